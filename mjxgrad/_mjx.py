@@ -1,0 +1,23 @@
+"""The one place that imports MJX.
+
+`mujoco.mjx` prints two lines to stdout when NVIDIA Warp, which this library does not use, is
+absent. A library must not print, and a program that writes its results to stdout must not find
+them there. Only those two lines are dropped: anything else said while importing is passed on.
+"""
+
+import contextlib
+import io
+import sys
+
+_NOISE = ("Failed to import warp:", "Failed to import mujoco_warp:")
+
+_said = io.StringIO()
+try:
+    with contextlib.redirect_stdout(_said):
+        from mujoco import mjx
+finally:
+    sys.stdout.writelines(
+        line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE)
+    )
+
+__all__ = ["mjx"]
