@@ -1,0 +1,64 @@
+# Everything runs in a virtual environment of its own, .venv; `make` alone lists what there is.
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+MAKEFLAGS += --no-print-directory
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+# Settings of one run, in TOML syntax: make ball_wall ARGS="num_samples=200 seed=1"
+ARGS ?=
+PYTEST_ARGS ?=
+
+BIN := .venv/bin
+EXPERIMENTS := $(sort $(basename $(notdir $(wildcard experiments/*.toml))))
+
+# Compiling is most of the time of a first run; kept on disk, the second run starts at once.
+export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
+export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
+
+.PHONY: help setup demo test test-slow bench lint clean $(EXPERIMENTS)
+
+help:  ## list these targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+	@echo
+	@echo 'One target per experiments/*.toml; change its settings with ARGS="key=value ...":'
+	@for name in $(EXPERIMENTS); do \
+	    printf 'make %-14s %s\n' "$$name" "$$(sed -n '1s/^# *//p' "experiments/$$name.toml")"; done
+
+setup: .venv/.installed  ## install the tested versions into .venv
+
+.venv/.installed: pyproject.toml .ci/constraints.txt
+	@command -v $(PYTHON) >/dev/null || { \
+	    echo "mjxgrad needs Python 3.11 or later, and $(PYTHON) was not found. Install it, or name yours: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit(f"mjxgrad needs Python 3.11 or later, $(PYTHON) is {v[0]}.{v[1]}. Name a later one: make PYTHON=python3.12")'
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "$(PYTHON) lacks its venv module. Install it (Debian, Ubuntu: apt-get install python3-venv) and run make again." >&2; exit 1; }
+	@printf 'Installing into .venv, a minute or two the first time '
+	@$(PYTHON) -m venv --clear .venv
+	@$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off \
+	    --constraint .ci/constraints.txt --editable '.[dev]' \
+	    | while read -r line; do case "$$line" in Collecting*|Installing*|Preparing*|Building*) printf .;; esac; done
+	@echo ' done.'
+	@touch $@
+
+demo: ball_wall  ## set all up, run the main job, write runs/ball_wall/report.html
+
+test: .venv/.installed  ## set all up and run the tests
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-slow: .venv/.installed  ## the tests that take minutes
+	@$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+bench: .venv/.installed  ## measure speed and memory against mjx.step
+	@$(BIN)/python -m experiments.bench $(ARGS)
+
+lint: .venv/.installed  ## ruff and pyright
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+
+clean:  ## remove .venv, caches and runs
+	@rm -rf .venv .cache .pytest_cache .ruff_cache build dist runs *.egg-info
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(EXPERIMENTS): .venv/.installed
+	@$(BIN)/python -m experiments run experiments/$@.toml $(ARGS)
