@@ -15,9 +15,13 @@ _said = io.StringIO()
 try:
     with contextlib.redirect_stdout(_said):
         from mujoco import mjx
+
+        # Not public, but what decides which geoms MJX tests for contact: a second implementation
+        # of that rule could disagree with it.
+        from mujoco.mjx._src.collision_driver import geom_pairs
 finally:
     sys.stdout.writelines(
         line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE)
     )
 
-__all__ = ["mjx"]
+__all__ = ["geom_pairs", "mjx"]
