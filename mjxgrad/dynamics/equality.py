@@ -1,0 +1,198 @@
+"""Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order."""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import rotation
+from mjxgrad.dynamics.assembly import Block, contact_jacobian
+
+
+def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
+    """Return one block per type that the model has."""
+    kinds = mujoco.mjtEq
+    table = (
+        (kinds.mjEQ_CONNECT, _connect),
+        (kinds.mjEQ_WELD, _weld),
+        (kinds.mjEQ_JOINT, _joint),
+        (kinds.mjEQ_TENDON, _tendon),
+    )
+    chosen = [(np.nonzero(model.eq_type == kind)[0], rows) for kind, rows in table]
+    return [rows(model, data, ids) for ids, rows in chosen if ids.size]
+
+
+def _block(
+    model: mjx.Model,
+    data: mjx.Data,
+    ids: np.ndarray,
+    jacobian: Float[Array, "constraints k nv"],
+    residual: Float[Array, "constraints k"],
+    inverse_weight: Float[Array, "constraints k"],
+) -> Block:
+    """Return the rows of constraints with k rows each, whose impedance follows the norm of their residual."""
+    count, each = residual.shape
+
+    def spread(x: Array) -> Array:
+        return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
+
+    flat = residual.reshape(-1)
+    zero = jnp.zeros_like(flat)
+    return Block(
+        jacobian=jacobian.reshape(count * each, -1),
+        residual=flat,
+        violation=spread(rotation.safe_norm(residual)),
+        inverse_weight=inverse_weight.reshape(-1),
+        solref=spread(model.eq_solref[ids]),
+        solimp=spread(model.eq_solimp[ids]),
+        margin=zero,
+        friction_loss=zero,
+        is_active=spread(jnp.asarray(data.eq_active)[ids] != 0),
+    )
+
+
+def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether constraints name sites, their objects (2 per constraint) and the objects' bodies."""
+    is_site = np.asarray(model.eq_objtype)[ids] == mujoco.mjtObj.mjOBJ_SITE
+    objects = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
+    bodies = objects.copy()
+    if is_site.any():
+        bodies[is_site] = np.asarray(model.site_bodyid)[objects[is_site]]
+    return is_site, objects, bodies
+
+
+def _points(
+    model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: Float[Array, "constraints 2 3"]
+) -> Float[Array, "constraints 2 3"]:
+    """Return the world positions of both ends: sites, or anchors in the frames of their bodies."""
+    is_site, objects, bodies = _ends(model, ids)
+    points = data.xpos[bodies] + jnp.sum(data.xmat[bodies] * anchors[:, :, None, :], axis=-1)
+    if is_site.any():
+        sites = data.site_xpos[np.where(is_site[:, None], objects, 0)]
+        points = jnp.where(is_site[:, None, None], sites, points)
+    return points
+
+
+def _translation(
+    model: mjx.Model,
+    data: mjx.Data,
+    points: Float[Array, "constraints 2 3"],
+    bodies: np.ndarray,
+) -> Float[Array, "constraints 3 nv"]:
+    """Return the Jacobian of the first end's position less the second's."""
+    frame = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), (len(points), 3, 3))
+    world = np.zeros_like(bodies[:, 0])
+    return contact_jacobian(
+        model, data, points[:, 0], frame, np.stack([world, bodies[:, 0]], 1), 3
+    ) - contact_jacobian(model, data, points[:, 1], frame, np.stack([world, bodies[:, 1]], 1), 3)
+
+
+def _connect(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    anchors = model.eq_data[ids][:, :6].reshape(-1, 2, 3)
+    points = _points(model, data, ids, anchors)
+    bodies = _ends(model, ids)[2]
+    weight = jnp.sum(model.body_invweight0[bodies, 0], axis=1)
+    return _block(
+        model,
+        data,
+        ids,
+        _translation(model, data, points, bodies),
+        points[:, 0] - points[:, 1],
+        jnp.repeat(weight[:, None], 3, axis=1),
+    )
+
+
+def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    """Six rows: difference of position, and the vector part of the relative quaternion times the torque scale."""
+    settings = model.eq_data[ids]
+    is_site, objects, bodies = _ends(model, ids)
+    # The data of a weld hold the second body's anchor first.
+    points = _points(model, data, ids, settings[:, :6].reshape(-1, 2, 3)[:, ::-1])
+    scale = settings[:, 10:11]
+    first = rotation.multiply(data.xquat[bodies[:, 0]], settings[:, 6:10])
+    second = data.xquat[bodies[:, 1]]
+    if is_site.any():
+        quaternions = model.site_quat[np.where(is_site[:, None], objects, 0)]
+        of_sites = rotation.multiply(data.xquat[bodies], quaternions)
+        first = jnp.where(is_site[:, None], of_sites[:, 0], first)
+        second = jnp.where(is_site[:, None], of_sites[:, 1], second)
+    back = rotation.conjugate(second)
+    error = rotation.multiply(back, first)[:, 1:] * scale
+    turning = _turning(model, data, bodies)  # constraints, nv, 3
+    axis = jnp.concatenate([jnp.zeros_like(turning[..., :1]), turning], axis=-1)
+    rate = rotation.multiply(rotation.multiply(back[:, None], axis), first[:, None])[..., 1:]
+    rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
+    weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
+    return _block(
+        model,
+        data,
+        ids,
+        jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1),
+        jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1),
+        jnp.repeat(weight, 3, axis=1),
+    )
+
+
+def _turning(
+    model: mjx.Model, data: mjx.Data, bodies: np.ndarray
+) -> Float[Array, "constraints nv 3"]:
+    """Return each joint velocity's part in the first body's angular velocity less the second's."""
+    from mjxgrad.dynamics.assembly import _ancestry
+
+    moves = _ancestry(model)
+    sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
+    return sign[:, :, None] * data.cdof[:, :3]
+
+
+def _polynomial(
+    coefficients: Float[Array, "n 5"], x: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return a quartic and its derivative, by Horner's rule: no power of zero to differentiate."""
+    value, slope = coefficients[:, 4], jnp.zeros_like(x)
+    for k in (3, 2, 1, 0):
+        slope = slope * x + value
+        value = value * x + coefficients[:, k]
+    return value, slope
+
+
+def _coupling(
+    model: mjx.Model,
+    data: mjx.Data,
+    ids: np.ndarray,
+    position: tuple[Array, Array],
+    jacobian: tuple[Array, Array],
+    weight: tuple[Array, Array],
+) -> Block:
+    """Return rows x₁ - p(x₂) for pairs of scalar coordinates; without a second one x₂ = 0."""
+    has_second = jnp.asarray(model.eq_obj2id[ids] >= 0, data.qpos.dtype)
+    value, slope = _polynomial(model.eq_data[ids][:, :5], position[1] * has_second)
+    row = jacobian[0] - (slope * has_second)[:, None] * jacobian[1]
+    return _block(
+        model,
+        data,
+        ids,
+        row[:, None],
+        (position[0] - value)[:, None],
+        (weight[0] + weight[1] * has_second)[:, None],
+    )
+
+
+def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
+    addresses = [model.jnt_qposadr[joint] for joint in objects]
+    dofs = [model.jnt_dofadr[joint] for joint in objects]
+    unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
+    first, second = (data.qpos[a] - model.qpos0[a] for a in addresses)
+    weights = tuple(model.dof_invweight0[dof] for dof in dofs)
+    return _coupling(
+        model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights
+    )
+
+
+def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
+    first, second = (data.ten_length[t] - model.tendon_length0[t] for t in objects)
+    jacobians = tuple(data._impl.ten_J[t] for t in objects)
+    weights = tuple(model.tendon_invweight0[t] for t in objects)
+    return _coupling(model, data, ids, (first, second), jacobians, weights)

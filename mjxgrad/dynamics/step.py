@@ -1,0 +1,213 @@
+"""One step that can be differentiated: MJX's stages in order, with our own rows, solve and integration.
+
+Drop-ins for `mjx.step`, `mjx.forward` and `mjx.solve` on any model and data of MJX's JAX implementation. Stages without work are
+skipped on what is static (no actuators, no tendons, no sensors, no rows); what nobody reads (camera poses, the unconstrained
+acceleration, the factor of the mass matrix) costs nothing under `jax.jit`, which removes it. For that to hold the solve starts
+from the last acceleration alone: MJX also evaluates the unconstrained one, which takes a factorisation of its own, to
+choose the better start.
+
+Matrix products ask for full precision, since NVIDIA GPUs otherwise round their factors to ten bits, contact Jacobians included.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import assembly, implicit, linear, springs
+from mjxgrad.dynamics.integrate import integrate_position
+from mjxgrad.dynamics.newton import Problem
+
+_Disable = mujoco.mjtDisableBit
+_Integrator = mujoco.mjtIntegrator
+
+
+def _at_full_precision(function: Callable[..., mjx.Data]) -> Callable[..., mjx.Data]:
+    @functools.wraps(function)
+    def wrapped(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
+            raise ValueError(
+                "model and data must be of MJX's JAX implementation, got "
+                f"{model.impl} and {data.impl}: create them with impl='jax'"
+            )
+        with jax.default_matmul_precision("highest"):
+            return function(model, data)
+
+    return wrapped
+
+
+@_at_full_precision
+def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Advance the state by one time step.
+
+    Args:
+        model: any model of MJX's JAX implementation; Euler, implicitfast or RK4.
+        data: the present state, controls and applied forces.
+
+    Returns:
+        Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
+        them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
+
+    Raises:
+        ValueError: if `model` or `data` belong to another implementation of MJX.
+        NotImplementedError: if MJX lacks the integrator.
+    """
+    data = forward(model, data)
+    integrator = model.opt.integrator
+    if integrator == _Integrator.mjINT_RK4:
+        return _runge_kutta(model, data)
+    if integrator == _Integrator.mjINT_EULER:
+        return _advance(model, data, _euler_acceleration(model, data), None)
+    if integrator == _Integrator.mjINT_IMPLICITFAST:
+        return _advance(model, data, _implicit_acceleration(model, data), None)
+    raise NotImplementedError(
+        f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>"
+    )
+
+
+@_at_full_precision
+def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`.
+
+    Args:
+        model: any model of MJX's JAX implementation.
+        data: the present state, controls and applied forces.
+
+    Returns:
+        Data with every field that depends on the state filled in.
+
+    Raises:
+        ValueError: if `model` or `data` belong to another implementation of MJX.
+    """
+    data = _smooth(model, data)
+    if model.nsensor:
+        data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
+    data = solve(model, data)
+    return mjx.sensor_acc(model, data) if model.nsensor else data
+
+
+@_at_full_precision
+def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find the acceleration and the constraint forces; a drop-in for `mjx.solve`.
+
+    The derivative is that of the converged solve, by the implicit function theorem; see `dynamics.implicit`.
+
+    Args:
+        model: its `opt.iterations` and `opt.tolerance` bound the iterations.
+        data: with mass matrix, smooth forces and constraint rows, as `mjx.fwd_acceleration` leaves them.
+
+    Returns:
+        Data with `qacc`, `qfrc_constraint` and the rows' forces.
+
+    Raises:
+        ValueError: if `model` or `data` belong to another implementation of MJX.
+    """
+    layout = assembly.row_layout(model, data)
+    if not layout.num_rows or not model.nv:
+        return data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
+    rows = assembly.rows_of(model, data, layout)
+    mass = mjx.full_m(model, data)
+    problem = Problem(mass, data.qfrc_smooth, data._impl.efc_J, rows)
+    cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
+    start = data.qacc_smooth if cold else data.qacc_warmstart
+    tolerance = jnp.asarray(model.opt.tolerance, mass.dtype)
+    acceleration = implicit.solve(
+        layout,
+        int(model.opt.iterations),
+        problem,
+        jax.lax.stop_gradient(start),
+        jax.lax.stop_gradient(tolerance),
+    )
+    force = problem.row_force(layout, acceleration)
+    return data.tree_replace(
+        {
+            "qacc": acceleration,
+            "qfrc_constraint": data._impl.efc_J.T @ force,
+            "_impl.efc_force": force,
+        }
+    )
+
+
+def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Run MJX's stages up to the unconstrained acceleration, with our own constraint rows."""
+    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    data = mjx.camlight(model, data)
+    if model.ntendon:
+        data = mjx.tendon(model, data)
+    data = mjx.crb(model, data)
+    if model.ntendon:
+        data = mjx.tendon_armature(model, data)
+    data = mjx.factor_m(model, data)
+    data = mjx.collision(model, data)
+    data = assembly.make_constraint(model, data)
+    if model.nu:
+        data = mjx.transmission(model, data)
+    data = springs.restore_derivative(model, mjx.fwd_velocity(model, data))
+    return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+
+
+def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off."""
+    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER):
+        return data.qacc
+    mass = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
+    return linear.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+
+
+def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """Return the acceleration with the velocity derivative of the smooth forces taken implicitly."""
+    derivative = mjx.deriv_smooth_vel(model, data)
+    if derivative is None:
+        return data.qacc
+    mass = mjx.full_m(model, data) - model.opt.timestep * derivative
+    return linear.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+
+
+def _advance(
+    model: mjx.Model,
+    data: mjx.Data,
+    acceleration: Float[Array, " nv"],
+    velocity: Float[Array, " nv"] | None,
+) -> mjx.Data:
+    """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
+    # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.
+    bare = model.tree_replace({"opt.disableflags": model.opt.disableflags | _Disable.mjDSBL_EULERDAMP})
+    moved = mjx.euler(bare, data)
+    qvel = data.qvel + model.opt.timestep * acceleration
+    drift = qvel if velocity is None else velocity
+    qpos = integrate_position(model, data.qpos, drift, model.opt.timestep)
+    return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
+
+
+def _runge_kutta(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Advance by the classical fourth-order rule; `data` holds the first stage."""
+    start, h = data, model.opt.timestep
+    velocity, acceleration, act_dot = (x / 6 for x in (data.qvel, data.qacc, data.act_dot))
+
+    def stage(carry, coefficients):
+        last, sums = carry
+        share, weight = coefficients
+        qpos = integrate_position(model, start.qpos, share * last.qvel, h)
+        state = last.replace(
+            qpos=qpos,
+            qvel=start.qvel + h * share * last.qacc,
+            act=start.act + h * share * last.act_dot,
+            time=start.time + h * share,
+            qacc_warmstart=last.qacc,
+        )
+        state = forward(model, state)
+        rates = (state.qvel, state.qacc, state.act_dot)
+        return (state, tuple(s + weight * r for s, r in zip(sums, rates, strict=True))), None
+
+    tableau = (jnp.array([0.5, 0.5, 1.0]), jnp.array([1 / 3, 1 / 3, 1 / 6]))
+    sums = (velocity, acceleration, act_dot)
+    (last, sums), _ = jax.lax.scan(stage, (data, sums), tableau)
+    velocity, acceleration, act_dot = sums
+    last = last.replace(
+        qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
+    )
+    return _advance(model, last, acceleration, velocity)
