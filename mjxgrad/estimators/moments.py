@@ -1,0 +1,125 @@
+r"""Moments of samples that arrive in chunks, merged without cancellation.
+
+Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept
+about the mean of what was seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose
+their variance in float32.
+
+References:
+    Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample
+    variances. COMPSTAT 1982, equation 2.1.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Summary(eqx.Module):
+    """What is kept of samples; all leaves zero means of none."""
+
+    @abstractmethod
+    def merge(self, other: "Summary") -> "Summary":
+        """Give the summary of both sets of samples."""
+
+
+class Moments(Summary):
+    """Count, mean, and sum of squared deviations."""
+
+    count: Int[Array, ""]
+    mean: Float[Array, "*shape"]
+    squares: Float[Array, "*shape"]
+
+    @classmethod
+    def of(cls, samples: Float[Array, "units *shape"], mask: Bool[Array, " units"]) -> "Moments":
+        """Summarise the samples that the mask picks; the others may be NaN."""
+        count = mask.sum()
+        samples = _masked(samples, mask)
+        mean = samples.sum(axis=0) / jnp.maximum(count, 1)
+        return cls(count, mean, (_masked(samples - mean, mask) ** 2).sum(axis=0))
+
+    def merge(self, other: "Moments") -> "Moments":
+        """Give the summary of both sets of samples."""
+        count = self.count + other.count
+        shift = other.mean - self.mean
+        share = other.count / jnp.maximum(count, 1)
+        squares = self.squares + other.squares + shift**2 * self.count * share
+        return Moments(count, self.mean + shift * share, squares)
+
+    def squared_error(self) -> Float[Array, "*shape"]:
+        """Give the squared standard error of the mean, NaN for fewer than two samples."""
+        pairs = self.count * (self.count - 1.0)
+        return jnp.where(self.count > 1, self.squares / jnp.maximum(pairs, 1), jnp.nan)
+
+
+class Value(Summary):
+    """One value that one of the chunks carries."""
+
+    value: Float[Array, ""]
+
+    def merge(self, other: "Value") -> "Value":
+        """Give the summary of both sets of samples."""
+        return Value(self.value + other.value)
+
+
+class ScoreMoments(Summary):
+    r"""Joint moments of costs and scores from which the baseline can be chosen at the end.
+
+    A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a
+    centre $c$, its features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and
+    $\bar s$, where bars are means within the unit. Moving the centre acts on them linearly,
+    $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so their sums and sums of products
+    about any centre follow from those about another: about the mean they merge without
+    cancellation, about zero or about the noise-free cost they give the other baselines.
+
+    Attributes:
+        costs: moments of $\bar f$; its mean is the centre.
+        first: sums of (u, p, s̄).
+        second: sums of their products.
+    """
+
+    costs: Moments
+    first: Float[Array, "3 dim"]
+    second: Float[Array, "3 3 dim"]
+
+    @classmethod
+    def of(
+        cls,
+        costs: Float[Array, "units rollouts"],
+        scores: Float[Array, "units rollouts dim"],
+        mask: Bool[Array, " units"],
+    ) -> "ScoreMoments":
+        """Summarise the units that the mask picks; the others may be NaN."""
+        scores = _masked(scores, mask)
+        summary = Moments.of(costs.mean(axis=1), mask)
+        centred = _masked(costs - summary.mean, mask)
+        product = (centred[..., None] * scores).mean(axis=1)
+        mean_score = scores.mean(axis=1)
+        product_of_means = centred.mean(axis=1)[:, None] * mean_score
+        features = jnp.stack([product, product_of_means, mean_score])
+        # Elementwise, not einsum: a matrix product may be in TF32 on a GPU.
+        second = (features[:, None] * features[None, :]).sum(axis=2)
+        return cls(summary, features.sum(axis=1), second)
+
+    def about(self, centre: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
+        """Give the sums of the features, and of their products, about another centre."""
+        shift = self.costs.mean - centre
+        return _moved(self.first, shift, 0), _moved(_moved(self.second, shift, 0), shift, 1)
+
+    def merge(self, other: "ScoreMoments") -> "ScoreMoments":
+        """Give the summary of both sets of samples."""
+        costs = self.costs.merge(other.costs)
+        mine, theirs = self.about(costs.mean), other.about(costs.mean)
+        return ScoreMoments(costs, mine[0] + theirs[0], mine[1] + theirs[1])
+
+
+def _moved(sums: Float[Array, "..."], shift: Float[Array, ""], axis: int) -> Float[Array, "..."]:
+    """Add the shift times the mean score to the two other features."""
+    product, product_of_means, score = jnp.moveaxis(sums, axis, 0)
+    moved = jnp.stack([product + shift * score, product_of_means + shift * score, score])
+    return jnp.moveaxis(moved, 0, axis)
+
+
+def _masked(samples: Float[Array, "units ..."], mask: Bool[Array, " units"]) -> Float[Array, "..."]:
+    return jnp.where(mask.reshape(-1, *[1] * (samples.ndim - 1)), samples, 0)

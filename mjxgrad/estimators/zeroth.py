@@ -1,0 +1,137 @@
+"""The zeroth-order estimate: the covariance of cost and score."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.estimators.estimate import GradientEstimate, assemble
+from mjxgrad.estimators.moments import ScoreMoments, Value
+from mjxgrad.estimators.sampling import Baseline, Plan, Samples, check_baseline, stream
+from mjxgrad.objective import Objective
+
+
+def zeroth_order(
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    num_samples: int,
+    baseline: Baseline = "leave_one_out",
+    antithetic: bool = False,
+    chunk_size: int | None = None,
+) -> GradientEstimate:
+    r"""Estimate the gradient of a smoothed objective without differentiating it.
+
+    With noise $w \sim p(w \mid \theta)$ the gradient of $F(\theta) = \mathbb{E}[f]$ is
+    $\mathbb{E}[(f_i - b_i)\, s_i]$, $s_i$ the score. All three baselines $b_i$ are independent
+    of sample $i$, so the estimate is unbiased even where $f$ jumps.
+
+    Args:
+        objective: its `value` is called once under `jax.vmap`.
+        params: the point $\theta$.
+        key: consumed here; do not use it again.
+        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with
+            antithetic pairs.
+        baseline: "leave_one_out", the mean cost of the other samples (of the other pairs);
+            "zero_noise", the cost without noise, one more rollout; or "none".
+        antithetic: use every noise together with its mirror image. The standard error is then
+            taken over pairs. Where the score is odd in the noise (parameter noise, open loop)
+            all baselines cancel within a pair.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
+            rounding.
+
+    Returns:
+        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
+
+    Raises:
+        ValueError: if `num_samples` is too small or odd, `chunk_size` too small, `baseline`
+            unknown, or `params` is not a vector of the objective's dimension.
+
+    References:
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy
+        Gradients? ICML 2022, arXiv:2202.00817, definition 2.3 (there with the zero-noise
+        baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE samples, get a baseline for free!
+        ICLR 2019 workshop, equation 8 (leave-one-out).
+    """
+    check_baseline(baseline)
+    plan = Plan(
+        num_samples,
+        chunk_size,
+        antithetic,
+        with_score=True,
+        with_zero_noise=baseline == "zero_noise",
+    )
+    params = jnp.asarray(params)
+    summary = stream(objective.sized_for(params), params, key, plan, zeroth_order_summary)
+    return zeroth_order_result(summary, plan, baseline)
+
+
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Value]:
+    """Keep of samples what the estimate needs: joint moments, and the cost without noise."""
+    moments = ScoreMoments.of(samples.costs, samples.scores, samples.zeroth_order_mask())
+    return moments, Value(samples.noise_free_cost())
+
+
+def zeroth_order_result(summary: tuple[ScoreMoments, Value], plan: Plan, baseline: Baseline) -> GradientEstimate:
+    """Turn what was kept into the estimate."""
+    moments, noise_free = summary
+    if baseline == "leave_one_out":
+        value, squared_error = _leave_one_out(moments)
+    else:
+        centre = noise_free.value if baseline == "zero_noise" else jnp.zeros_like(noise_free.value)
+        value, squared_error = _fixed_baseline(moments, centre)
+    return assemble(
+        value,
+        squared_error,
+        moments.costs,
+        count=moments.costs.count,
+        rollouts_per_unit=plan.rollouts_per_unit,
+        num_samples=plan.num_samples,
+        num_rollouts=plan.num_rollouts,
+        num_gradient_rollouts=plan.num_rollouts if plan.with_gradient else 0,
+        has_baseline=baseline != "zero_noise" or jnp.isfinite(noise_free.value),
+    )
+
+
+def _fixed_baseline(
+    moments: ScoreMoments, centre: Float[Array, ""]
+) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    first, second = moments.about(centre)
+    count = moments.costs.count
+    return _mean_and_squared_error(first[0], second[0, 0], count)
+
+
+def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    r"""Mean of $g_i = u_i - b_i \bar s_i$, $b_i$ the mean cost of the other units.
+
+    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs
+    $u = p$ and this is $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of
+    cost and score.
+
+    The $g_i$ share the mean, so their spread over $n$ is not quite the variance $V$ of their
+    mean. With $\mathbb{E}[s] = 0$ and $c = \mathbb{E}[\bar f \bar s]$,
+
+    $$V = \frac{\mathrm{Var}\,u}{n} + \frac{\mathrm{Var}\bar f\,\mathrm{Var}\bar s + c^2}{n(n-1)},
+      \qquad \mathbb{E}[\text{spread}/n] = V - \frac{c^2}{(n-1)^2}.$$
+
+    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and
+    $\mathbb{E}[k^2] = c^2 + V_k$; together they give an estimate of $V$ that is unbiased for
+    every $n \ge 2$, and never negative without pairs.
+    """
+    first, second = moments.about(moments.costs.mean)
+    count = moments.costs.count
+    others = jnp.maximum(count - 1, 1).astype(first.dtype)
+    total = first[0] + first[1] / others
+    total_square = second[0, 0] + 2 * second[0, 1] / others + second[1, 1] / others**2
+    value, spread = _mean_and_squared_error(total, total_square, count)
+    # Written as n/(n-1) p, whose mean is k.
+    scale = 1 + 1 / others
+    covariance, covariance_spread = _mean_and_squared_error(scale * first[1], scale**2 * second[1, 1], count)
+    return value, spread + (covariance**2 - covariance_spread) / (others**2 + 1)
+
+
+def _mean_and_squared_error(
+    total: Float[Array, " dim"], total_square: Float[Array, " dim"], count: Array
+) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    mean = total / jnp.maximum(count, 1)
+    pairs = jnp.maximum(count * (count - 1.0), 1)
+    return mean, (total_square - count * mean**2) / pairs

@@ -1,0 +1,103 @@
+"""Both estimates against closed forms, where each is unbiased and where it is not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.estimators import first_order, zeroth_order
+from mjxgrad.objective import closed_loop, open_loop, parameter_noise
+from tests.estimators import textbook
+from tests.estimators.textbook import STDDEV, assert_within_error
+
+N = 100_000
+EVERY_WAY = [(baseline, pairs) for baseline in ("leave_one_out", "zero_noise", "none") for pairs in (False, True)]
+
+
+@pytest.fixture
+def key():
+    return jax.random.key(7)
+
+
+@pytest.mark.parametrize(("baseline", "antithetic"), EVERY_WAY)
+def test_zeroth_order_sees_a_step(key, baseline, antithetic):
+    objective = parameter_noise(textbook.step, STDDEV)
+    estimate = zeroth_order(objective, jnp.array([0.07]), key, num_samples=N, baseline=baseline, antithetic=antithetic)
+    assert_within_error(estimate, textbook.step_gradient(0.07))
+
+
+def test_first_order_does_not_see_a_step(key):
+    estimate = first_order(parameter_noise(textbook.step, STDDEV), jnp.array([0.07]), key, num_samples=N)
+    assert estimate.value == 0
+    assert estimate.variance == 0
+
+
+def test_a_steep_ramp_has_the_variance_of_rare_large_slopes(key):
+    """The derivative is 2/ν with probability p, else 0: a Bernoulli variable."""
+    width, point = 0.03, 0.04
+    p = textbook.ramp_probability(point, width)
+    estimate = first_order(parameter_noise(textbook.ramp(width), STDDEV), jnp.array([point]), key, num_samples=N)
+    assert_within_error(estimate, 2 * p / width)
+    # Var of a Bernoulli's sample variance: p(1-p)(1-2p)²/N to leading order.
+    error = (2 / width) ** 2 * np.sqrt(p * (1 - p) * (1 - 2 * p) ** 2 / N)
+    assert abs(estimate.variance - (2 / width) ** 2 * p * (1 - p)) < 4 * error
+
+
+def test_zeroth_order_does_not_care_how_steep_the_ramp_is(key):
+    width, point = 0.03, 0.04
+    estimate = zeroth_order(parameter_noise(textbook.ramp(width), STDDEV), jnp.array([point]), key, num_samples=N)
+    assert_within_error(estimate, 2 * textbook.ramp_probability(point, width) / width)
+
+
+@pytest.mark.parametrize("estimator", [first_order, zeroth_order])
+def test_a_quadratic_with_a_sine_is_smoothed(key, estimator):
+    estimate = estimator(parameter_noise(textbook.quadratic_sine, STDDEV), jnp.array([0.3]), key, num_samples=N)
+    assert_within_error(estimate, textbook.quadratic_sine_gradient(0.3))
+
+
+def test_only_zeroth_order_sees_the_throw_that_clears_the_wall(key):
+    """First order has the wrong sign: it converges to E f', without the jumps."""
+    objective = parameter_noise(textbook.ball_over_wall, STDDEV)
+    smooth, truth = textbook.ball_over_wall_gradients(0.8)
+    assert smooth > 0 > truth
+    assert_within_error(zeroth_order(objective, jnp.array([0.8]), key, num_samples=N), truth)
+    assert_within_error(first_order(objective, jnp.array([0.8]), key, num_samples=N), smooth)
+
+
+@pytest.mark.parametrize("estimator", [first_order, zeroth_order])
+def test_each_parameter_may_have_its_own_noise(key, estimator):
+    point, stddev = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2])
+    objective = parameter_noise(textbook.bumpy, jnp.asarray(stddev))
+    estimate = estimator(objective, jnp.asarray(point), key, num_samples=N)
+    assert_within_error(estimate, textbook.bumpy_gradient(point, stddev))
+
+
+@pytest.mark.parametrize("antithetic", [False, True])
+def test_zeroth_order_follows_a_policy_through_its_states(key, antithetic):
+    """A linear system under a linear policy: mean and covariance, so the expected cost, by recursion."""
+    task = textbook.LinearSystem()
+    policy_params = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+    objective = closed_loop(task, textbook.linear_policy, 0.3, params=policy_params)
+    exact = jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3))(objective.ravel(policy_params))
+    at = objective.ravel(policy_params)
+    assert_within_error(zeroth_order(objective, at, key, num_samples=N, antithetic=antithetic), exact)
+
+
+def test_first_order_follows_a_policy_through_its_states(key):
+    task = textbook.LinearSystem()
+    policy_params = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+    objective = closed_loop(task, textbook.linear_policy, 0.3, params=policy_params)
+    exact = jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3))(objective.ravel(policy_params))
+    assert_within_error(first_order(objective, objective.ravel(policy_params), key, num_samples=N), exact)
+
+
+@pytest.mark.parametrize("estimator", [first_order, zeroth_order])
+def test_open_loop_controls_have_the_gradient_of_a_quadratic(key, estimator):
+    """The cost is quadratic in the controls, so noise adds a constant: the gradient is that without noise."""
+    task = textbook.LinearSystem()
+    controls = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
+    objective = open_loop(task, jnp.array([0.3]))
+    exact = jax.grad(lambda u: task.run(u)[0])(controls)
+    estimate = estimator(objective, objective.ravel(controls), key, num_samples=N)
+    np.testing.assert_array_equal(objective.unravel(objective.ravel(controls)), controls)
+    assert_within_error(estimate, exact.ravel())

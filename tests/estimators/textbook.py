@@ -1,0 +1,136 @@
+"""Functions whose smoothed gradient is known in closed form (none of them symmetric at the points used)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from mjxgrad.estimators import GradientEstimate
+from mjxgrad.tasks import Task
+
+STDDEV = 0.1
+
+
+def step(x: Float[Array, " 1"]) -> Float[Array, ""]:
+    """1 from zero on, else 0."""
+    return jnp.where(x[0] >= 0, 1.0, 0.0)
+
+
+def step_gradient(point: float) -> float:
+    """The density of the noise at the jump."""
+    return norm.pdf(point / STDDEV) / STDDEV
+
+
+def ramp(width: float):
+    """From -1 to 1 over a width about zero."""
+    return lambda x: jnp.clip(2 * x[0] / width, -1, 1)
+
+
+def ramp_probability(point: float, width: float) -> float:
+    """The chance to be on the slope."""
+    return norm.cdf((width / 2 - point) / STDDEV) - norm.cdf((-width / 2 - point) / STDDEV)
+
+
+def quadratic_sine(x: Float[Array, " 1"]) -> Float[Array, ""]:
+    """x² + 0.1 sin(20 x)."""
+    return x[0] ** 2 + 0.1 * jnp.sin(20 * x[0])
+
+
+def quadratic_sine_gradient(point: float) -> float:
+    """E x² = θ² + σ²; E sin(ωx) = exp(-ω²σ²/2) sin(ωθ)."""
+    return 2 * point + 0.1 * 20 * np.exp(-(20**2) * STDDEV**2 / 2) * np.cos(20 * point)
+
+
+SPEED, GRAVITY, WALL, HEIGHT = 1.0, 9.81, 0.06, 0.02
+
+
+def ball_over_wall(angle: Float[Array, " 1"]) -> Float[Array, ""]:
+    """Minus the squared range of a point thrown at an angle; it falls straight down if a wall stops it."""
+    reach = SPEED**2 * jnp.sin(2 * angle[0]) / GRAVITY
+    height_at_wall = WALL * jnp.tan(angle[0]) - GRAVITY * WALL**2 / (2 * SPEED**2 * jnp.cos(angle[0]) ** 2)
+    is_blocked = (reach > WALL) & (height_at_wall < HEIGHT)
+    return -(jnp.where(is_blocked, WALL, reach) ** 2)
+
+
+def ball_over_wall_gradients(point: float) -> tuple[float, float]:
+    """What first order converges to, E f', and the truth, which adds each jump times the density there."""
+    # Height at the wall equals the wall's at two angles: a quadratic in tan.
+    drop = GRAVITY * WALL**2 / (2 * SPEED**2)
+    lower, upper = np.arctan(np.sort(np.roots([-drop, WALL, -drop - HEIGHT])))
+
+    def density(angle: float) -> float:
+        return norm.pdf((angle - point) / STDDEV) / STDDEV
+
+    def cost(angle: float) -> float:
+        return -((SPEED**2 * np.sin(2 * angle) / GRAVITY) ** 2)
+
+    def slope(angle: float) -> float:
+        return -2 * np.sin(2 * angle) * 2 * np.cos(2 * angle) * SPEED**4 / GRAVITY**2
+
+    short = np.arcsin(WALL * GRAVITY / SPEED**2) / 2
+    pieces = [(point - 9 * STDDEV, short), (lower, upper), (np.pi / 2 - short, point + 9 * STDDEV)]
+    smooth = sum(quad(lambda x: slope(x) * density(x), a, b, epsabs=1e-12)[0] for a, b in pieces if a < b)
+    jump_up = (cost(lower) + WALL**2) * density(lower)
+    jump_down = (-(WALL**2) - cost(upper)) * density(upper)
+    return smooth, smooth + jump_up + jump_down
+
+
+def bumpy(x: Float[Array, " 3"]) -> Float[Array, ""]:
+    """Three coordinates that have nothing in common."""
+    return x[0] ** 2 * x[1] + jnp.exp(x[2]) + x[2]
+
+
+def bumpy_gradient(x: np.ndarray, stddev: np.ndarray) -> np.ndarray:
+    """E (x₀+w₀)²(x₁+w₁) = (x₀²+σ₀²)x₁; E exp(x₂+w₂) = exp(x₂ + σ₂²/2)."""
+    return np.array([2 * x[0] * x[1], x[0] ** 2 + stddev[0] ** 2, np.exp(x[2] + stddev[2] ** 2 / 2) + 1])
+
+
+class LinearSystem(Task):
+    """x' = A x + B u, cost Σ (|x|² + 0.3 |u|²) + 2|x_T - 1|²: everything is known about it."""
+
+    horizon: int = eqx.field(static=True, default=4)
+    num_controls: int = eqx.field(static=True, default=1)
+    transition: Float[Array, "2 2"] = eqx.field(default_factory=lambda: jnp.array([[1.0, 0.3], [-0.2, 0.8]]))
+    input_matrix: Float[Array, "2 1"] = eqx.field(default_factory=lambda: jnp.array([[0.5], [1.1]]))
+    start: Float[Array, " 2"] = eqx.field(default_factory=lambda: jnp.array([0.7, -0.4]))
+
+    def run(self, controls, params: PyTree = None, noise=None):
+        is_policy = callable(controls)
+        noise = jnp.zeros((self.horizon, self.num_controls)) if noise is None else noise
+
+        def advance(state, step):
+            control = (controls(params, state) if is_policy else controls[step]) + noise[step]
+            cost = state @ state + 0.3 * control @ control
+            return self.transition @ state + self.input_matrix @ control, (cost, state)
+
+        final, (costs, states) = jax.lax.scan(advance, self.start, jnp.arange(self.horizon))
+        return costs.sum() + 2 * ((final - 1) ** 2).sum(), states
+
+    def expected_cost(self, policy_params: dict, stddev: float) -> Float[Array, ""]:
+        """Under u = K x + k + w: mean and covariance of a linear system follow by recursion."""
+        gain, offset = policy_params["gain"], policy_params["offset"]
+        mean, covariance, total = self.start, jnp.zeros((2, 2)), 0.0
+        closed = self.transition + self.input_matrix @ gain
+        for _ in range(self.horizon):
+            control_mean = gain @ mean + offset
+            control_covariance = gain @ covariance @ gain.T + stddev**2 * jnp.eye(1)
+            total += mean @ mean + jnp.trace(covariance)
+            total += 0.3 * (control_mean @ control_mean + jnp.trace(control_covariance))
+            mean = closed @ mean + self.input_matrix @ offset
+            covariance = closed @ covariance @ closed.T + stddev**2 * self.input_matrix @ self.input_matrix.T
+        return total + 2 * (((mean - 1) ** 2).sum() + jnp.trace(covariance))
+
+
+def linear_policy(params: dict, state: Float[Array, " 2"]) -> Float[Array, " 1"]:
+    return params["gain"] @ state + params["offset"]
+
+
+def assert_within_error(estimate: GradientEstimate, truth, num_errors: float = 4.0) -> None:
+    """The estimate is within some of its own standard errors of the truth, and these are not NaN or silly."""
+    error = np.abs(np.asarray(estimate.value) - truth)
+    assert np.all(error <= num_errors * np.asarray(estimate.standard_error)), (estimate.value, truth)
+    # An error bar as wide as the value proves nothing.
+    assert np.all(np.asarray(estimate.standard_error) < 0.2 * np.abs(truth)), estimate.standard_error
