@@ -1,0 +1,187 @@
+"""From a trajectory to frames to a video, offscreen."""
+
+import copy
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from mjxgrad.scene import Scene
+
+Number = int | float
+# (frames, height, width, 3); unnamed, for the videos of one call may differ in length and a tiling in size.
+Frames = UInt8[np.ndarray, "_ _ _ 3"]
+
+
+class RenderingUnavailableError(RuntimeError):
+    """There is no OpenGL that renders without a display; the message names the package that brings one."""
+
+
+def frames(
+    scene: Scene | mujoco.MjModel,
+    qpos: Float[np.ndarray, "states nq"] | Float[Array, "states nq"],
+    *,
+    timestep: Number,
+    fps: Number = 30.0,
+    speed: Number = 1.0,
+    height: int = 360,
+    width: int = 640,
+    camera: str | int | mujoco.MjvCamera | None = None,
+    show_contacts: bool = False,
+) -> Frames:
+    r"""Draw a trajectory at the times at which a video shows it.
+
+    Frame $i$ shows time $i \cdot$ `speed` / `fps`, by the nearest state: states are close in time, and the mean of
+    two quaternions is not the orientation between them.
+
+    Args:
+        scene: what moves; a scene's complete C model is drawn, or a C model itself.
+        qpos: the states, one per `timestep`, the first at time zero.
+        timestep: simulated time between two states, in s.
+        fps: frames per second of the video.
+        speed: simulated over shown time; 0.25 is four times slower than real.
+        height: in pixels.
+        width: in pixels.
+        camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view.
+        show_contacts: mark the points of contact.
+
+    Returns:
+        The frames.
+
+    Raises:
+        ValueError: if `qpos` has no state, does not fit the model or is not finite, if a number is not positive, or
+            if there is no such camera.
+        RenderingUnavailableError: if there is no OpenGL.
+    """
+    mj_model = scene.mj_model if isinstance(scene, Scene) else scene
+    positions = np.asarray(qpos, dtype=np.float64)
+    _check(mj_model, positions, timestep=timestep, fps=fps, speed=speed, height=height, width=width)
+    mj_model = copy.copy(mj_model)
+    mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
+    mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
+    data, option = mujoco.MjData(mj_model), mujoco.MjvOption()
+    option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = show_contacts
+    view = _free_camera(mj_model) if camera is None else camera
+    drawn = []
+    with _renderer(mj_model, height, width) as renderer:
+        for state in _nearest(len(positions), timestep, speed / fps):
+            data.qpos[:] = positions[state]
+            mujoco.mj_fwdPosition(mj_model, data)
+            renderer.update_scene(data, view, option)
+            drawn.append(renderer.render())
+    return np.stack(drawn)
+
+
+def tile(videos: Sequence[Frames], captions: Sequence[str], *, columns: int) -> Frames:
+    """Put videos side by side, each under its caption; one that ends early keeps its last frame.
+
+    Args:
+        videos: of the same height and width.
+        captions: one for each.
+        columns: videos in a row; the last row is filled up with black.
+
+    Returns:
+        The frames of the whole.
+
+    Raises:
+        ValueError: if there are no videos, if the captions are not as many, or if the sizes differ.
+    """
+    if not videos or len(videos) != len(captions):
+        raise ValueError(f"captions must be as many as videos, and at least 1, got {len(captions)} for {len(videos)}")
+    sizes = {video.shape[1:] for video in videos}
+    if len(sizes) > 1:
+        raise ValueError(f"videos must have one size, got {sorted(size[:2] for size in sizes)}")
+    length = max(len(video) for video in videos)
+    padded = [video[np.minimum(np.arange(length), len(video) - 1)] for video in videos]
+    cells = [_captioned(video, caption) for video, caption in zip(padded, captions, strict=True)]
+    cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[i : i + columns], axis=2) for i in range(0, len(cells), columns)]
+    return np.concatenate(rows, axis=1)
+
+
+def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
+    """Write frames as H.264 in MP4, with the ffmpeg of `imageio_ffmpeg`.
+
+    The file appears at its place once it is complete.
+
+    Args:
+        path: of the file; its folder exists.
+        video: the frames; an odd last row or column is left out, for H.264 takes even sizes only.
+        fps: frames per second.
+
+    Raises:
+        OSError: if the file cannot be written.
+        RuntimeError: if ffmpeg fails.
+    """
+    # Imported here, for mediapy brings IPython with it, and drawing needs neither.
+    import imageio_ffmpeg
+    import mediapy
+
+    path = Path(path)
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    # Compressed to memory: a full disk is then Python's own OSError and not a page of ffmpeg's.
+    even = video[:, : video.shape[1] // 2 * 2, : video.shape[2] // 2 * 2]
+    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    # The index at the front lets a browser start before all is read.
+    content = mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) -> None:
+    for name, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}")
+    if positions.ndim != 2 or positions.shape[1] != mj_model.nq or not len(positions):
+        raise ValueError(f"qpos must have shape (states, nq) = (at least 1, {mj_model.nq}), got {positions.shape}")
+    if not np.isfinite(positions).all():
+        bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+        raise ValueError(f"qpos must be finite, got a value that is not in state {bad}; draw the states before it")
+
+
+def _nearest(num_states: int, timestep: Number, interval: Number) -> np.ndarray:
+    """The state nearest to each frame's time."""
+    # The last state counts as reached despite rounding in its time.
+    num_frames = int((num_states - 1) * timestep / interval + 1e-6) + 1
+    times = np.arange(num_frames) * interval
+    return np.minimum(np.rint(times / timestep).astype(int), num_states - 1)
+
+
+def _free_camera(mj_model: mujoco.MjModel) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(mj_model, camera)
+    return camera
+
+
+def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(mj_model, height, width)
+    # MuJoCo, PyOpenGL, glfw and the drivers each raise errors of their own here, some of no common class.
+    except Exception as error:
+        reason = str(error).partition(",")[0] or type(error).__name__
+        raise RenderingUnavailableError(
+            "rendering needs an OpenGL that works without a display, and none was found: install libosmesa6 (draws on "
+            "the processor) or libegl1 (with a GPU's driver) and start Python with MUJOCO_GL=osmesa or MUJOCO_GL=egl; "
+            f"without a display MuJoCo said: {reason}"
+        ) from error
+
+
+def _captioned(video: np.ndarray, caption: str) -> np.ndarray:
+    """Put a band with a caption above every frame."""
+    width = video.shape[2]
+    size = max(11, width // 28)
+    band = Image.new("RGB", (width, 2 * size), (24, 28, 36))
+    draw = ImageDraw.Draw(band)
+    # Pillow's own font lacks Greek letters; matplotlib, which mediapy needs anyway, brings one that has them.
+    import matplotlib
+
+    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
+    draw.text((width / 2, size), caption, font=font, fill=(238, 240, 244), anchor="mm")
+    return np.concatenate([np.broadcast_to(np.asarray(band), (len(video), *np.asarray(band).shape)), video], axis=1)

@@ -1,0 +1,130 @@
+"""Drawing: on a machine without OpenGL the refusal is tested in place of the pictures."""
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad.render import RenderingUnavailableError, frames, tile, write_video
+
+# A white ball that slides along x, seen from a camera that looks along y: its place in the picture is its place in x.
+SLIDER = """
+<mujoco>
+  <option timestep="0.01"/>
+  <visual><headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/></visual>
+  <worldbody>
+    <camera name="side" pos="0 -3 0" xyaxes="1 0 0 0 0 1"/>
+    <body><joint type="slide" axis="1 0 0"/><geom size="0.2" rgba="1 1 1 1"/></body>
+  </worldbody>
+</mujoco>
+"""
+TIMESTEP = 0.01
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(SLIDER)
+
+
+@pytest.fixture(scope="module")
+def opengl(model):
+    """Skip what needs pictures; that there is a sentence in their place has a test of its own."""
+    try:
+        frames(model, np.zeros((1, 1)), timestep=TIMESTEP, height=8, width=8)
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+
+
+def centres(video):
+    """Mean column of the white pixels of each frame, from -1 at the left edge to 1 at the right one."""
+    columns = np.linspace(-1, 1, video.shape[2])
+    brightness = (video > 200).all(axis=-1).sum(axis=1)
+    return (brightness * columns).sum(axis=1) / brightness.sum(axis=1)
+
+
+def test_without_opengl_the_error_names_the_packages():
+    """MUJOCO_GL=disable is what a machine without OpenGL comes down to."""
+    program = (
+        "import mujoco, numpy as np\n"
+        "from mjxgrad.render import RenderingUnavailableError, frames\n"
+        "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')\n"
+        "try:\n    frames(model, np.zeros((1, 0)), timestep=0.01)\n"
+        "except RenderingUnavailableError as error:\n    print(error)\n"
+    )
+    environment = {**os.environ, "MUJOCO_GL": "disable"}
+    result = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert "libosmesa6" in result.stdout, result.stderr
+    assert "libegl1" in result.stdout
+
+
+@pytest.mark.usefixtures("opengl")
+def test_the_picture_follows_the_state(model):
+    qpos = np.array([[-0.5], [0.0], [0.5]])
+    video = frames(model, qpos, timestep=TIMESTEP, fps=100, height=60, width=80, camera="side")
+    left, middle, right = centres(video)
+    assert abs(middle) < 0.02
+    assert left == pytest.approx(-right, abs=0.02)
+    assert right > 0.2
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize(("speed", "expected"), [(1.0, 11), (0.5, 21), (2.0, 6)])
+def test_speed_sets_the_number_of_frames(model, speed, expected):
+    """100 steps of 0.01 s are 1 s, shown at 10 frames per second: 11 frames with the first, at real speed."""
+    video = frames(model, np.zeros((101, 1)), timestep=TIMESTEP, fps=10, speed=speed, height=16, width=16)
+    assert len(video) == expected
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_picture_may_be_larger_than_the_scene_says_and_the_scene_is_left_alone(model):
+    offscreen = model.vis.global_.offwidth
+    video = frames(model, np.zeros((1, 1)), timestep=TIMESTEP, height=8, width=offscreen + 10)
+    assert video.shape == (1, 8, offscreen + 10, 3)
+    assert model.vis.global_.offwidth == offscreen
+
+
+@pytest.mark.parametrize(
+    ("qpos", "settings", "sentence"),
+    [
+        (np.zeros((3, 2)), {}, r"qpos must have shape \(states, nq\) = \(at least 1, 1\), got \(3, 2\)"),
+        (np.zeros((0, 1)), {}, r"got \(0, 1\)"),
+        (np.array([[0.0], [np.nan]]), {}, "not in state 1"),
+        (np.zeros((3, 1)), {"fps": 0.0}, "fps must be positive, got 0.0"),
+        (np.zeros((3, 1)), {"speed": -1.0}, "speed must be positive, got -1.0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_a_sentence(model, qpos, settings, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        frames(model, qpos, timestep=TIMESTEP, **settings)
+
+
+def test_tiles_stand_in_rows_and_the_shorter_video_keeps_its_last_frame():
+    short = np.full((1, 20, 40, 3), 50, np.uint8)
+    long = np.stack([np.full((20, 40, 3), value, np.uint8) for value in (100, 200)])
+    tiled = tile([short, long, short], ["soft", "stiff", "σ = 0.1"], columns=2)
+    band = tiled.shape[1] // 2 - 20
+    assert tiled.shape == (2, 2 * (band + 20), 80, 3)
+    assert band > 0
+    assert (tiled[1, band : band + 20, :40] == 50).all()
+    assert (tiled[1, band : band + 20, 40:] == 200).all()
+    assert (tiled[:, band + 20 :, 40:] == 0).all()
+
+
+def test_a_caption_too_few_is_refused():
+    with pytest.raises(ValueError, match="captions must be as many as videos"):
+        tile([np.zeros((1, 8, 8, 3), np.uint8)] * 2, ["one"], columns=2)
+
+
+def test_a_video_is_complete_or_absent(tmp_path):
+    video = np.random.default_rng(0).integers(0, 255, (5, 33, 48, 3), dtype=np.uint8)
+    write_video(tmp_path / "video.mp4", video, fps=10)
+    assert [path.name for path in tmp_path.iterdir()] == ["video.mp4"]
+    # An MP4 names its brand in its first box; moov before mdat lets a browser start at once.
+    content = (tmp_path / "video.mp4").read_bytes()
+    assert content[4:8] == b"ftyp"
+    assert content.index(b"moov") < content.index(b"mdat")
+    with pytest.raises(OSError, match="absent"):
+        write_video(tmp_path / "absent" / "video.mp4", video, fps=10)
