@@ -16,12 +16,20 @@ try:
     with contextlib.redirect_stdout(_said):
         from mujoco import mjx
 
-        # Not public, but what decides which geoms MJX tests for contact: a second implementation
-        # of that rule could disagree with it.
-        from mujoco.mjx._src.collision_driver import geom_pairs
+        # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
+        # has: second implementations of these rules could disagree with them.
+        from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
+        from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
 finally:
     sys.stdout.writelines(
         line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE)
     )
 
-__all__ = ["geom_pairs", "mjx"]
+__all__ = [
+    "counts",
+    "geom_pairs",
+    "has_collision_fn",
+    "make_efc_address",
+    "make_efc_type",
+    "mjx",
+]

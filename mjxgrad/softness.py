@@ -61,13 +61,23 @@ class Softness(eqx.Module):
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse two subsets at once.
+        """Refuse two subsets at once, and values without meaning if they are known.
 
         Raises:
-            ValueError: if both `geoms` and `pairs` are given.
+            ValueError: if both `geoms` and `pairs` are given, if stiffness or width is not
+                positive, damping ratio negative, or impedance not between 0 and 1.
         """
         if self.geoms is not None and self.pairs is not None:
-            raise ValueError("give either geoms or pairs to Softness, got both")
+            raise ValueError("Softness takes either geoms or pairs, got both")
+        for name, is_valid, requirement in (
+            ("stiffness", lambda x: x > 0, "positive"),
+            ("damping_ratio", lambda x: x >= 0, "at least 0"),
+            ("impedance", lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+            ("width", lambda x: x > 0, "positive"),
+        ):
+            value = getattr(self, name)
+            if _is_known(value) and not np.all(is_valid(np.asarray(value))):
+                raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
 
     @classmethod
     def sweep(cls, **parts: Any) -> "Softness":
@@ -106,9 +116,11 @@ class Softness(eqx.Module):
             The model with other `geom_solref`, `geom_solimp`, `pair_solref`, `pair_solimp`.
 
         Raises:
-            ValueError: if a name is unknown; if a geom to be changed also decides the contact of
-                a pair that was not selected; if the present values to be kept disagree.
+            ValueError: if a part has a leading axis; if a name is unknown; if a geom to be changed
+                also decides the contact of a pair that was not selected; if the present values
+                to be kept disagree.
         """
+        self._refuse_batch()
         selected = _select(model, self)
         _refuse_shared_geoms(model, selected)
         # For each place to be written, the pair that it belongs to.
@@ -142,13 +154,52 @@ class Softness(eqx.Module):
         )
 
     def _set_solimp(self, solimp: Array, rows: list[int]) -> Array:
-        rows = np.array(rows, dtype=int)
+        """Write impedance and width; they mix linearly, so the rest keeps its mixed value."""
+        if not rows:
+            return solimp
         if self.impedance is not None:
-            solimp = solimp.at[rows, :2].set(self.impedance[..., None, :] if self.impedance.ndim
-                                             else self.impedance)
+            solimp = solimp.at[np.array(rows), :2].set(self.impedance)
         if self.width is not None:
-            solimp = solimp.at[rows, 2].set(self.width)
+            solimp = solimp.at[np.array(rows), 2].set(self.width)
         return solimp
+
+    def _refuse_batch(self) -> None:
+        for name in ("stiffness", "damping_ratio", "impedance", "width"):
+            value = getattr(self, name)
+            allowed = [(), (2,)] if name == "impedance" else [()]
+            if value is not None and value.shape not in allowed:
+                raise ValueError(
+                    f"{name} must be one value to be applied, got shape {value.shape}; "
+                    f"apply a sweep under jax.vmap"
+                )
+
+
+def softness_warnings(softness: Softness, model: mjx.Model) -> list[str]:
+    """Say which parts of a softness have no effect on a model.
+
+    Args:
+        softness: as applied; parts that are traced are not looked at.
+        model: of MJX.
+
+    Returns:
+        Sentences; none if every part has its effect.
+    """
+    if not contact_pairs(model):
+        return ["softness has no effect: no two geoms of the scene can touch"]
+    low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
+    messages = []
+    if _is_known(softness.impedance):
+        for value in np.unique(np.asarray(softness.impedance)):
+            if not low <= value <= high:
+                messages.append(
+                    f"impedance {value:g} has the effect of {np.clip(value, low, high):g}: "
+                    f"MuJoCo keeps it between {low:g} and {high:g}"
+                )
+    return messages
+
+
+def _is_known(value: Array | None) -> bool:
+    return value is not None and not isinstance(value, jax.core.Tracer)
 
 
 def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:

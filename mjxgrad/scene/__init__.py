@@ -1,6 +1,8 @@
 """From MJCF to a scene that MJX can step: what it has, what was converted and left out."""
 
-from mjxgrad.scene.load import load_scene
-from mjxgrad.scene.scene import Conversion, Omission, Scene, SceneError
+from mjxgrad.scene.conversions import Conversion
+from mjxgrad.scene.load import SceneError, load_scene
+from mjxgrad.scene.omissions import Omission
+from mjxgrad.scene.scene import Scene, SceneWarning
 
-__all__ = ["Conversion", "Omission", "Scene", "SceneError", "load_scene"]
+__all__ = ["Conversion", "Omission", "Scene", "SceneError", "SceneWarning", "load_scene"]

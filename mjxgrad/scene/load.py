@@ -1,49 +1,190 @@
-"""Reading a scene."""
+"""From a file, a string or a C model to a scene."""
 
 import copy
+import math
 import os
+import warnings
 from pathlib import Path
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import mujoco
 
-from mjxgrad._mjx import mjx
+from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contacts import contact_pairs
-from mjxgrad.scene.scene import Scene, SceneError
-from mjxgrad.softness import Softness
+from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
+from mjxgrad.scene.omissions import leave_out
+from mjxgrad.scene.refusals import refusal_messages
+from mjxgrad.scene.scene import Scene, SceneWarning
+from mjxgrad.softness import Softness, softness_warnings
+
+_FLOAT32_TOLERANCE = 1e-6
+_SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
+
+
+class SceneError(ValueError):
+    """A scene cannot be loaded; the message says what, what is required and the remedy."""
 
 
 def load_scene(
-    source: str | os.PathLike | mujoco.MjModel,
+    source: str | os.PathLike[str] | mujoco.MjModel,
     *,
     softness: Softness | None = None,
     keep_everything: bool = False,
     timestep: float | None = None,
 ) -> Scene:
-    """Load a scene."""
-    mj_model = _compile(source)
+    """Load a scene, convert or refuse what MJX lacks and leave out what the scene does not need.
+
+    Arrays are float64 if `jax_enable_x64` is set and float32 otherwise. In float32 a solver
+    tolerance below 1e-6 is raised to it: the scaled improvement and gradient that it is compared
+    with are not resolved below, and the solver would only run into its iteration limit.
+
+    Args:
+        source: path of an MJCF file, MJCF as a string, or a C model, which is not changed.
+        softness: contact softness to set, instead of that in the file.
+        keep_everything: leave out nothing, and keep the solver tolerance and the storage of
+            matrices as in the file. The motion is the same to rounding.
+        timestep: in s, instead of that in the file.
+
+    Returns:
+        The scene. `print(scene.summary())` shows what it has.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        IsADirectoryError: if the path is a folder.
+        TypeError: if the source is none of the three.
+        ValueError: if `timestep` is not positive, or as `Softness.apply`.
+        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or MJX cannot simulate
+            it; all unsupported features are named at once.
+    """
+    mj_model, name = _compile(source)
     if timestep is not None:
+        if not (math.isfinite(timestep) and timestep > 0):
+            raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
         mj_model.opt.timestep = timestep
-    model = mjx.put_model(mj_model, impl="jax")
-    data = mjx.make_data(mj_model, impl="jax")
-    scene = Scene(model, data, mj_model, (), (), contact_pairs(mj_model))
-    return scene if softness is None else scene.with_softness(softness)
+    if mj_model.nv == 0:
+        raise SceneError(
+            f"{name} must have at least one degree of freedom, got none (nv = 0), so that nothing "
+            f"can move; give a body a joint"
+        )
+    conversions = _make_simulable(mj_model, name)
+
+    stepped = copy.deepcopy(mj_model)
+    conversions += list(drop_sensors(stepped))
+    omissions = ()
+    if not keep_everything:
+        omissions = leave_out(stepped)
+        conversions += _fit_solver(stepped)
+    model, data = _put(stepped, name)
+
+    pairs = contact_pairs(mj_model)
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name)
+    inexact = [c for c in conversions if not c.exact]
+    messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in inexact]
+    if softness is not None:
+        scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
+        messages += softness_warnings(softness, scene.model)
+    for message in messages + scene.warnings():
+        warnings.warn(f"{name}: {message}", SceneWarning, stacklevel=2)
+    return scene
 
 
-def _compile(source) -> mujoco.MjModel:
-    """The C model of a source; a copy if the source is one already."""
+def _compile(source: str | os.PathLike[str] | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:
+    """The C model of a source, ours to change, and how messages call it."""
     if isinstance(source, mujoco.MjModel):
-        return copy.deepcopy(source)
-    if isinstance(source, str) and source.lstrip().startswith("<"):
-        try:
-            return mujoco.MjModel.from_xml_string(source)
-        except ValueError as error:
-            raise SceneError(f"MuJoCo cannot read the MJCF string: {error}") from error
+        return copy.deepcopy(source), "the model"
+    accepted = "an MJCF file, MJCF as a string (starting with '<') or a mujoco.MjModel"
+    if not isinstance(source, str | os.PathLike):
+        raise TypeError(f"source must be {accepted}, got {type(source).__name__}")
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
+        return _parse(mujoco.MjModel.from_xml_string, source.strip("\ufeff \t\r\n"), "the MJCF")
     path = Path(source)
     if path.is_dir():
-        raise IsADirectoryError(f"scene must be an MJCF file, got the directory {str(path)!r}")
-    if not path.exists():
-        raise FileNotFoundError(f"no scene file at {str(path)!r}")
+        raise IsADirectoryError(f"source must be {accepted}, got the folder {str(path)!r}")
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"source must be {accepted}, got {str(path)!r}, which does not exist; relative paths "
+            f"start at the current folder"
+        )
+    return _parse(mujoco.MjModel.from_xml_path, str(path), path.name)
+
+
+def _parse(read, argument: str, name: str) -> tuple[mujoco.MjModel, str]:
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        return read(argument), name
     except ValueError as error:
-        raise SceneError(f"MuJoCo cannot read {str(path)!r}: {error}") from error
+        message = " ".join(str(error).split())
+        raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (
+            error
+        )
+
+
+def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:
+    """Convert in place what can be converted; refuse the rest."""
+    conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
+    refused = refusal_messages(mj_model)
+    if len(refused) == 1:
+        raise SceneError(f"{name} cannot be simulated: {refused[0]}")
+    if refused:
+        listed = "\n".join(f"  - {message}" for message in refused)
+        raise SceneError(f"{name} cannot be simulated for {len(refused)} reasons:\n{listed}")
+    return conversions + [c for rule in AFTER_REFUSALS for c in rule(mj_model)]
+
+
+def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
+    """Store small matrices densely, and ask of float32 only what it resolves."""
+    conversions = []
+    if model.nv < _SPARSE_FROM:
+        if model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE:
+            reason = f"faster below {_SPARSE_FROM} degrees of freedom, the same numbers"
+            conversions.append(Conversion("jacobian", "sparse", "dense", reason))
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    is_single = jnp.result_type(float) == jnp.float32
+    if is_single and model.opt.tolerance < _FLOAT32_TOLERANCE:
+        given, model.opt.tolerance = model.opt.tolerance, _FLOAT32_TOLERANCE
+        used = f"{_FLOAT32_TOLERANCE:g}"
+        reason = "float32 resolves no more"
+        conversions.append(Conversion("tolerance", f"{given:g}", used, reason))
+    return conversions
+
+
+def _put(model: mujoco.MjModel, name: str) -> tuple[mjx.Model, mjx.Data]:
+    """Model and data of MJX."""
+    if not contact_pairs(model):
+        # MJX insists on a collision function even for pairs whose contact is disabled.
+        model.geom_contype[:] = 0
+        model.geom_conaffinity[:] = 0
+    try:
+        mjx_model = mjx.put_model(model, impl="jax")
+        return mjx_model, _make_data(model, mjx_model)
+    except NotImplementedError as error:
+        raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
+
+
+def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
+    """Data of MJX, also for frictionless contacts beside elliptic ones, which MJX refuses."""
+    cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    data = mjx.make_data(model, impl="jax")
+    model.opt.cone = cone
+    if cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return data
+    condim = data._impl.contact.dim
+    efc_type = make_efc_type(mjx_model, condim)
+    num_equality, num_friction, num_limit, num_contact = counts(efc_type)
+    num_rows = num_equality + num_friction + num_limit + num_contact
+    rows = {
+        f"_impl.{field.name}": jnp.zeros((num_rows, *value.shape[1:]), value.dtype)
+        for field in data._impl.fields()
+        if field.name.startswith("efc_")
+        and isinstance(value := getattr(data._impl, field.name), jax.Array)
+    }
+    sizes = {
+        "_impl.ne": num_equality,
+        "_impl.nf": num_friction,
+        "_impl.nl": num_limit,
+        "_impl.nefc": num_rows,
+        "_impl.efc_type": efc_type,
+        "_impl.contact.efc_address": make_efc_address(mjx_model, condim, efc_type),
+    }
+    return data.tree_replace(rows | sizes)

@@ -1,0 +1,120 @@
+r"""Contacts that MuJoCo alters without a word, or that the time step cannot follow."""
+
+import mujoco
+import numpy as np
+
+from mjxgrad._mjx import mjx
+from mjxgrad.contacts import ContactPair, contact_parameters
+
+
+def largest_stable_step(damping_ratio: float, integrator: int) -> float:
+    r"""Largest $h \omega_0$ at which a contact at full impedance does not gain energy.
+
+    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and
+    $\zeta = b / (2 \omega_0)$. Semi-implicit Euler, as which `implicitfast` treats contact too,
+    is stable while $h^2 k + 2 h b < 4$, that is up to $2 (\sqrt{1 + \zeta^2} - \zeta)$. RK4 is
+    stable while its amplification factor at both eigenvalues is at most 1.
+
+    Args:
+        damping_ratio: $\zeta$.
+        integrator: of MuJoCo, `mujoco.mjtIntegrator`.
+
+    Returns:
+        The limit of $h \omega_0$; the limit of $h b$ is $2 \zeta$ times this.
+    """
+    if integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        # The difference of two large numbers, in a form that does not cancel.
+        return 2.0 / (np.sqrt(1.0 + damping_ratio**2) + damping_ratio)
+    stable, unstable = 0.0, 3.0
+    for _ in range(50):
+        middle = (stable + unstable) / 2
+        if _runge_kutta_growth(middle, damping_ratio) <= 1.0:
+            stable = middle
+        else:
+            unstable = middle
+    return stable
+
+
+def _runge_kutta_growth(step: float, damping_ratio: float) -> float:
+    root = np.emath.sqrt(damping_ratio**2 - 1.0)
+    z = step * np.array([-damping_ratio + root, -damping_ratio - root])
+    return float(np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max())
+
+
+def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[str]:
+    """Say which contacts are altered by `refsafe` or too stiff for the time step.
+
+    Args:
+        model: of MJX, with known values.
+        pairs: its pairs that can touch.
+
+    Returns:
+        Sentences, one for all pairs that have the same parameters.
+    """
+    if not pairs:
+        return []
+    parameters = contact_parameters(model, pairs)
+    solref, stiffness, damping = (
+        np.asarray(x, dtype=float)
+        for x in (parameters.solref, parameters.stiffness, parameters.damping)
+    )
+    timestep = float(model.opt.timestep)
+    messages: dict[str, list[ContactPair]] = {}
+    for pair, (first, second), k, b in zip(pairs, solref, stiffness, damping, strict=True):
+        for message in (
+            _altered_by_refsafe(first, second, b, timestep),
+            _beyond_stability(k, b, timestep, int(model.opt.integrator)),
+        ):
+            if message:
+                messages.setdefault(message, []).append(pair)
+    return [f"contact of {name_pairs(same)}: {text}" for text, same in messages.items()]
+
+
+def name_pairs(pairs: list[ContactPair]) -> str:
+    """Two pairs by name, or the first of them and how many more there are."""
+    if len(pairs) == 1 or len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36:
+        return ", ".join(str(pair) for pair in pairs)
+    return f"{pairs[0]} + {len(pairs) - 1} more"
+
+
+def format_number(x: float) -> str:
+    """Three digits; whole numbers up to 99999 in full."""
+    x = float(x)
+    if np.isinf(x):
+        return "∞" if x > 0 else "−∞"
+    if 1e3 <= abs(x) < 99999.5:
+        return f"{x:.0f}"
+    return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def _altered_by_refsafe(
+    time_constant: float, damping_ratio: float, damping: float, timestep: float
+) -> str | None:
+    # A relative margin, because float32 rounds a time constant of exactly two steps.
+    if time_constant <= 0 or 2.0 / damping <= time_constant * (1 + 1e-5):
+        return None
+    return (
+        f"its time constant {time_constant:g} s is below two time steps, so refsafe replaces it by "
+        f"{2 * timestep:g} s and smaller values have no effect; use a time step of at most "
+        f"{time_constant / 2:g} s, or Softness, which writes the format that refsafe leaves alone"
+    )
+
+
+def _beyond_stability(
+    stiffness: float, damping: float, timestep: float, integrator: int
+) -> str | None:
+    if stiffness <= 0:
+        return None
+    frequency = np.sqrt(stiffness)
+    limit = largest_stable_step(damping / (2 * frequency), integrator)
+    if timestep * frequency < limit:
+        return None
+    is_euler = integrator != mujoco.mjtIntegrator.mjINT_RK4
+    measure = timestep**2 * stiffness + 2 * timestep * damping
+    criterion = f"h²k + 2hb = {measure:.3g}, stable below 4" if is_euler else "RK4"
+    return (
+        f"stiffness {format_number(stiffness)} 1/s² and damping {format_number(damping)} 1/s are "
+        f"beyond what a time step of {timestep:g} s integrates without gaining energy "
+        f"({criterion}); use a time step below {format_number(limit / frequency)} s, or at this "
+        f"damping ratio a stiffness below {format_number((limit / timestep) ** 2)} 1/s²"
+    )

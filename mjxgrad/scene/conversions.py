@@ -1,0 +1,265 @@
+"""Settings that MJX trips over or ignores, replaced by what gives the same motion.
+
+Each rule changes a copy of the C model in place and says what it did. Where the motion cannot be
+kept exactly the conversion says so, and loading the scene warns.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjxgrad._mjx import mjx
+from mjxgrad.contacts import contact_pairs, deciding_geoms
+from mjxgrad.scene.refusals import describe_pair, element_name, has_medium
+
+_DISABLE = mujoco.mjtDisableBit
+_ENABLE = mujoco.mjtEnableBit
+_GEOM = mujoco.mjtGeom
+_SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
+_EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A setting of the file and what stands in its place.
+
+    Attributes:
+        what: the setting, as MJCF calls it.
+        given: its value in the file.
+        used: what stands in its place.
+        reason: why the motion is the same, or what differs.
+        exact: whether the motion is that of C MuJoCo, up to the solver's tolerance.
+    """
+
+    what: str
+    given: str
+    used: str
+    reason: str
+    exact: bool = True
+
+
+def _has(model: mujoco.MjModel, flag: int) -> bool:
+    return bool(model.opt.disableflags & flag)
+
+
+def _enable_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
+    for flag, reason, exact in (
+        (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
+        (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing", True),
+        (_ENABLE.mjENBL_SLEEP, "bodies at rest are stepped too, not frozen below "
+                               "sleep_tolerance as in C MuJoCo", False),
+    ):  # fmt: skip
+        if model.opt.enableflags & flag.value:
+            model.opt.enableflags &= ~flag.value
+            name = flag.name.removeprefix("mjENBL_").lower()
+            yield Conversion(f"flag {name}", "enable", "disable", reason, exact)
+
+
+def _c_only_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
+    for flag in ("ISLAND", "MIDPHASE", "NATIVECCD", "MULTICCD", "AUTORESET"):
+        bit = getattr(_DISABLE, f"mjDSBL_{flag}").value
+        if _has(model, bit):
+            reason = "chooses between algorithms of C MuJoCo; MJX has its own"
+            yield Conversion(f"flag {flag.lower()}", "disable", "ignored", reason)
+
+
+def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
+    given = model.opt.solver
+    if given == mujoco.mjtSolver.mjSOL_NEWTON:
+        return
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and any(
+        pair.condim > 1 for pair in contact_pairs(model)
+    )
+    if given == mujoco.mjtSolver.mjSOL_PGS and elliptic:
+        reason = "with elliptic cones PGS stops short of the optimum that Newton finds"
+        yield Conversion("solver", "PGS", "Newton", reason, exact=False)
+    else:
+        name = mujoco.mjtSolver(given).name.removeprefix("mjSOL_")
+        yield Conversion("solver", name, "Newton", "the same convex problem, the same optimum")
+
+
+def _noslip(model: mujoco.MjModel) -> Iterator[Conversion]:
+    # Refused before, if there is friction for it to act on.
+    if model.opt.noslip_iterations > 0:
+        given, model.opt.noslip_iterations = model.opt.noslip_iterations, 0
+        yield Conversion("noslip_iterations", str(given), "0", "the scene has no friction")
+
+
+def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
+    if model.opt.wind.any() and not has_medium(model):
+        given = " ".join(f"{w:g}" for w in model.opt.wind)
+        model.opt.wind[:] = 0.0
+        yield Conversion("wind", given, "0 0 0", "there is no medium: density = viscosity = 0")
+
+
+def _passive_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """With one of the two flags disabled MJX drops every passive force, C only its own."""
+    spring, damper = _has(model, _SPRING), _has(model, _DAMPER)
+    if spring and not damper:
+        model.opt.disableflags &= ~_SPRING
+        for field in ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness"):
+            getattr(model, field)[:] = 0.0
+        model.tendon_stiffnesspoly[:] = 0.0
+        yield Conversion("flag spring", "disable", "stiffness 0", "MJX would drop damping as well")
+    if damper and not spring:
+        model.opt.disableflags &= ~_DAMPER
+        for field in ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly",
+                      "actuator_damping", "actuator_dampingpoly"):  # fmt: skip
+            getattr(model, field)[:] = 0.0
+        yield Conversion("flag damper", "disable", "damping 0", "MJX would drop springs as well")
+    if spring and damper and not _has(model, _EULERDAMP):
+        model.opt.disableflags |= _EULERDAMP
+        reason = "with the damper flag disabled C MuJoCo integrates no damping, MJX would"
+        yield Conversion("flag eulerdamp", "enable", "disable", reason)
+
+
+def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """Armature and damping of an actuator, seen through its gear, belong to its target."""
+    if not (model.actuator_armature.any() or model.actuator_damping.any()):
+        return
+    targets = (
+        ("joint", model.jnt_actuatorid, model.jnt_dofadr, model.dof_armature, model.dof_damping),
+        ("tendon", model.tendon_actuatorid, np.arange(model.ntendon), model.tendon_armature,
+         model.tendon_damping),
+    )  # fmt: skip
+    for word, actuators, addresses, armature, damping in targets:
+        for target, actuator in enumerate(actuators):
+            if actuator < 0:
+                continue
+            gear = model.actuator_gear[model.actuator_outadr[actuator], 0]
+            address = addresses[target]
+            armature[address] += gear**2 * model.actuator_armature[actuator]
+            damping[address] += gear**2 * model.actuator_damping[actuator]
+            actuators[target] = -1
+            name = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
+            used = f"of its {word}, times gear²"
+            reason = "a constant gear makes the two the same"
+            yield Conversion(f"{name} armature, damping", "of the actuator", used, reason)
+    model.actuator_armature[:] = 0.0
+    model.actuator_damping[:] = 0.0
+
+
+def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """C clips every coefficient from below, MJX does not and divides by it."""
+    used = {1: [], 3: [0], 4: [0, 1], 6: [0, 1, 2]}
+    raised: list[str] = []
+    for pair in contact_pairs(model):
+        if pair.explicit >= 0:
+            rows = [model.pair_friction[pair.explicit][: max(pair.condim - 1, 0)]]
+        else:
+            rows = [model.geom_friction[g] for g in deciding_geoms(model, pair)]
+            rows = rows if np.max([r[used[pair.condim]] for r in rows], axis=0).size else []
+        if not rows:
+            continue
+        needed = slice(None) if pair.explicit >= 0 else used[pair.condim]
+        if (np.max([r[needed] for r in rows], axis=0) < mujoco.mjMINMU).any():
+            raised.append(str(pair))
+    if raised:
+        for field in ("geom_friction", "pair_friction"):
+            np.maximum(getattr(model, field), mujoco.mjMINMU, out=getattr(model, field))
+        what = f"friction of {raised[0]}" + (f" + {len(raised) - 1}" if len(raised) > 1 else "")
+        yield Conversion(what, "0", f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it")
+
+
+def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        return
+    if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
+        reason = "MJX leaves out the gyroscopic derivative of free bodies; same order of accuracy"
+        yield Conversion("integrator", "implicitfast", "MJX's implicitfast", reason, exact=False)
+    affine_gain = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (
+        model.actuator_gainprm[:, 2] != 0
+    )
+    affine_bias = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (
+        model.actuator_biasprm[:, 2] != 0
+    )
+    muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
+    limited = model.actuator_forcelimited.astype(bool)
+    # One control per actuator: others are refused.
+    clamped = model.actuator_ctrllimited[model.actuator_ctrladr].astype(bool)
+    differs = muscle | ((affine_gain | affine_bias) & limited) | (affine_gain & clamped)
+    if differs.any():
+        which = np.flatnonzero(differs)
+        first = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, which[0])
+        more = f" + {which.size - 1}" if which.size > 1 else ""
+        reason = "its velocity derivative ignores force and control limits and muscles"
+        yield Conversion(
+            f"integrator at {first}{more}",
+            "implicitfast",
+            "MJX's implicitfast",
+            reason,
+            exact=False,
+        )
+
+
+def _distance_field_pairs(model: mujoco.MjModel) -> Iterator[Conversion]:
+    searched = {
+        frozenset(pair)
+        for pair in (
+            (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
+            (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
+            (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
+            (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID),
+            (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
+            (_GEOM.mjGEOM_ELLIPSOID,),
+            (_GEOM.mjGEOM_CYLINDER,),
+        )
+    }
+    for pair in contact_pairs(model):
+        types = frozenset(_GEOM(t) for t in model.geom_type[[pair.geom1, pair.geom2]])
+        if types in searched:
+            reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
+            yield Conversion(
+                f"contact of {describe_pair(model, pair)}",
+                "exact",
+                "MJX's search on distance fields",
+                reason,
+                exact=False,
+            )
+
+
+def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """A sensor that MJX lacks would raise or read zero; it moves nothing, so it may stay."""
+    known = {int(member) for member in mjx.SensorType}
+    delayed = (model.sensor_history[:, 0] > 0) | (model.sensor_interval[:, 0] > 0)
+    for i in range(model.nsensor):
+        kind = mujoco.mjtSensor(model.sensor_type[i])
+        if int(kind) in known and not delayed[i] and not _is_unmatched_contact(model, i):
+            continue
+        # No stage computes it any more; the type must be one that MJX knows.
+        model.sensor_needstage[i] = mujoco.mjtStage.mjSTAGE_NONE
+        model.sensor_type[i] = mujoco.mjtSensor.mjSENS_CLOCK
+        name = element_name(model, mujoco.mjtObj.mjOBJ_SENSOR, i)
+        word = "delayed " if delayed[i] else ""
+        given = word + kind.name.removeprefix("mjSENS_").lower()
+        yield Conversion(name, given, "reads 0", "MJX cannot compute it", exact=False)
+
+
+def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
+    if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_CONTACT:
+        return False
+    objects = {int(model.sensor_objtype[sensor]), int(model.sensor_reftype[sensor])}
+    by_body = {int(o) for o in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)}
+    by_site = model.sensor_objtype[sensor] == mujoco.mjtObj.mjOBJ_SITE
+    net_force = model.sensor_intprm[sensor, 1] == 3
+    return bool(objects & by_body) or by_site or net_force
+
+
+# Those that make a refusal needless come before the refusals, the others after them.
+BEFORE_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
+    _enable_flags,
+    _c_only_flags,
+    _wind,
+    _passive_flags,
+)
+AFTER_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
+    _solver,
+    _noslip,
+    _actuator_inertia,
+    _least_friction,
+    _implicitfast,
+    _distance_field_pairs,
+)

@@ -1,0 +1,143 @@
+"""What a step of a scene leaves out, and why its motion does not need it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjxgrad.contacts import contact_pairs
+from mjxgrad.scene.refusals import has_medium
+
+_DISABLE = mujoco.mjtDisableBit
+_EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
+
+
+@dataclass(frozen=True)
+class Omission:
+    """Work that a step of this scene does not do.
+
+    Attributes:
+        what: the stage, or the elements.
+        reason: why the motion does not need it.
+    """
+
+    what: str
+    reason: str
+
+
+def leave_out(model: mujoco.MjModel) -> tuple[Omission, ...]:
+    """Switch off what a scene does not need, and list all that a step of it leaves out.
+
+    Most stages cost nothing once the model has no element for them, for their arrays have no
+    rows, and what is computed for reading only is removed by XLA from a compiled rollout, which
+    carries nothing but the state. One flag has to be set: Euler integration would factorise the
+    mass matrix a second time for damping that is zero.
+
+    Args:
+        model: changed in place.
+
+    Returns:
+        The omissions, in the order of a step.
+    """
+    omissions = tuple(Omission(what, reason) for what, find in _TABLE if (reason := find(model)))
+    if _has_needless_eulerdamp(model):
+        model.opt.disableflags |= _EULERDAMP
+    return omissions
+
+
+def _absent(absence: str, is_there: Callable[[mujoco.MjModel], bool], flag=None):
+    """Reason for leaving out a stage: it has no elements, or its flag is disabled."""
+
+    def reason(model: mujoco.MjModel) -> str | None:
+        if flag is not None and model.opt.disableflags & flag.value:
+            name = flag.name.removeprefix("mjDSBL_").lower()
+            return f"the file disables the flag {name}"
+        return None if is_there(model) else absence
+
+    return reason
+
+
+def _counted(count: Callable[[mujoco.MjModel], int], reason: str):
+    """Reason for leaving out elements of which there are some, with their number."""
+
+    def find(model: mujoco.MjModel) -> str | None:
+        number = int(count(model))
+        return f"{number}: {reason}" if number else None
+
+    return find
+
+
+def _has_needless_eulerdamp(model: mujoco.MjModel) -> bool:
+    return (
+        model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        and not model.opt.disableflags & _EULERDAMP
+        and not model.dof_damping.any()
+    )
+
+
+def _num_visual_geoms(model: mujoco.MjModel) -> int:
+    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
+    return model.ngeom - len(touching)
+
+
+def _num_unused_sites(model: mujoco.MjModel) -> int:
+    """Sites at which no tendon, actuator or equality constraint acts."""
+    wraps_site = np.isin(
+        model.wrap_type,
+        [mujoco.mjtWrap.mjWRAP_SITE, mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER],
+    )
+    if wraps_site.any() or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any():
+        return 0
+    if (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any():
+        return 0
+    return model.nsite
+
+
+def _num_render_meshes(model: mujoco.MjModel) -> int:
+    """Meshes of which no instance collides."""
+    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    collided = {int(model.geom_dataid[g]) for g in touching if is_mesh[g]}
+    return model.nmesh - len(collided)
+
+
+def _has_limits(model: mujoco.MjModel) -> bool:
+    return bool(model.jnt_limited.any() or model.tendon_limited.any())
+
+
+def _has_friction_loss(model: mujoco.MjModel) -> bool:
+    return bool((model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any())
+
+
+_TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
+    ("tendons", _absent("none in the scene", lambda m: m.ntendon > 0)),
+    ("collision detection",
+     _absent("no two geoms can touch", lambda m: bool(contact_pairs(m)),
+             _DISABLE.mjDSBL_CONTACT)),
+    ("equality constraints",
+     _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
+    ("friction loss",
+     _absent("no joint or tendon has any", _has_friction_loss,
+             _DISABLE.mjDSBL_FRICTIONLOSS)),
+    ("limits", _absent("no joint or tendon is limited", _has_limits, _DISABLE.mjDSBL_LIMIT)),
+    ("actuation", _absent("no actuators", lambda m: m.nu > 0, _DISABLE.mjDSBL_ACTUATION)),
+    ("gravity compensation",
+     _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
+    ("fluid forces", _absent("no medium: density = viscosity = 0", has_medium)),
+    ("implicit damping",
+     lambda m: "no joint is damped; keep_everything=True to differentiate by dof_damping"
+     if _has_needless_eulerdamp(m) else None),
+    ("sensors",
+     lambda m: _absent("none in the scene", lambda n: n.nsensor > 0, _DISABLE.mjDSBL_SENSOR)(m)
+     or f"{m.nsensor}: not computed unless something reads them"),
+    ("contact of visual geoms", _counted(_num_visual_geoms, "they match no other geom")),
+    ("sites", _counted(_num_unused_sites, "nothing acts at them; placed only if read")),
+    ("cameras", _counted(lambda m: m.ncam, "placed only if read, and for rendering")),
+    ("lights", _counted(lambda m: m.nlight, "rendering only")),
+    ("textures, materials", _counted(lambda m: m.ntex + m.nmat, "rendering only")),
+    ("skins", _counted(lambda m: m.nskin, "rendering only")),
+    ("visual meshes", _counted(_num_render_meshes, "rendering only; no instance collides")),
+    ("outputs of a step that nobody reads",
+     lambda m: "a compiled rollout carries only the state, so XLA removes them"),
+)  # fmt: skip

@@ -1,0 +1,281 @@
+"""What MJX cannot simulate, each with its remedy.
+
+The table is the result of stepping a small scene per feature in C MuJoCo and in MJX 3.17 and
+comparing: some features raise in MJX, without naming the element, and many more are ignored.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjxgrad._mjx import has_collision_fn, mjx
+from mjxgrad.contacts import contact_pairs
+
+_OBJECT = mujoco.mjtObj
+_ENABLE = mujoco.mjtEnableBit
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A feature that MJX lacks.
+
+    Attributes:
+        feature: what MJX has none of.
+        find: names the places where a model uses it; nothing if it does not.
+        remedy: what to do instead.
+    """
+
+    feature: str
+    find: Callable[[mujoco.MjModel], Iterable[str]]
+    remedy: str
+
+    def message(self, model: mujoco.MjModel) -> str | None:
+        """One sentence if a model uses the feature, else None."""
+        found = list(self.find(model))
+        if not found:
+            return None
+        more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+        return f"MJX has no {self.feature}, got {', '.join(found[:4])}{more}; {self.remedy}"
+
+
+def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    """An element as messages call it: its kind with its name or its number."""
+    name = mujoco.mj_id2name(model, kind, int(index))
+    word = kind.name.removeprefix("mjOBJ_").lower()
+    return f"{word} {name!r}" if name else f"{word} {int(index)}"
+
+
+def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray]):
+    """Names of the elements for which a condition holds; it gives one row per element."""
+
+    def find(model: mujoco.MjModel) -> list[str]:
+        rows = np.asarray(condition(model))
+        rows = rows.reshape(rows.shape[0], -1).any(axis=1) if rows.size else np.zeros(0, bool)
+        return [element_name(model, kind, i) for i in np.flatnonzero(rows)]
+
+    return find
+
+
+def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type, theirs: type, prefix: str):
+    """Names of elements whose type MJX does not know, with that type."""
+
+    def find(model: mujoco.MjModel) -> list[str]:
+        known = {int(member) for member in ours}
+        return [
+            f"{element_name(model, kind, i)} ({theirs(t).name.removeprefix(prefix).lower()})"
+            for i, t in enumerate(getattr(model, field))
+            if int(t) not in known
+        ]
+
+    return find
+
+
+def _when(condition: Callable[[mujoco.MjModel], bool], given: str | Callable):
+    """What is given, if a condition on the whole model holds."""
+
+    def find(model: mujoco.MjModel) -> list[str]:
+        if not condition(model):
+            return []
+        return [given(model) if callable(given) else given]
+
+    return find
+
+
+def _integrator(member: mujoco.mjtIntegrator):
+    name = member.name.removeprefix("mjINT_").lower()
+    return _when(lambda m: m.opt.integrator == member, f"integrator={name!r}")
+
+
+def _flag(member: mujoco.mjtEnableBit):
+    name = member.name.removeprefix("mjENBL_").lower()
+    return _when(lambda m: bool(m.opt.enableflags & member.value), f"<flag {name}='enable'/>")
+
+
+def has_medium(model: mujoco.MjModel) -> bool:
+    """Whether bodies move through a fluid."""
+    return model.opt.density > 0 or model.opt.viscosity > 0
+
+
+def has_constraints(model: mujoco.MjModel) -> bool:
+    """Whether any constraint can ever act."""
+    return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value and bool(
+        model.neq
+        or model.jnt_limited.any()
+        or model.tendon_limited.any()
+        or (model.dof_frictionloss > 0).any()
+        or (model.tendon_frictionloss > 0).any()
+        or contact_pairs(model)
+    )
+
+
+def _geom_type(model: mujoco.MjModel, geom: int) -> str:
+    return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+
+
+def describe_pair(model: mujoco.MjModel, pair) -> str:
+    """Two geoms by name and type."""
+    return " with ".join(
+        f"{name!r} ({_geom_type(model, geom)})"
+        for name, geom in zip(pair.names, (pair.geom1, pair.geom2), strict=True)
+    )
+
+
+def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
+    for pair in contact_pairs(model):
+        types = model.geom_type[[pair.geom1, pair.geom2]]
+        if not has_collision_fn(*types):
+            yield describe_pair(model, pair)
+
+
+def _margins_of_meshes(model: mujoco.MjModel) -> Iterator[str]:
+    without = {mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value}
+    for pair in contact_pairs(model):
+        if pair.explicit >= 0:
+            margin = model.pair_margin[pair.explicit]
+        else:
+            margin = model.geom_margin[[pair.geom1, pair.geom2]].sum()
+        if margin and without & set(model.geom_type[[pair.geom1, pair.geom2]].tolist()):
+            yield describe_pair(model, pair)
+
+
+def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
+    for field, kind in (
+        ("geom_solref", _OBJECT.mjOBJ_GEOM),
+        ("pair_solref", _OBJECT.mjOBJ_PAIR),
+        ("jnt_solref", _OBJECT.mjOBJ_JOINT),
+        ("dof_solref", _OBJECT.mjOBJ_DOF),
+        ("eq_solref", _OBJECT.mjOBJ_EQUALITY),
+        ("tendon_solref_lim", _OBJECT.mjOBJ_TENDON),
+        ("tendon_solref_fri", _OBJECT.mjOBJ_TENDON),
+    ):
+        for i, (first, second) in enumerate(getattr(model, field)):
+            if (first > 0) != (second > 0):
+                yield f"{first:g} {second:g} in {field} of {element_name(model, kind, i)}"
+
+
+def _has_frictional_rows(model: mujoco.MjModel) -> bool:
+    return (
+        any(pair.condim > 1 for pair in contact_pairs(model))
+        or (model.dof_frictionloss > 0).any()
+        or (model.tendon_frictionloss > 0).any()
+    )
+
+
+def _is_scalar_joint(model: mujoco.MjModel) -> np.ndarray:
+    joint = mujoco.mjtJoint
+    return np.isin(model.jnt_type, [joint.mjJNT_SLIDE.value, joint.mjJNT_HINGE.value])
+
+
+def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
+    group = model.actuator_group
+    in_range = (group >= 0) & (group < 31)
+    return in_range & ((model.opt.disableactuator >> np.clip(group, 0, 30)) & 1).astype(bool)
+
+
+_DIRECTLY = "remove it from the MJCF"
+
+REFUSALS: tuple[Refusal, ...] = (
+    Refusal("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
+            "build them of rigid bodies and joints"),
+    Refusal("plugins", _where(_OBJECT.mjOBJ_PLUGIN, lambda m: np.ones(m.nplugin, bool)),
+            "remove them, or replace signed distance fields by meshes or primitive geoms"),
+    Refusal("collision between some types of geom", _pairs_without_function,
+            "exclude the pair by contype and conaffinity or <contact><exclude>, or use "
+            "capsules, spheres or boxes"),
+    Refusal("margin in contacts of meshes and height fields", _margins_of_meshes,
+            "set margin='0' on both geoms"),
+    Refusal("integrator 'implicit'", _integrator(mujoco.mjtIntegrator.mjINT_IMPLICIT),
+            "use 'implicitfast', 'Euler' or 'RK4'"),
+    Refusal("integrator 'discrete'", _integrator(mujoco.mjtIntegrator.mjINT_DISCRETE),
+            "use 'implicitfast', 'Euler' or 'RK4'"),
+    Refusal("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
+            "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
+    Refusal("exact constraint diagonal",
+            lambda m: _flag(_ENABLE.mjENBL_DIAGEXACT)(m) if has_constraints(m) else [], _DIRECTLY),
+    Refusal("IPC contact", _flag(_ENABLE.mjENBL_IPC), _DIRECTLY),
+    Refusal("noslip solver",
+            _when(lambda m: m.opt.noslip_iterations > 0 and _has_frictional_rows(m),
+                  lambda m: f"noslip_iterations={m.opt.noslip_iterations}"),
+            "set noslip_iterations='0', and against slip use cone='elliptic' with a larger "
+            "impratio"),
+    Refusal("polynomial joint stiffness",
+            _where(_OBJECT.mjOBJ_JOINT, lambda m: m.jnt_stiffnesspoly != 0),
+            "keep the linear coefficient only"),
+    Refusal("polynomial joint damping",
+            _where(_OBJECT.mjOBJ_JOINT,
+                   lambda m: (m.dof_dampingpoly != 0)[m.jnt_dofadr]),
+            "keep the linear coefficient only"),
+    Refusal("polynomial tendon stiffness or damping",
+            _where(_OBJECT.mjOBJ_TENDON,
+                   lambda m: np.hstack([m.tendon_stiffnesspoly, m.tendon_dampingpoly]) != 0),
+            "keep the linear coefficients only"),
+    Refusal("polynomial actuator damping",
+            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_dampingpoly != 0),
+            "keep the linear coefficient only"),
+    Refusal("surface velocity", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_surfacevel != 0),
+            "drive the body that carries the geom by a joint"),
+    Refusal("contact adhesion", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_adhesion != 0),
+            _DIRECTLY),
+    Refusal("contact adhesion", _where(_OBJECT.mjOBJ_PAIR, lambda m: m.pair_adhesion != 0),
+            _DIRECTLY),
+    Refusal("ellipsoid fluid model",
+            _where(_OBJECT.mjOBJ_GEOM, lambda m: (m.geom_fluid[:, 0] > 0) & has_medium(m)),
+            "use fluidshape='none' for the box model, or set density and viscosity to zero"),
+    Refusal("fluid forces with integrator 'implicitfast'",
+            _when(lambda m: has_medium(m)
+                  and m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+                  lambda m: f"density={m.opt.density:g}, viscosity={m.opt.viscosity:g}"),
+            "use 'Euler' or 'RK4'"),
+    Refusal("such actuator transmission",
+            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_trntype", mjx.TrnType,
+                          mujoco.mjtTrn, "mjTRN_"),
+            "drive a joint, tendon or site instead"),
+    Refusal("such actuator dynamics",
+            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_dyntype", mjx.DynType,
+                          mujoco.mjtDyn, "mjDYN_"),
+            "use none, integrator, filter, filterexact or muscle"),
+    Refusal("such actuator gain",
+            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_gaintype", mjx.GainType,
+                          mujoco.mjtGain, "mjGAIN_"),
+            "use fixed, affine or muscle"),
+    Refusal("such actuator bias",
+            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_biastype", mjx.BiasType,
+                          mujoco.mjtBias, "mjBIAS_"),
+            "use none, affine or muscle"),
+    Refusal("actuators with several controls",
+            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_ctrlnum != 1),
+            "use one actuator per control"),
+    Refusal("disabled actuator groups", _where(_OBJECT.mjOBJ_ACTUATOR, _disabled_actuators),
+            "remove those actuators, or actuatorgroupdisable from <option>"),
+    Refusal("early activation",
+            _where(_OBJECT.mjOBJ_ACTUATOR,
+                   lambda m: m.actuator_actearly & (m.actuator_actadr >= 0)),
+            "set actearly='false'"),
+    Refusal("actuator delay",
+            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_history[:, 0] > 0),
+            "remove delay and nsample, and delay the controls before the rollout"),
+    Refusal("such equality constraint",
+            _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
+            "use connect, weld, joint or tendon"),
+    Refusal("solref of mixed signs", _mixed_solrefs,
+            "give two positive numbers (time constant, damping ratio) or two that are not "
+            "(−stiffness, −damping)"),
+    Refusal("joint limit that acts on both ends at once",
+            _where(_OBJECT.mjOBJ_JOINT,
+                   lambda m: m.jnt_limited & _is_scalar_joint(m)
+                   & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1))),
+            "make the joint's margin smaller than half its range"),
+    Refusal("tendon limit that acts on both ends at once",
+            _where(_OBJECT.mjOBJ_TENDON,
+                   lambda m: m.tendon_limited
+                   & (2 * m.tendon_margin > np.ptp(m.tendon_range, axis=1))),
+            "make the tendon's margin smaller than half its range"),
+)  # fmt: skip
+
+
+def refusal_messages(model: mujoco.MjModel) -> list[str]:
+    """One sentence for each feature of a model that MJX cannot simulate."""
+    messages = (refusal.message(model) for refusal in REFUSALS)
+    return [message for message in messages if message]
