@@ -54,10 +54,10 @@ class ContactPair:
 
 
 class ContactParameters(eqx.Module):
-    """Effective contact parameters of some pairs, one row each.
+    r"""Effective contact parameters of some pairs, one row each.
 
     Attributes:
-        stiffness: $k = \\omega_0^2$, in 1/s².
+        stiffness: $k = \omega_0^2$, in 1/s².
         damping: $b$, in 1/s.
         impedance: $d_0$ and $d_w$.
         width: penetration over which the impedance rises, in m.

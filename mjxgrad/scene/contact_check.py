@@ -72,7 +72,7 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
 
 def name_pairs(pairs: list[ContactPair]) -> str:
     """Two pairs by name, or the first of them and how many more there are."""
-    if len(pairs) == 1 or len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36:
+    if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
         return ", ".join(str(pair) for pair in pairs)
     return f"{pairs[0]} + {len(pairs) - 1} more"
 

@@ -92,7 +92,7 @@ def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
     parameters = scene.contact_parameters()
     columns = (
         [str(pair.condim) for pair in scene.pairs],
-        [" ".join(formatformat_number(x) for x in row) for row in np.asarray(parameters.solref)],
+        [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref)],
         _numbers(parameters.stiffness),
         _numbers(parameters.damping),
         _numbers(parameters.natural_frequency),
@@ -109,7 +109,7 @@ def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
 
 
 def _numbers(values) -> list[str]:
-    return [formatformat_number(x) for x in np.asarray(values)]
+    return [format_number(x) for x in np.asarray(values)]
 
 
 def _friction(condim: int, friction: np.ndarray) -> str:
