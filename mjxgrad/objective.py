@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.tasks.task import Task
+from mjxgrad.task import Task
 
 
 class Objective(eqx.Module):

@@ -1,5 +1,6 @@
 """The cost and noise of each scene in mjcf/."""
 
-from mjxgrad.tasks.task import Task
+from mjxgrad.task import SceneTask, Task
+from mjxgrad.tasks.ball_wall import BallWall, ball_wall
 
-__all__ = ["Task"]
+__all__ = ["BallWall", "SceneTask", "Task", "ball_wall"]

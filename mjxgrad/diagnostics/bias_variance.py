@@ -1,0 +1,294 @@
+"""Bias and variance of both kinds of gradient, against contact softness."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from mjxgrad.diagnostics.reference import REACH, Landscape, cell_points, map_in_chunks
+from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
+from mjxgrad.estimators.estimate import GradientEstimate
+from mjxgrad.estimators.sampling import DEFAULT_CHUNK_SIZE, Baseline, Plan, Samples, check_baseline, sample
+from mjxgrad.estimators.shared import both_plan, both_results, both_summary
+from mjxgrad.estimators.zeroth import zeroth_order
+from mjxgrad.objective import Objective, ParameterNoise
+
+
+class BiasVariance(eqx.Module):
+    """What `bias_variance` measured; `softness` × `points` are the leading axes.
+
+    An interval has its lower and upper ends on the very first axis and covers with chance `confidence`: Student's t for
+    means and biases, percentile bootstrap for variances.
+
+    Attributes:
+        softness: what was swept, stacked.
+        params: the points.
+        first: the first-order estimates.
+        zeroth: the zeroth-order estimates, of the same rollouts.
+        cost: without noise.
+        reference: the gradient of the smoothed cost, from rollouts of its own.
+        reference_error: its standard error.
+        reference_method: "landscape" (see `Landscape`) or "zeroth_order" (a long run).
+        bias: first order less reference.
+        bias_error: its standard error, from both.
+        first_interval: of the mean of the first-order estimate.
+        zeroth_interval: of the mean of the zeroth-order estimate.
+        reference_interval: of the reference.
+        bias_interval: of the bias.
+        first_variance_interval: of the variance of one first-order sample.
+        zeroth_variance_interval: of the variance of one zeroth-order sample.
+        landscape: the cost along the parameter at every softness, if there is only one parameter, with noise on it.
+        confidence: of every interval.
+    """
+
+    softness: PyTree
+    params: Float[Array, "points dim"]
+    first: GradientEstimate
+    zeroth: GradientEstimate
+    cost: Float[Array, "softness points"]
+    reference: Float[Array, "softness points dim"]
+    reference_error: Float[Array, "softness points dim"]
+    bias: Float[Array, "softness points dim"]
+    bias_error: Float[Array, "softness points dim"]
+    first_interval: Float[np.ndarray, "2 softness points dim"]
+    zeroth_interval: Float[np.ndarray, "2 softness points dim"]
+    reference_interval: Float[np.ndarray, "2 softness points dim"]
+    bias_interval: Float[np.ndarray, "2 softness points dim"]
+    first_variance_interval: Float[np.ndarray, "2 softness points"]
+    zeroth_variance_interval: Float[np.ndarray, "2 softness points"]
+    landscape: Landscape | None
+    reference_method: Literal["landscape", "zeroth_order"] = eqx.field(static=True)
+    confidence: float = eqx.field(static=True)
+
+
+def bias_variance(
+    objective_of_softness: Callable[[PyTree], Objective],
+    params: Float[Array, "points dim"],
+    key: PRNGKeyArray,
+    *,
+    softness: PyTree | Sequence[PyTree],
+    num_samples: int = 256,
+    num_reference: int = 2048,
+    baseline: Baseline = "leave_one_out",
+    confidence: float = 0.95,
+    num_resamples: int = 1000,
+    chunk_size: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> BiasVariance:
+    r"""Measure both estimates of the gradient of a smoothed cost, at every softness and point.
+
+    The noise is the same at every softness, so that differences between them are not luck. Everything is compiled once,
+    in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept for the
+    bootstrap: memory grows with points × `num_samples` × dim.
+
+    Args:
+        objective_of_softness: gives the objective at one softness; traceable.
+        params: points to measure at, one per row, in the parameters' units.
+        key: consumed here.
+        softness: any pytree whose leaves have a leading axis (`Softness.sweep`), or a sequence of pytrees.
+        num_samples: differentiated rollouts per softness and point. At least 2.
+        num_reference: rollouts for the reference, per softness if the cost is of one parameter with noise on it (one
+            landscape serves all points), otherwise per softness and point.
+        baseline: of the zeroth-order estimate.
+        confidence: of the intervals.
+        num_resamples: of the bootstrap.
+        chunk_size: rollouts at a time.
+        progress: called after every softness with how many are done and how many there are.
+
+    Returns:
+        The measurement.
+
+    Raises:
+        ValueError: if `params` is not a matrix, `softness` has no or unequal leading axes, or a number is out of range.
+
+    References:
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+        arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
+    """
+    check_baseline(baseline)
+    if jnp.ndim(params) != 2:
+        raise ValueError(
+            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+        )
+    if num_reference < 4:
+        raise ValueError(f"num_reference must be at least 4, got {num_reference}")
+    params = jnp.asarray(params)
+    stacked, count = _stacked(softness)
+    plan = both_plan(num_samples, chunk_size, False, baseline)
+    measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
+    rows = []
+    for i in range(count):
+        measured, samples = jax.block_until_ready(measure(jax.tree.map(lambda leaf, i=i: leaf[i], stacked), params, key))
+        rows.append((measured, _variance_intervals(samples, baseline, confidence, num_resamples)))
+        if progress is not None:
+            progress(i + 1, count)
+    measured = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
+    return _table(stacked, params, measured, np.stack([row[1] for row in rows], axis=2), confidence)
+
+
+class _Cell(eqx.Module):
+    """One softness, all points."""
+
+    first: GradientEstimate
+    zeroth: GradientEstimate
+    cost: Float[Array, " points"]
+    reference: Float[Array, "points dim"]
+    reference_error: Float[Array, "points dim"]
+    landscape: Landscape | None
+
+
+class _Measurement(eqx.Module):
+    """What is compiled."""
+
+    objective_of_softness: Callable[[PyTree], Objective] = eqx.field(static=True)
+    plan: Plan = eqx.field(static=True)
+    baseline: Baseline = eqx.field(static=True)
+    num_reference: int = eqx.field(static=True)
+
+    def __call__(
+        self, softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
+    ) -> tuple[_Cell, Samples]:
+        objective = self.objective_of_softness(softness).sized_for(params[0])
+        samples_key, reference_key = jax.random.split(key)
+        samples = self._samples(objective, params, samples_key)
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), self.plan, self.baseline))(samples)
+        is_line = isinstance(objective, ParameterNoise) and objective.dim == 1
+        reference = self._line if is_line else self._long_run
+        return _Cell(first, zeroth, *reference(objective, params, reference_key)), samples
+
+    def _samples(self, objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray) -> Samples:
+        """Roll out for both estimates, all points through one compiled body."""
+        num_chunks, size = self.plan.chunks()
+        points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
+
+        def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
+            point, chunk = point_and_chunk
+            units = size * chunk + jnp.arange(size)
+            return sample(objective, params[point], jax.random.fold_in(key, point), units, self.plan)
+
+        samples = jax.lax.map(one_chunk, (points, chunks))
+        return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
+
+    def _line(self, objective: ParameterNoise, params: Float[Array, "points dim"], key: PRNGKeyArray) -> tuple:
+        """Take the reference from one landscape."""
+        stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
+        low, high = params.min() - REACH * stddev, params.max() + REACH * stddev
+        points, cell = cell_points(key, low, high, self.num_reference)
+        everywhere = jnp.concatenate([points, params[:, 0]])
+        # One body for the landscape and for the points themselves: compiling it takes longer than running it.
+        costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, self._chunk_size())
+        landscape = Landscape(points, costs[: self.num_reference], cell)
+        cost = costs[self.num_reference :]
+        gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
+        return cost, gradient[:, None], error[:, None], landscape
+
+    def _long_run(self, objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray) -> tuple:
+        """Take the reference from many more samples, in pairs, of the estimate that is unbiased."""
+        num_samples = 2 * (self.num_reference // 2)
+
+        def one_point(index_and_point: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+            index, point = index_and_point
+            estimate = zeroth_order(
+                objective,
+                point,
+                jax.random.fold_in(key, index),
+                num_samples=num_samples,
+                antithetic=True,
+                chunk_size=self._chunk_size(),
+            )
+            return objective.value(point, objective.zero_noise()), estimate.value, estimate.standard_error
+
+        cost, gradient, error = jax.lax.map(one_point, (jnp.arange(len(params)), params))
+        return cost, gradient, error, None
+
+    def _chunk_size(self) -> int:
+        return max(2, self.plan.chunk_size or DEFAULT_CHUNK_SIZE)
+
+
+def _table(
+    softness: PyTree,
+    params: Float[Array, "points dim"],
+    measured: _Cell,
+    variance_intervals: Float[np.ndarray, "2 2 softness points"],
+    confidence: float,
+) -> BiasVariance:
+    first, zeroth, is_line = measured.first, measured.zeroth, measured.landscape is not None
+    bias = first.value - measured.reference
+    # Independent: the reference has rollouts of its own.
+    bias_error = jnp.hypot(first.standard_error, measured.reference_error)
+    count_first, count_zeroth = first.num_finite[..., None], zeroth.num_finite[..., None]
+    # The reference averages over so many cells, or samples, that its t is a normal distribution.
+    many = 10**6
+    return BiasVariance(
+        softness=softness,
+        params=params,
+        first=first,
+        zeroth=zeroth,
+        cost=measured.cost,
+        reference=measured.reference,
+        reference_error=measured.reference_error,
+        bias=bias,
+        bias_error=bias_error,
+        first_interval=mean_interval(first.value, first.standard_error, count_first, confidence),
+        zeroth_interval=mean_interval(zeroth.value, zeroth.standard_error, count_zeroth, confidence),
+        reference_interval=mean_interval(measured.reference, measured.reference_error, many, confidence),
+        bias_interval=mean_interval(bias, bias_error, count_first, confidence),
+        first_variance_interval=variance_intervals[0],
+        zeroth_variance_interval=variance_intervals[1],
+        landscape=measured.landscape,
+        reference_method="landscape" if is_line else "zeroth_order",
+        confidence=confidence,
+    )
+
+
+def _variance_intervals(
+    samples: Samples, baseline: Baseline, confidence: float, num_resamples: int
+) -> Float[np.ndarray, "2 2 points"]:
+    """Bootstrap both variances at each point: estimate, end of interval, point."""
+    points = range(len(samples.costs))
+    per_point = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples) for i in points]
+    intervals = [
+        [bootstrap_variance_interval(terms, confidence, num_resamples=num_resamples) for terms in _terms(s, baseline)]
+        for s in per_point
+    ]
+    return np.moveaxis(np.array(intervals), 0, -1)
+
+
+def _terms(samples: Samples, baseline: Baseline) -> tuple[np.ndarray, np.ndarray]:
+    """Give the samples of both estimates at one point; the leave-one-out baseline as the mean that it is up to 1/N."""
+    is_noisy = samples.is_noisy > 0
+    costs, scores = samples.costs[is_noisy, 0], samples.scores[is_noisy, 0]
+    finite = costs[np.isfinite(costs)]
+    centre = {
+        "leave_one_out": finite.mean() if len(finite) else np.nan,
+        "zero_noise": samples.costs[samples.is_noise_free > 0, 0].sum(),
+        "none": 0.0,
+    }[baseline]
+    gradients = np.where(np.isfinite(costs)[:, None], samples.gradients[is_noisy, 0], np.nan)
+    return gradients, (costs - centre)[:, None] * scores
+
+
+def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:
+    """Give one pytree with a leading axis, and its length."""
+    if isinstance(softness, list | tuple):
+        if not softness:
+            raise ValueError("softness must have at least one value, got none")
+        structures = {jax.tree.structure(one) for one in softness}
+        if len(structures) > 1:
+            raise ValueError(
+                "softness must have the same parts set in every value, got "
+                f"{len(structures)} different sets; give each of them every part that any of them has"
+            )
+        softness = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *softness)
+    softness = jax.tree.map(jnp.asarray, softness)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
+    if len(lengths) != 1 or () in lengths or (0,) in lengths:
+        raise ValueError(
+            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; "
+            "see Softness.sweep"
+        )
+    return softness, lengths.pop()[0]

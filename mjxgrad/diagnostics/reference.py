@@ -1,0 +1,118 @@
+r"""The gradient of a smoothed objective, found without either estimator that is on trial.
+
+For noise on a single parameter it is an integral over a line,
+
+$$F'(\theta) = \int (f(x) - f(\theta)) \frac{x - \theta}{\sigma^2}
+   \varphi\!\left(\frac{x - \theta}{\sigma}\right) \frac{dx}{\sigma},$$
+
+so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and $f$ evaluated at a random place in each:
+unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included, and an error that falls as 1/cells at a
+jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+# The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
+REACH = 6.0
+
+
+class Landscape(eqx.Module):
+    """A cost along one parameter, at one random place in each of many equal cells.
+
+    Attributes:
+        points: ascending, in the parameter's units.
+        costs: at the points.
+        cell: length of a cell.
+    """
+
+    points: Float[Array, " cells"]
+    costs: Float[Array, "*batch cells"]
+    cell: Float[Array, ""]
+
+    def smoothed_gradient(
+        self, params: Float[Array, ""], stddev: Float[Array, ""], centre: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Give the gradient of the smoothed cost with its standard error.
+
+        Args:
+            params: where; at least `REACH` standard deviations inside the landscape.
+            stddev: of the noise.
+            centre: a cost to compare with, such as that at `params` itself; it must not be taken from these costs.
+
+        Returns:
+            The gradient and a standard error that is rather too large than too small; both NaN if a cost that carries
+            weight is not finite.
+        """
+        offset = (self.points - params) / stddev
+        return self._integral(offset / stddev, offset, stddev, centre)
+
+    def smoothed_cost(
+        self, params: Float[Array, ""], stddev: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Give the smoothed cost with its standard error; arguments and errors as in `smoothed_gradient`."""
+        offset = (self.points - params) / stddev
+        return self._integral(jnp.ones_like(offset), offset, stddev, jnp.zeros_like(params))
+
+    def _integral(
+        self,
+        factor: Float[Array, " cells"],
+        offset: Float[Array, " cells"],
+        stddev: Float[Array, ""],
+        centre: Float[Array, ""],
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        weight = factor * jax.scipy.stats.norm.pdf(offset) / stddev
+        # Outside the reach a cost may be anything, also not finite.
+        terms = jnp.where(jnp.abs(offset) <= REACH, (self.costs - centre) * weight, 0) * self.cell
+        # Neighbouring cells differ by the variance within them and by their means, so this is on the safe side. Two
+        # points per cell would give an unbiased one that mostly misses the only cell that matters: that of the jump.
+        variance = (jnp.diff(terms) ** 2).sum(axis=-1) / 2
+        return terms.sum(axis=-1), jnp.sqrt(variance)
+
+
+def cell_points(
+    key: PRNGKeyArray, low: Float[Array, ""], high: Float[Array, ""], num_cells: int
+) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
+    """Draw one point in each of the equal cells of a line.
+
+    Args:
+        key: consumed here.
+        low: where the first cell begins.
+        high: where the last cell ends.
+        num_cells: how many.
+
+    Returns:
+        The points, ascending, and the length of a cell.
+    """
+    cell = (high - low) / num_cells
+    return low + cell * (jnp.arange(num_cells) + jax.random.uniform(key, (num_cells,), cell.dtype)), cell
+
+
+def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree:
+    """Apply a function to each of many points, some at a time.
+
+    `jax.lax.map` with a batch size would compile the function a second time for what remains over.
+
+    Args:
+        function: called under `jax.vmap`.
+        points: with a leading axis.
+        chunk_size: points at a time, at most.
+
+    Returns:
+        The results, with a leading axis.
+    """
+    count = jax.tree.leaves(points)[0].shape[0]
+    num_chunks = -(-count // chunk_size)
+    size = -(-count // num_chunks)
+    # The last chunk is filled up with points that there are already.
+    indices = jnp.minimum(jnp.arange(num_chunks * size), count - 1)
+
+    def one_chunk(indices: Array) -> PyTree:
+        return jax.vmap(function)(jax.tree.map(lambda leaf: leaf[indices], points))
+
+    results = jax.lax.map(one_chunk, indices.reshape(num_chunks, size))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
