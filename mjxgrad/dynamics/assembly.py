@@ -34,9 +34,9 @@ class Block(eqx.Module):
     Attributes:
         jacobian: from joint velocities to the rows, also where the row is inactive.
         residual: r in a_ref (m or rad).
-        violation: what the impedance depends on.
+        impedance: d(r), and dw, its value from the width on.
         inverse_weight: Â, inverse inertia (1/kg).
-        solref, solimp: solver parameters in MuJoCo's formats.
+        solref: stiffness and damping in MuJoCo's formats.
         margin: distance at which the row begins (m or rad).
         friction_loss: largest force of a friction loss row.
         is_active: whether the row takes part.
@@ -44,10 +44,9 @@ class Block(eqx.Module):
 
     jacobian: Float[Array, "rows nv"]
     residual: Float[Array, " rows"]
-    violation: Float[Array, " rows"]
+    impedance: Float[Array, "rows 2"]
     inverse_weight: Float[Array, " rows"]
     solref: Float[Array, "rows 2"]
-    solimp: Float[Array, "rows 5"]
     margin: Float[Array, " rows"]
     friction_loss: Float[Array, " rows"]
     is_active: Bool[Array, " rows"]
@@ -77,7 +76,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
         residual = jnp.where(block.is_active, block.residual, 0.0)
         stiffness, damping = _stiffness_damping(model, block)
-        impedance = _impedance(block.solimp, block.violation)
+        impedance = block.impedance[:, 0]
         weight = 1 / jnp.maximum(
             block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL
         )
@@ -130,8 +129,7 @@ def _stiffness_damping(
     refsafe the time constant is clamped from below at two time steps; at the clamp itself the derivative is that of the
     unclamped side, since from there every larger value counts.
     """
-    first, second = block.solref[:, 0], block.solref[:, 1]
-    largest = jnp.clip(block.solimp[:, 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    first, second, largest = block.solref[:, 0], block.solref[:, 1], block.impedance[:, 1]
     time_constant = jnp.where(first > 0, first, 1.0)
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         shortest = 2 * model.opt.timestep
@@ -144,10 +142,10 @@ def _stiffness_damping(
     return stiffness, damping
 
 
-def _impedance(
-    solimp: Float[Array, "rows 5"], violation: Float[Array, " rows"]
-) -> Float[Array, " rows"]:
-    """Return d(r): from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
+def impedance(
+    solimp: Float[Array, "n 5"], violation: Float[Array, " n"]
+) -> Float[Array, "n 2"]:
+    """Return d(r) and dw: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
     smallest = jnp.clip(solimp[:, 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     largest = jnp.clip(solimp[:, 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     width = jnp.maximum(solimp[:, 2], mujoco.mjMINVAL)
@@ -160,7 +158,7 @@ def _impedance(
     part = jnp.where(is_lower, middle, 1 - middle)
     climb = part * (jnp.where(is_lower, x, 1 - x) / part) ** power
     inside = smallest + (largest - smallest) * jnp.where(is_lower, climb, 1 - climb)
-    return jnp.where(is_inside, inside, largest)
+    return jnp.stack([jnp.where(is_inside, inside, largest), largest], axis=1)
 
 
 def _friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
@@ -177,10 +175,9 @@ def _friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     return Block(
         jacobian=jacobian,
         residual=zero,
-        violation=zero,
+        impedance=impedance(join(model.dof_solimp, model.tendon_solimp_fri), zero),
         inverse_weight=join(model.dof_invweight0, model.tendon_invweight0),
         solref=join(model.dof_solref, model.tendon_solref_fri),
-        solimp=join(model.dof_solimp, model.tendon_solimp_fri),
         margin=zero,
         friction_loss=join(model.dof_frictionloss, model.tendon_frictionloss),
         is_active=jnp.ones(len(jacobian), bool),
@@ -198,7 +195,14 @@ def _limit(
     residual = distance - margin
     zero = jnp.zeros_like(residual)
     return Block(
-        jacobian, residual, residual, inverse_weight, solref, solimp, margin, zero, residual < 0
+        jacobian,
+        residual,
+        impedance(solimp, residual),
+        inverse_weight,
+        solref,
+        margin,
+        zero,
+        residual < 0,
     )
 
 
@@ -299,14 +303,14 @@ def _pyramids(
     def spread(x: Array) -> Array:
         return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
 
+    resistance = spread(impedance(contact.solimp, residual))
     residual = spread(residual)
     return Block(
         jacobian=edges.reshape(count * each, -1),
         residual=residual,
-        violation=residual,
+        impedance=resistance,
         inverse_weight=spread(inverse_weight),
         solref=spread(contact.solref),
-        solimp=spread(contact.solimp),
         margin=spread(contact.includemargin),
         friction_loss=jnp.zeros_like(residual),
         is_active=residual < 0,
@@ -338,10 +342,9 @@ def _cones(
     return Block(
         jacobian=directions.reshape(count * dim, -1),
         residual=residual.reshape(-1),
-        violation=spread(distance),
+        impedance=spread(impedance(contact.solimp, distance)),
         inverse_weight=jnp.concatenate(weights, axis=1).reshape(-1),
         solref=jnp.concatenate(solref, axis=1).reshape(-1, 2),
-        solimp=spread(contact.solimp),
         margin=spread(contact.includemargin),
         friction_loss=jnp.zeros(count * dim, distance.dtype),
         is_active=spread(distance < 0),

@@ -9,8 +9,6 @@ Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope boun
   (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
-All functions take leading batch axes, since the line search evaluates many points of a line at once.
-
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints: Theory and implementation in
     MuJoCo. ICRA 2014. MuJoCo documentation, "Computation", "Constraint model".
@@ -20,7 +18,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,57 +72,57 @@ class Rows(eqx.Module):
 class _Cone(eqx.Module):
     """An elliptic group seen in the coordinates u, with its zones."""
 
-    u: Float[Array, "*batch contacts dim"]
-    tangent: Float[Array, "*batch contacts tangents"]
-    normal: Float[Array, "*batch contacts"]
-    slip: Float[Array, "*batch contacts"]
-    gap: Float[Array, "*batch contacts"]
+    tangent: Float[Array, "contacts tangents"]
+    slip: Float[Array, " contacts"]
+    gap: Float[Array, " contacts"]
     stiffness: Float[Array, " contacts"]
-    is_middle: Array
-    is_bottom: Array
+    is_middle: Bool[Array, " contacts"]
+    is_bottom: Bool[Array, " contacts"]
 
 
 def _cone(
-    group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim"], x: Float[Array, "*batch rows"]
+    group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim"], x: Float[Array, " rows"]
 ) -> _Cone:
-    block = x[..., group.start : group.stop].reshape(*x.shape[:-1], group.count, group.dim)
-    u = block * scale
-    square = jnp.sum(u[..., 1:] ** 2, axis=-1)
+    u = _blocks(group, x) * scale
+    square = jnp.sum(u[:, 1:] ** 2, axis=1)
     slides = square > 0
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
-    normal, mu = u[..., 0], scale[:, 0]
+    mu = scale[:, 0]
+    normal = u[:, 0]
     is_top = normal >= mu * slip
     is_bottom = ~is_top & (mu * normal + slip <= 0)
-    stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))
-    tangent = u[..., 1:] / jnp.where(slides, slip, 1.0)[..., None]
-    return _Cone(
-        u, tangent, normal, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom
-    )
+    weight = rows.weight[group.start : group.stop : group.dim]
+    tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
+    stiffness = weight / (mu**2 * (1 + mu**2))
+    return _Cone(tangent, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom)
+
+
+def _blocks(group: ConeGroup, x: Float[Array, " rows"]) -> Float[Array, "contacts dim "]:
+    return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
 
 
 def force(
-    layout: RowLayout, rows: Rows, x: Float[Array, "*batch rows"]
-) -> Float[Array, "*batch rows"]:
+    layout: RowLayout, rows: Rows, x: Float[Array, " rows"]
+) -> Float[Array, " rows"]:
     """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
     stop, friction = layout.simple_stop, layout.friction
     linear = -rows.weight * x
     bound = rows.bound[friction]
-    limit = jnp.sign(x[..., friction]) * bound
+    limit = jnp.sign(x[friction]) * bound
+    # `where`, not `clip` and `maximum`: at a tie their derivative is one half, which belongs to neither side.
     parts = [
-        linear[..., : friction.start],
-        # `where`, not `clip` and `maximum`: at a tie their derivative is one half, which belongs to neither side.
-        jnp.where(jnp.abs(linear[..., friction]) < bound, linear[..., friction], -limit),
-        jnp.where(x[..., friction.stop : stop] < 0, linear[..., friction.stop : stop], 0.0),
+        linear[: friction.start],
+        jnp.where(jnp.abs(linear[friction]) < bound, linear[friction], -limit),
+        jnp.where(x[friction.stop : stop] < 0, linear[friction.stop : stop], 0.0),
     ]
     for group, scale in zip(layout.cones, rows.scales, strict=True):
         cone = _cone(group, rows, scale, x)
         press = jnp.where(cone.is_middle, -cone.stiffness * cone.gap, 0.0)
-        slide = -press[..., None] * scale[:, :1] * cone.tangent
-        middle = scale * jnp.concatenate([press[..., None], slide], axis=-1)
-        bottom = linear[..., group.start : group.stop].reshape(middle.shape)
-        both = jnp.where(cone.is_bottom[..., None], bottom, middle)
-        parts.append(both.reshape(*x.shape[:-1], group.count * group.dim))
-    return jnp.concatenate(parts, axis=-1)
+        slide = -(press * scale[:, 0])[:, None] * cone.tangent
+        middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
+        both = jnp.where(cone.is_bottom[:, None], _blocks(group, linear), middle)
+        parts.append(both.reshape(-1))
+    return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
 def curvature_product(
@@ -137,17 +135,11 @@ def curvature_product(
     stop, friction = layout.simple_stop, layout.friction
     weight = rows.weight[:stop]
     stuck = jnp.abs(weight[friction] * x[friction]) < rows.bound[friction]
-    is_curved = jnp.concatenate(
-        [
-            jnp.ones(friction.start, bool),
-            stuck,
-            x[friction.stop : stop] < 0,
-        ]
-    )
+    is_curved = jnp.concatenate([jnp.ones(friction.start, bool), stuck, x[friction.stop : stop] < 0])
     parts = [jnp.where(is_curved, weight, 0.0)[:, None] * matrix[:stop]]
     for group, scale in zip(layout.cones, rows.scales, strict=True):
         cone = _cone(group, rows, scale, x)
-        block = matrix[group.start : group.stop].reshape(group.count, group.dim, -1)
+        block = _blocks(group, matrix)
         scaled = scale[:, :, None] * block
         mu = scale[:, 0]
         along = jnp.concatenate([jnp.ones((group.count, 1), x.dtype), -mu[:, None] * cone.tangent], 1)
@@ -159,52 +151,8 @@ def curvature_product(
             [jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1
         )
         middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)
-        bottom = rows.weight[group.start : group.stop].reshape(group.count, group.dim, 1) * block
+        bottom = _blocks(group, rows.weight)[:, :, None] * block
         zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)
         both = jnp.where(cone.is_bottom[:, None, None], bottom, zone)
         parts.append(both.reshape(group.count * group.dim, -1))
     return jnp.concatenate(parts, axis=0)
-
-
-def breakpoints(
-    layout: RowLayout, rows: Rows, x: Float[Array, " rows"], slope: Float[Array, " rows"]
-) -> Float[Array, " points"]:
-    """Return where on the line x + t slope a row may change its law; 1 where it never does.
-
-    Between two neighbours the derivative of the cost along the line is linear (no elliptic rows) or smooth.
-    """
-    stop, friction = layout.simple_stop, layout.friction
-    edge = rows.bound[friction] / rows.weight[friction]
-    crossings = [
-        _ratio(-x[friction.stop : stop], slope[friction.stop : stop]),
-        _ratio(edge - x[friction], slope[friction]),
-        _ratio(-edge - x[friction], slope[friction]),
-    ]
-    for group, scale in zip(layout.cones, rows.scales, strict=True):
-        u = x[group.start : group.stop].reshape(group.count, group.dim) * scale
-        v = slope[group.start : group.stop].reshape(group.count, group.dim) * scale
-        square = [jnp.sum(a[:, 1:] * b[:, 1:], axis=1) for a, b in ((u, u), (u, v), (v, v))]
-        normal = [a[:, 0] * b[:, 0] for a, b in ((u, u), (u, v), (v, v))]
-        mu2 = scale[:, 0] ** 2
-        for cone in (
-            [n - mu2 * t for n, t in zip(normal, square, strict=True)],  # N = μT
-            [mu2 * n - t for n, t in zip(normal, square, strict=True)],  # μN = -T
-        ):
-            crossings.extend(_roots(*cone))
-    return jnp.concatenate(crossings)
-
-
-def _ratio(numerator: Float[Array, " n"], denominator: Float[Array, " n"]) -> Float[Array, " n"]:
-    moves = denominator != 0
-    t = numerator / jnp.where(moves, denominator, 1.0)
-    return jnp.where(moves & jnp.isfinite(t), t, 1.0)
-
-
-def _roots(
-    c: Float[Array, " n"], b: Float[Array, " n"], a: Float[Array, " n"]
-) -> list[Float[Array, " n"]]:
-    """Return the real roots of a t² + 2 b t + c, in the form without cancellation."""
-    discriminant = b * b - a * c
-    real = discriminant >= 0
-    q = -(b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(real, discriminant, 0.0)))
-    return [jnp.where(real, _ratio(q, a), 1.0), jnp.where(real, _ratio(c, q), 1.0)]

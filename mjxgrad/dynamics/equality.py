@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import rotation
-from mjxgrad.dynamics.assembly import Block, contact_jacobian
+from mjxgrad.dynamics.assembly import Block, contact_jacobian, impedance
 
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
@@ -42,10 +42,9 @@ def _block(
     return Block(
         jacobian=jacobian.reshape(count * each, -1),
         residual=flat,
-        violation=spread(rotation.safe_norm(residual)),
+        impedance=spread(impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
         inverse_weight=inverse_weight.reshape(-1),
         solref=spread(model.eq_solref[ids]),
-        solimp=spread(model.eq_solimp[ids]),
         margin=zero,
         friction_loss=zero,
         is_active=spread(jnp.asarray(data.eq_active)[ids] != 0),

@@ -44,6 +44,6 @@ def solve(
 def _solve_jvp(layout, max_iterations, primals, tangents):
     problem, start, tolerance = primals
     acceleration = solve(layout, max_iterations, problem, start, tolerance)
-    _, change = jax.jvp(lambda p: p.gradient(layout, acceleration), (problem,), (tangents[0],))
-    hessian = problem.hessian(layout, acceleration)
+    _, change = jax.jvp(lambda p: p.at(layout, acceleration).gradient, (problem,), (tangents[0],))
+    hessian = problem.hessian(layout, problem.at(layout, acceleration).x)
     return acceleration, -linear.solve_positive_definite(hessian, change)

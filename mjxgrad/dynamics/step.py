@@ -122,12 +122,12 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         jax.lax.stop_gradient(start),
         jax.lax.stop_gradient(tolerance),
     )
-    force = problem.row_force(layout, acceleration)
+    point = problem.at(layout, acceleration)
     return data.tree_replace(
         {
             "qacc": acceleration,
-            "qfrc_constraint": data._impl.efc_J.T @ force,
-            "_impl.efc_force": force,
+            "qfrc_constraint": point.pull,
+            "_impl.efc_force": point.row_force,
         }
     )
 
