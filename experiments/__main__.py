@@ -1,0 +1,64 @@
+"""The command line: `python -m experiments run FILE.toml [key=value ...]` and `python -m experiments list`."""
+
+import argparse
+import signal
+import sys
+import tomllib
+from pathlib import Path
+
+from experiments.config import FOLDER, read_header
+from experiments.failure import ExperimentError
+from experiments.runner import run_file
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: of the command, or None for those of the process.
+
+    Returns:
+        The exit status: 0, 2 for a refusal that was explained, 130 for an interruption.
+    """
+    options = _parser().parse_args(arguments)
+    # A run that is asked to stop clears up as it does for Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        if options.command == "list":
+            return _list()
+        run_file(options.file, options.overrides, output=options.output, force=options.force)
+    except KeyboardInterrupt:
+        print("\ninterrupted; earlier results are as they were", file=sys.stderr)
+        return 130
+    # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
+    except (ExperimentError, ValueError, FloatingPointError, MemoryError) as error:
+        if options.debug:
+            raise
+        print(str(error) or type(error).__name__, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _list() -> int:
+    for path in sorted(FOLDER.glob("*.toml")):
+        text = path.read_text(encoding="utf-8")
+        kind = tomllib.loads(text).get("experiment", "?")
+        print(f"{path.stem:<16} {kind:<14} {read_header(text)[0]}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments on mjxgrad.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="run one configuration, or each combination of its sweep")
+    run.add_argument("file", help="a TOML file, or the name of one in experiments/")
+    run.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, in TOML syntax")
+    run.add_argument("--output", type=Path, default=Path("runs"), help="folder for results (default: runs)")
+    run.add_argument("--force", action="store_true", help="run even if nothing has changed")
+    run.add_argument("--debug", action="store_true", help="show tracebacks")
+    commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

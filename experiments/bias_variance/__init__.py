@@ -1,0 +1,1 @@
+"""Bias and variance of first- and zeroth-order gradients against contact stiffness."""

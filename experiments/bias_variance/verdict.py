@@ -1,0 +1,180 @@
+"""The answer of a bias and variance experiment in words, computed from its numbers."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from experiments.bias_variance.outcome import Outcome
+from experiments.report import Table, quantity
+from experiments.theme import power
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say where each estimate is to be used.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        One to three sentences.
+    """
+    good = outcome.prefers_first[outcome.swept]
+    budget = f"With {outcome.budget} rollouts per gradient"
+    if good.all():
+        choice = f"{budget} the first-order estimate is the closer one at every stiffness and angle."
+    elif not good.any():
+        choice = f"{budget} the zeroth-order estimate is the closer one at every stiffness and angle."
+    else:
+        choice = f"{budget} {_split(outcome, good)}"
+    return " ".join([choice, _bias(outcome), *_default(outcome)])
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Single findings, one sentence each.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        The sentences that the numbers support; there may be none.
+    """
+    return [
+        sentence for sentence in (_worst_bias(outcome), _wrong_signs(outcome), _variance(outcome)) if sentence is not None
+    ]
+
+
+def table(outcome: Outcome) -> Table:
+    """Tabulate both estimates, the reference and which estimate to use."""
+    rows, emphasised = [], set()
+    for i, j in np.ndindex(outcome.bias.value.shape):
+        use = "first" if outcome.prefers_first[i, j] else "zeroth"
+        if outcome.is_biased[i, j]:
+            emphasised.add((len(rows), 5))
+        rows.append([
+            name(outcome, i) if j == 0 else "",
+            f"{outcome.angles[j]:g}",
+            *(_with_half_width(interval, i, j) for interval in (outcome.first, outcome.zeroth, outcome.reference)),
+            _with_half_width(outcome.bias, i, j),
+            quantity(outcome.first_variance.value[i, j] / outcome.zeroth_variance.value[i, j]),
+            use,
+        ])
+    columns = (
+        "stiffness, 1/s²", "angle, rad", "first order", "zeroth order", "reference", "bias of first order",
+        "variance ratio", "use",
+    )
+    percent = f"{outcome.confidence:.0%}"
+    caption = (
+        f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.num_samples} rollouts each. "
+        "A bias in bold differs from zero beyond chance over the whole table. The ratio is the variance of a sample of "
+        "first order over that of zeroth order. The last column is the estimate with the "
+        f"smaller expected error at {outcome.budget} rollouts per gradient."
+    )
+    return Table(columns, rows, caption, frozenset(emphasised))
+
+
+def name(outcome: Outcome, i: int) -> str:
+    """Name a row: its stiffness, or that it is the default."""
+    return power(outcome.stiffness[i]) if i < outcome.swept.stop else f"default ({power(outcome.stiffness[i])})"
+
+
+def _with_half_width(interval, i: int, j: int) -> str:
+    value, half = interval.value[i, j], (interval.high[i, j] - interval.low[i, j]) / 2
+    # Beyond three digits nobody reads on; the rest is in metrics.csv.
+    return quantity(value) if half < 1e-3 * abs(value) else quantity(value, half)
+
+
+def _split(outcome: Outcome, good: np.ndarray) -> str:
+    """Say where first order is better: by stiffness or by angle, whichever leaves less undecided."""
+    by_stiffness = _sides(good, lambda rows: _range(outcome, rows), "at every angle")
+    by_angle = _sides(good.T, lambda columns: _angles(outcome, columns), "at every stiffness")
+    parts, _ = min(by_stiffness, by_angle, key=lambda sides: sides[1])
+    return _join(parts) + "."
+
+
+def _sides(good: np.ndarray, words: Callable[[np.ndarray], str], throughout: str) -> tuple[list[str], int]:
+    """Describe the groups (rows) where all agree and where not; with the number of cases that do not."""
+    at_all, at_none = good.all(axis=1), ~good.any(axis=1)
+    mixed = ~at_all & ~at_none
+    parts = []
+    if at_all.any():
+        parts.append(f"first order is closer {throughout} {words(at_all)}")
+    if at_none.any():
+        parts.append(f"zeroth order is closer {throughout} {words(at_none)}")
+    if mixed.any():
+        rest = "the rest is mixed" if parts else "it is mixed"
+        parts.append(f"{rest} (first order is closer in {good[mixed].sum()} of {good[mixed].size} cases)")
+    return parts, int(good[mixed].size)
+
+
+def _angles(outcome: Outcome, columns: np.ndarray) -> str:
+    return f"at {_join([f'{angle:g}' for angle in outcome.angles[columns]])} rad"
+
+
+def _range(outcome: Outcome, rows: np.ndarray) -> str:
+    """Words for the stiffnesses of some rows of the sweep: a range if they are neighbours, else a list."""
+    picked = np.flatnonzero(rows)
+    labels = [power(k) for k in outcome.stiffness[picked]]
+    if len(picked) == 1:
+        return f"at {labels[0]} 1/s²"
+    if (np.diff(picked) > 1).any():
+        return f"at {_join(labels)} 1/s²"
+    if picked[0] == 0:
+        return f"up to a stiffness of {labels[-1]} 1/s²"
+    if picked[-1] == outcome.swept.stop - 1:
+        return f"from {labels[0]} 1/s² on"
+    return f"from {labels[0]} to {labels[-1]} 1/s²"
+
+
+def _bias(outcome: Outcome) -> str:
+    biased = outcome.is_biased[outcome.swept].any(axis=1)
+    if not biased.any():
+        return f"No bias of the first-order estimate is seen in the sweep ({outcome.confidence:.0%} over all cases)."
+    sentence = f"The first-order estimate is measurably biased {_range(outcome, biased)}"
+    # No bias seen is no bias only where one as large as the gradient itself would have been seen.
+    half_width = (outcome.bias.high - outcome.bias.low) / 2
+    is_blind = (half_width > np.abs(outcome.reference.value))[outcome.swept].any(axis=1) & ~biased
+    return f"{sentence}; {_range(outcome, is_blind)} it is too noisy to tell." if is_blind.any() else f"{sentence}."
+
+
+def _default(outcome: Outcome) -> list[str]:
+    if not outcome.has_default:
+        return []
+    biased, wrong = outcome.is_biased[-1].sum(), outcome.has_wrong_sign[-1].sum()
+    count = len(outcome.angles)
+    if not biased:
+        return [f"Under MuJoCo's default contact no bias is seen at any of the {count} angles."]
+    sign = f", and has the wrong sign at {wrong}" if wrong else ""
+    return [f"Under MuJoCo's default contact it is biased at {biased} of {count} angles{sign}."]
+
+
+def _worst_bias(outcome: Outcome) -> str | None:
+    size = np.where(outcome.is_biased, np.abs(outcome.bias.value), -1.0)
+    i, j = np.unravel_index(np.argmax(size), size.shape)
+    if size[i, j] < 0:
+        return None
+    first, reference = outcome.first.value[i, j], outcome.reference.value[i, j]
+    return (
+        f"Largest bias: at {outcome.angles[j]:g} rad and stiffness {name(outcome, i)} the first-order mean is "
+        f"{quantity(first)} where the truth is {quantity(reference)} m²/rad."
+    )
+
+
+def _wrong_signs(outcome: Outcome) -> str | None:
+    count = int(outcome.has_wrong_sign.sum())
+    if not count:
+        return None
+    cases = "one case" if count == 1 else f"{count} of {outcome.has_wrong_sign.size} cases"
+    where = outcome.has_wrong_sign.any(axis=0)
+    return f"The first-order estimate surely points the wrong way in {cases}, {_angles(outcome, where)}."
+
+
+def _variance(outcome: Outcome) -> str | None:
+    """Name the cases whose variances differ beyond their intervals."""
+    larger = (outcome.first_variance.low > outcome.zeroth_variance.high)[outcome.swept].any(axis=1)
+    if not larger.any():
+        return "Nowhere in the sweep is the variance of first order beyond that of zeroth order."
+    return f"The variance of first order exceeds that of zeroth order, at some angle, {_range(outcome, larger)}."
+
+
+def _join(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,173 @@
+"""A run's configuration: a TOML file, checked as a whole before anything heavy is imported."""
+
+import itertools
+import json
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from experiments import mistakes
+from experiments.failure import ConfigurationError, suggest
+
+FOLDER = Path(__file__).parent
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Settings(BaseModel):
+    """A table of settings that refuses unknown keys and wrong types."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True)
+
+
+class RunSettings(Settings):
+    """What every kind of experiment has."""
+
+    experiment: str
+    """The kind of experiment, a key of `experiments.registry.EXPERIMENTS`."""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Of every random number in the run."""
+    precision: Literal["float32", "float64"] = "float64"
+    """Of every array in the run."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run, ready to start.
+
+    Attributes:
+        name: of the output folder; a combination of a sweep adds its own folder to it.
+        settings: validated, defaults filled in.
+        question: what the run answers, from the comment that opens the file.
+        expected: the answer its author expects, from the same comment; may be empty.
+        varied: the settings that set this run apart within its sweep, by dotted key.
+    """
+
+    name: str
+    settings: RunSettings
+    question: str
+    expected: str
+    varied: dict[str, Any]
+
+
+def load_runs(file: str, overrides: list[str]) -> list[Run]:
+    """Read a configuration: one run, or one per combination of its `[sweep]` table.
+
+    Args:
+        file: a path to a TOML file, or the name of one in `experiments/`.
+        overrides: `key=value` in TOML syntax, dotted keys included. A key that the file sweeps is no longer swept.
+
+    Returns:
+        The runs in the order of the sweep, its last key changing fastest.
+
+    Raises:
+        ConfigurationError: naming every mistake in the file and the overrides.
+    """
+    path = find_file(file)
+    text = path.read_text(encoding="utf-8")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(path.name, [f"not TOML: {error}"]) from None
+    problems = [problem for item in overrides if (problem := _apply(table, item))]
+    sweep, sweep_problems = _take_sweep(table)
+    combinations = [dict(zip(sweep, values, strict=True)) for values in itertools.product(*sweep.values())]
+    question, expected = read_header(text)
+    runs = []
+    for varied in combinations:
+        candidate = json.loads(json.dumps(table, default=str))
+        for key, value in varied.items():
+            _assign(candidate, key.split("."), value)
+        settings, found = mistakes.validate(candidate, swept=set(sweep))
+        problems += found
+        runs.append(Run(path.stem, settings, question or path.stem, expected, varied))
+    if problems or sweep_problems:
+        raise ConfigurationError(path.name, problems + sweep_problems)
+    return runs
+
+
+def find_file(file: str) -> Path:
+    """Find a configuration by path or by name.
+
+    Args:
+        file: a path to a TOML file, or the name of one in `experiments/`.
+
+    Returns:
+        The path of a file that exists.
+
+    Raises:
+        ConfigurationError: answering an unknown name with those there are.
+    """
+    path = Path(file)
+    if path.is_file():
+        return path
+    if (FOLDER / f"{file}.toml").is_file():
+        return FOLDER / f"{file}.toml"
+    names = [known.stem for known in FOLDER.glob("*.toml")]
+    raise ConfigurationError(file, [f"there is no such file; {suggest(path.stem, names)}"])
+
+
+def read_header(text: str) -> tuple[str, str]:
+    """Read the comment that opens a configuration.
+
+    Args:
+        text: of the TOML file.
+
+    Returns:
+        The question it asks, and what is expected (after the word "Expected:"); empty if there is none.
+    """
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    comment = " ".join(line.lstrip("# ").strip() for line in lines)
+    question, _, expected = comment.partition("Expected:")
+    return question.strip(), expected.strip()
+
+
+def _apply(table: dict[str, Any], override: str) -> str | None:
+    """Write one `key=value` into a table; returns what is wrong with it."""
+    key, equals, value = override.partition("=")
+    key, value = key.strip(), value.strip()
+    if not equals or not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", key):
+        return f'{override}: not an override; write key=value, such as seed=1 or softness.stiffness="[1e3, 1e4]"'
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        # A shell eats the quotes of a TOML string, so a bare word stands for one.
+        if not re.fullmatch(r"[A-Za-z_][\w./-]*", value):
+            return f"{override}: {value or 'nothing'} is not a TOML value"
+        parsed = value
+    if isinstance(table.get("sweep"), dict):
+        table["sweep"].pop(key, None)
+    return _assign(table, key.split("."), parsed)
+
+
+def _assign(table: dict[str, Any], keys: list[str], value: object) -> str | None:
+    *parents, last = keys
+    for parent in parents:
+        table = table.setdefault(parent, {})
+        if not isinstance(table, dict):
+            return f"{'.'.join(keys)}: {parent} is a value, not a table"
+    table[last] = value
+    return None
+
+
+def _take_sweep(table: dict[str, Any]) -> tuple[dict[str, list[Any]], list[str]]:
+    """Take the `[sweep]` table out of a configuration: dotted key -> the values it takes."""
+    sweep, problems = table.pop("sweep", {}), []
+    if not isinstance(sweep, dict):
+        return {}, [f"sweep: must be a table of arrays, got {sweep!r}"]
+    flat = _flatten(sweep)
+    for key in [key for key, values in flat.items() if not isinstance(values, list) or not values]:
+        problems.append(f"sweep.{key}: must be an array of at least one value, got {flat.pop(key)!r}")
+    return flat, problems
+
+
+def _flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat

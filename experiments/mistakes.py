@@ -1,0 +1,77 @@
+"""From a table of settings to a checked configuration, or to sentences about all that is wrong with it."""
+
+import json
+import types
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from experiments.failure import suggest
+
+
+def validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
+    """Check a table of settings against the configuration of its kind of experiment.
+
+    Args:
+        table: as read from TOML.
+        swept: dotted keys whose value came from the `[sweep]` table, for the paths in the answer.
+
+    Returns:
+        The settings, or None, and one sentence per mistake.
+    """
+    from experiments.registry import EXPERIMENTS
+
+    kind = table.get("experiment")
+    if kind not in EXPERIMENTS:
+        named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
+        return None, [f"experiment: {named}{suggest(str(kind), EXPERIMENTS)}"]
+    settings = EXPERIMENTS[kind].settings
+    try:
+        # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
+        return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
+    except ValidationError as error:
+        return None, [_sentence(settings, detail, swept) for detail in error.errors()]
+
+
+def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
+    # Pydantic puts a union's branch into the path too; only names of settings and positions in arrays help a reader.
+    parts, owner = _walk(settings, detail["loc"])
+    path = ".".join(parts)
+    swept_path = f"sweep.{path}" if path in swept else path
+    given = json.dumps(detail.get("input"), ensure_ascii=False)
+    match detail["type"]:
+        case "extra_forbidden":
+            return f"{swept_path}: unknown key; {suggest(parts[-1], owner.model_fields)}"
+        case "missing":
+            return f"{swept_path}: required, and missing"
+        case "literal_error":
+            expected = detail.get("ctx", {}).get("expected", "").replace("'", "")
+            choices = expected.replace(" or ", ", ").split(", ")
+            return f"{swept_path}: there is no {given}; {suggest(str(detail.get('input')), choices)}"
+        case "value_error":
+            reason = detail["msg"].removeprefix("Value error, ")
+            return f"{swept_path}: {reason}" if path else reason
+    reason = detail["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return f"{swept_path}: must be {reason}, got {given}"
+
+
+def _walk(settings: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel]]:
+    """Follow an error's location through nested settings: its readable parts, and the last table on its way."""
+    owner, table, parts = settings, settings, []
+    for step in location:
+        if isinstance(step, int):
+            parts[-1] = f"{parts[-1]}[{step}]"
+            continue
+        if not parts or table is not None:
+            parts.append(step)
+            owner = table or owner
+            field = owner.model_fields.get(step)
+            table = _nested(field.annotation) if field else None
+    return parts, owner
+
+
+def _nested(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return annotation if issubclass(annotation, BaseModel) else None
+    return next((found for argument in get_args(annotation) if (found := _nested(argument))), None)

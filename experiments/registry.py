@@ -1,0 +1,34 @@
+"""The kinds of experiment there are."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.config import RunSettings
+from experiments.report import Report
+from experiments.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A kind of experiment.
+
+    Attributes:
+        settings: its configuration.
+        function: `module:name` of `(settings, workspace) -> Report`. A name, so that a configuration is checked,
+            and precision and OpenGL are chosen, before JAX and MuJoCo are imported.
+    """
+
+    settings: type[RunSettings]
+    function: str
+
+    def load(self) -> Callable[[RunSettings, Workspace], Report]:
+        """Import the function that runs it."""
+        module, _, name = self.function.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+
+EXPERIMENTS = {
+    "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
+}

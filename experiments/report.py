@@ -1,0 +1,211 @@
+"""What an experiment hands back, and the page it becomes."""
+
+import base64
+import html
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+STYLE = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture in the output folder.
+
+    Attributes:
+        file: relative to the output folder.
+        caption: what it shows and how to read it.
+        title: a few words.
+    """
+
+    file: str
+    title: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Numbers to read, already rounded to what their error bars allow.
+
+    Attributes:
+        columns: headings.
+        rows: cells, as text; `quantity` writes a number with its error.
+        caption: what it shows.
+        emphasised: positions (row, column) of the cells that the verdict rests on.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str
+    emphasised: frozenset[tuple[int, int]] = frozenset()
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome of a run.
+
+    Attributes:
+        verdict: the answer in a sentence or two, computed from the data.
+        details: further sentences, one finding each.
+        figures: in order of reading.
+        tables: after the figures.
+        metrics: rows for metrics.csv, in SI units.
+        video: relative to the output folder, or None.
+        video_caption: what it shows; without a video, why there is none.
+        warnings: what a reader must know before trusting the numbers.
+    """
+
+    verdict: str
+    figures: Sequence[Figure]
+    tables: Sequence[Table]
+    metrics: Sequence[dict[str, Any]]
+    details: Sequence[str] = ()
+    video: str | None = None
+    video_caption: str = ""
+    warnings: Sequence[str] = field(default_factory=tuple)
+
+
+def quantity(value: float, error: float | None = None) -> str:
+    """Write a number with as many digits as its error allows.
+
+    Args:
+        value: the number.
+        error: one standard error or half an interval; without it three digits are given.
+
+    Returns:
+        Such as "−0.0118 ± 0.0004" or "(1.23 ± 0.05)×10⁵".
+    """
+    if value != value or (error is not None and error != error):
+        return "undefined"
+    magnitude = max(abs(value), error or 0.0)
+    exponent = int(f"{magnitude:e}".partition("e")[2]) if magnitude else 0
+    power = exponent if exponent >= 4 or exponent < -3 else 0
+    scale = 10.0**power
+    if not error:
+        text = f"{value / scale:.{max(0, 2 - exponent + power)}f}"
+    else:
+        decimals = max(0, 1 - int(f"{error / scale:e}".partition("e")[2]))
+        text = f"{value / scale:.{decimals}f} ± {error / scale:.{decimals}f}"
+    text = text.replace("-", "−")
+    if not power:
+        return text
+    return f"({text})×10{superscript(power)}" if error else f"{text}×10{superscript(power)}"
+
+
+def superscript(number: int) -> str:
+    """Write an integer as an exponent."""
+    return str(number).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
+    """Write a report as one HTML file that needs nothing beside it.
+
+    Args:
+        report: the outcome.
+        folder: where its pictures and its video lie.
+        name: of the run.
+        question: what it answers.
+        expected: what was expected, or empty.
+        about: headed lists of settings and circumstances.
+
+    Returns:
+        The page.
+    """
+    body = [
+        f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
+        f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
+        _items(report.details),
+        "</section>",
+        f'<p class="expected"><b>Expected beforehand.</b> {_text(expected)}</p>' if expected else "",
+        _warnings(report.warnings),
+        _video(report, folder),
+        *(_figure(figure, folder, number) for number, figure in enumerate(report.figures, start=1)),
+        *(_table(table) for table in report.tables),
+        '<section class="about">',
+        *(_definitions(heading, entries) for heading, entries in about.items()),
+        "</section>",
+    ]
+    return document(f"{name}: {question}", "\n".join(part for part in body if part))
+
+
+def document(title: str, body: str) -> str:
+    """Frame a page's body.
+
+    Args:
+        title: of the browser's tab.
+        body: HTML.
+
+    Returns:
+        The page.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{_text(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _text(text: object) -> str:
+    return html.escape(str(text))
+
+
+def _data_uri(path: Path, media_type: str) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def _items(sentences: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{_text(sentence)}</li>" for sentence in sentences) + "</ul>" if sentences else ""
+
+
+def _warnings(sentences: Sequence[str]) -> str:
+    if not sentences:
+        return ""
+    return f'<section class="warnings"><h2>Before you trust the numbers</h2>{_items(sentences)}</section>'
+
+
+def _figure(figure: Figure, folder: Path, number: int) -> str:
+    source = _data_uri(folder / figure.file, "image/png")
+    return (
+        f'<figure><img src="{source}" alt="{_text(figure.title)}"><figcaption><b>Figure {number}. '
+        f"{_text(figure.title)}.</b> {_text(figure.caption)}</figcaption></figure>"
+    )
+
+
+def _video(report: Report, folder: Path) -> str:
+    if report.video is None:
+        return f'<p class="missing"><b>No video.</b> {_text(report.video_caption)}</p>' if report.video_caption else ""
+    source = _data_uri(folder / report.video, "video/mp4")
+    return (
+        f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
+        f"<figcaption><b>Video.</b> {_text(report.video_caption)}</figcaption></figure>"
+    )
+
+
+def _table(table: Table) -> str:
+    head = "".join(f'<th scope="col">{_text(column)}</th>' for column in table.columns)
+    rows = []
+    for i, row in enumerate(table.rows):
+        cells = [
+            f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>"
+            for j, cell in enumerate(row)
+        ]
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return (
+        f'<figure class="table"><figcaption>{_text(table.caption)}</figcaption><div class="scroll"><table>'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></figure>"
+    )
+
+
+def _class(table: Table, position: tuple[int, int], cell: str) -> str:
+    names = ["number"] if re.match(r"[−(]?\d", cell) else []
+    names += ["emphasised"] if position in table.emphasised else []
+    return f' class="{" ".join(names)}"' if names else ""
+
+
+def _definitions(heading: str, entries: dict[str, Any]) -> str:
+    rows = "".join(f"<dt>{_text(key)}</dt><dd>{_text(value)}</dd>" for key, value in entries.items())
+    return f"<div><h2>{_text(heading)}</h2><dl>{rows}</dl></div>"

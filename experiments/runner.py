@@ -1,0 +1,169 @@
+"""From a configuration to a finished output folder."""
+
+import json
+import os
+import re
+import shlex
+import sys
+import time
+import warnings
+import zlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from experiments import environment
+from experiments.config import Run, load_runs
+from experiments.failure import ExperimentError
+from experiments.opengl import OpenGL
+from experiments.output import building, write_csv, write_text, write_toml, writing
+from experiments.overview import overview
+from experiments.registry import EXPERIMENTS
+from experiments.report import Report, page
+from experiments.workspace import CompileClock, Workspace
+
+
+def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> Path:
+    """Run a configuration, every combination if it sweeps.
+
+    A result whose settings, source and versions are unchanged is kept, so an interrupted sweep goes on where it stopped.
+
+    Args:
+        file: a TOML file, or the name of one in `experiments/`.
+        overrides: `key=value` in TOML syntax.
+        output: the folder that holds each run's folder.
+        force: run what is unchanged, too.
+
+    Returns:
+        The path of the report.
+
+    Raises:
+        ExperimentError: in one sentence, if the run cannot go on.
+    """
+    runs = load_runs(file, overrides)
+    command = shlex.join(["python", "-m", "experiments", "run", file, *overrides])
+    is_sweep = bool(runs[0].varied)
+    top = output / (f"{runs[0].name}-sweep" if is_sweep else runs[0].name)
+    folders = [top / _folder_name(run.varied) if is_sweep else top for run in runs]
+    for run, folder in zip(runs, folders, strict=True):
+        _run_one(run, folder, command, force)
+    if is_sweep:
+        with writing(top):
+            write_text(top / "report.html", overview(runs, folders))
+        print(f"sweep of {len(runs)}: {top / 'report.html'}")
+    return top / "report.html"
+
+
+def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
+    settings = run.settings.model_dump(mode="json")
+    fingerprint = environment.fingerprint([settings, run.question, run.expected])
+    previous = _previous(folder)
+    # A report that lacks its video is made again once there is an OpenGL to draw it with.
+    is_unchanged = previous.get("fingerprint") == fingerprint
+    if is_unchanged and not force and not (previous["lacks_opengl"] and OpenGL().settle()):
+        print(f"unchanged: {folder / 'report.html'} (same settings and code; --force runs it again)")
+        return
+    with building(folder) as partial:
+        search = OpenGL()
+        _set_up_jax(run.settings.precision)
+        opengl = search.settle()
+        print(f"{folder}: {run.question}", file=sys.stderr)
+        workspace, started, compiling = Workspace(partial), time.perf_counter(), CompileClock()
+        report = _call(run, workspace)
+        head, is_dirty = environment.commit()
+        facts = {
+            "command": command,
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "commit": head,
+            "dirty": is_dirty,
+            "versions": environment.versions(),
+            "device": environment.device(),
+            "opengl": opengl,
+            "lacks_opengl": opengl is None and report.video is None and bool(report.video_caption),
+            "seconds": {
+                **workspace.seconds,
+                "total": time.perf_counter() - started,
+                "of it compiling": compiling.seconds,
+            },
+            "fingerprint": fingerprint,
+        }
+        with writing(folder):
+            _write(run, report, partial, facts)
+    print(f"{report.verdict}\n{folder / 'report.html'}")
+
+
+def _call(run: Run, workspace: Workspace) -> Report:
+    """Run the experiment; what the library warns of goes into the report, not to the terminal."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        report = EXPERIMENTS[run.settings.experiment].load()(run.settings, workspace)
+    sentences = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, UserWarning))
+    return Report(**{**vars(report), "warnings": [*report.warnings, *sentences]})
+
+
+def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> None:
+    header = "\n".join(filter(None, [run.question, f"Expected: {run.expected}" if run.expected else ""]))
+    write_toml(folder / "config.toml", run.settings.model_dump(mode="json"), header)
+    write_csv(folder / "metrics.csv", report.metrics)
+    (folder / "environment.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps({"verdict": report.verdict}, indent=2) + "\n", encoding="utf-8")
+    name = " · ".join([run.name, *(f"{key} = {value}" for key, value in run.varied.items())])
+    text = page(
+        report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts)
+    )
+    (folder / "report.html").write_text(text, encoding="utf-8")
+
+
+def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    commit = (facts["commit"] or "no repository")[:12] + (" with uncommitted changes" if facts["dirty"] else "")
+    device = facts["device"]
+    return {
+        "Settings": _flat(run.settings.model_dump(mode="json")),
+        "Time": {name: f"{seconds:.1f} s" for name, seconds in facts["seconds"].items()},
+        "Made with": {
+            "command": facts["command"],
+            "commit": commit,
+            "finished": facts["finished"],
+            "device": f"{device['count']} × {device['kind']} ({device['platform']}), {device['processors']} processors",
+            **facts["versions"],
+        },
+    }
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = ", ".join(map(_short, value)) if isinstance(value, list) else _short(value)
+    return flat
+
+
+def _short(value: Any) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _previous(folder: Path) -> dict[str, Any]:
+    """What the folder's result was made with; nothing if there is none or it is damaged."""
+    try:
+        facts = json.loads((folder / "environment.json").read_text(encoding="utf-8"))
+        return facts if (folder / "report.html").is_file() else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _set_up_jax(precision: str) -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", precision == "float64")
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        jax.config.update("jax_compilation_cache_dir", str(environment.ROOT / ".cache" / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _folder_name(varied: dict[str, Any]) -> str:
+    """Name a combination: readable, fit for any file system, different for different values."""
+    text = ",".join(f"{key}={value}" for key, value in varied.items())
+    safe = re.sub(r"[^\w.,=+-]", "_", text)[:100]
+    return safe if safe == text else f"{safe}-{zlib.crc32(text.encode()):08x}"

@@ -1,0 +1,76 @@
+"""What a running experiment sees of its output folder, its clock and its terminal."""
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from tqdm import tqdm
+
+
+class Workspace:
+    """An output folder under construction, with the time that its stages took.
+
+    Args:
+        folder: exists, and is moved to its final place by the runner once all is written.
+
+    Attributes:
+        seconds: wall time by stage.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def stage(self, name: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:
+        """Time a stage and show how far it is.
+
+        Args:
+            name: what is being done.
+            unit: what it consists of, in the plural.
+            total: how many of these there are.
+
+        Yields:
+            A function to be told how many are done.
+        """
+        start = time.perf_counter()
+        is_terminal = sys.stderr.isatty()
+        # A log is no place for a bar that redraws itself ten times a second.
+        interval = 0.1 if is_terminal else 15.0
+        bar = tqdm(desc=f"  {name}", unit=f" {unit}", total=total, mininterval=interval, dynamic_ncols=True)
+        stop = threading.Event()
+
+        def keep_alive() -> None:
+            # The first step compiles, for half a minute: the clock must be seen to run.
+            while not stop.wait(interval + 0.9):
+                bar.refresh()
+
+        ticking = threading.Thread(target=keep_alive, daemon=True)
+        ticking.start()
+        try:
+            yield lambda done: bar.update(done - bar.n) and None
+        finally:
+            stop.set()
+            ticking.join()
+            bar.close()
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+class CompileClock:
+    """The time that JAX spends on compiling in this process, from where it is made.
+
+    Tracing is left out of it, for JAX reports that of nested functions twice.
+    """
+
+    def __init__(self):
+        import jax
+
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, seconds: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            self.seconds += seconds

@@ -1,0 +1,134 @@
+"""Configurations are refused as a whole, with every mistake and its remedy."""
+
+import pytest
+
+from experiments.config import FOLDER, load_runs, read_header
+from experiments.failure import ConfigurationError
+
+VALID = """\
+# Is it so?
+# Expected: yes, it
+# is.
+experiment = "bias_variance"
+task = "ramp"
+stddev = 0.1
+angles = [0.05]
+stiffness = [1, 1e2]
+num_samples = 10
+reference_samples = 100
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text):
+        path = tmp_path / "trial.toml"
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+def mistakes(path, *overrides):
+    with pytest.raises(ConfigurationError) as caught:
+        load_runs(path, list(overrides))
+    return caught.value.mistakes
+
+
+def test_a_valid_file_is_one_run_with_its_defaults_filled_in(write):
+    (run,) = load_runs(write(VALID), [])
+    assert (run.name, run.question, run.expected, run.varied) == ("trial", "Is it so?", "yes, it is.", {})
+    assert run.settings.stiffness == (1.0, 100.0)
+    assert run.settings.seed == 0
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_configuration_is_valid_and_opens_with_its_question(path):
+    for run in load_runs(str(path), []):
+        assert run.question.endswith("?")
+        assert run.expected
+
+
+def test_all_mistakes_are_told_at_once(write):
+    text = VALID.replace("stddev = 0.1", 'stddev = "wide"').replace("num_samples = 10", "num_sampels = 10")
+    found = mistakes(write(text), "angles=[]", "video.speed=0", "nonsense", "seed=-1")
+    assert {sentence.partition(":")[0] for sentence in found} == {
+        "stddev", "num_sampels", "num_samples", "angles", "video.speed", "video.angles", "video.stiffness", "nonsense",
+        "seed",
+    }  # fmt: skip
+
+
+def test_a_misspelt_key_is_answered_with_the_right_one(write):
+    (sentence,) = mistakes(write(VALID + "dampign_ratio = 1.0\n"))
+    assert sentence == 'dampign_ratio: unknown key; did you mean "damping_ratio"?'
+
+
+def test_a_misspelt_key_in_a_table_is_answered_from_that_table(write):
+    found = mistakes(write(VALID + "[video]\nangles = [0.5]\nstiffness = [1.0]\nspede = 1.0\n"))
+    assert found == ('video.spede: unknown key; did you mean "speed"?',)
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("experiment=bias_varaince", 'experiment: there is no experiment "bias_varaince"; did you mean "bias_variance"?'),
+        ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of bias_variance'),
+        ("task=ball_wal", 'task: there is no "ball_wal"; did you mean "ball_wall"?'),
+        ("task=juggling", 'task: there is no "juggling"; choose one of ball_wall, ramp'),
+        ("seed=1.5", "seed: must be integer, got 1.5"),
+        ('num_samples="10"', 'num_samples: must be integer, got "10"'),
+        ("num_samples=1", "num_samples: must be greater than or equal to 2, got 1"),
+        ("stddev=nan", "stddev: must be a finite number, got NaN"),
+        ("angles=[0.1, true]", "angles[1]: must be number, got true"),
+        ("stddev.x=1", "stddev.x: stddev is a value, not a table"),
+        ("seed=2026-01-01", "seed: must be integer"),
+        ("seed=[1", "seed=[1: [1 is not a TOML value"),
+    ],
+)
+def test_one_mistake_is_one_sentence(write, override, sentence):
+    (found,) = mistakes(write(VALID), override)
+    assert found.startswith(sentence)
+
+
+def test_overrides_are_toml_and_a_bare_word_is_a_string(write):
+    overrides = ["stiffness=[1e1, 1e3]", "task=ramp", "video.angles=[0.2]", "video.stiffness=[5]", "include_default=false"]
+    (run,) = load_runs(write(VALID), overrides)
+    assert run.settings.stiffness == (10.0, 1000.0)
+    assert run.settings.video.angles == (0.2,)
+    assert run.settings.include_default is False
+
+
+def test_a_sweep_is_every_combination_with_its_last_key_changing_fastest(write):
+    runs = load_runs(write(VALID + "[sweep]\nseed = [0, 1]\nstddev = [0.1, 0.2, 0.3]\n"), [])
+    assert [(run.settings.seed, run.settings.stddev) for run in runs] == [
+        (seed, stddev) for seed in (0, 1) for stddev in (0.1, 0.2, 0.3)
+    ]
+    assert runs[1].varied == {"seed": 0, "stddev": 0.2}
+
+
+def test_an_override_ends_the_sweep_of_its_key(write):
+    runs = load_runs(write(VALID + "[sweep]\nseed = [0, 1]\nstddev = [0.1, 0.2]\n"), ["seed=7"])
+    assert [(run.settings.seed, run.varied) for run in runs] == [(7, {"stddev": 0.1}), (7, {"stddev": 0.2})]
+
+
+def test_a_mistake_in_a_sweep_is_told_once_and_by_its_path(write):
+    found = mistakes(write(VALID + '[sweep]\nsede = [0, 1]\nstddev = [0.1, "wide"]\nnum_samples = 5\n'))
+    assert set(found) == {
+        'sweep.sede: unknown key; did you mean "seed"?',
+        'sweep.stddev: must be number, got "wide"',
+        "sweep.num_samples: must be an array of at least one value, got 5",
+    }
+
+
+def test_a_missing_file_is_answered_with_those_there_are():
+    assert mistakes("ball_wal") == ('there is no such file; did you mean "ball_wall"?',)
+
+
+def test_broken_toml_is_told_with_its_line(write):
+    (sentence,) = mistakes(write(VALID + "seed = = 1\n"))
+    assert sentence.startswith("not TOML: ")
+    assert "line 11" in sentence
+
+
+def test_a_file_without_a_comment_has_no_question():
+    assert read_header("seed = 1\n") == ("", "")

@@ -1,0 +1,88 @@
+"""An output folder is complete, or as it was before."""
+
+import os
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from experiments.failure import ExperimentError
+from experiments.output import building, write_csv, write_text, write_toml
+
+
+def listing(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_folder_appears_whole_and_replaces_the_former(tmp_path):
+    for content in ("old", "new"):
+        with building(tmp_path / "run") as folder:
+            (folder / content).write_text(content)
+            assert not (tmp_path / "run" / content).exists()
+    assert listing(tmp_path) == ["run"]
+    assert listing(tmp_path / "run") == ["new"]
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_a_failure_leaves_the_former_result_and_nothing_else(tmp_path, failure):
+    with building(tmp_path / "run") as folder:
+        (folder / "old").write_text("old")
+    with pytest.raises(failure), building(tmp_path / "run") as folder:
+        (folder / "half").write_text("half")
+        raise failure
+    assert listing(tmp_path) == ["run"]
+    assert listing(tmp_path / "run") == ["old"]
+
+
+def test_what_a_killed_run_left_behind_is_cleared_and_its_former_result_comes_back(tmp_path):
+    """Killed between its two renames: the old result stands aside, and the new one is not in place."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    (tmp_path / ".run.previous").mkdir()
+    (tmp_path / ".run.previous" / "old").write_text("old")
+    (tmp_path / f".run.partial-{process.pid}").mkdir()
+    with pytest.raises(RuntimeError), building(tmp_path / "run"):
+        raise RuntimeError
+    assert listing(tmp_path) == ["run"]
+    assert listing(tmp_path / "run") == ["old"]
+
+
+def test_the_remains_of_a_run_that_still_goes_on_are_left_to_it(tmp_path):
+    other = tmp_path / f".run.partial-{os.getppid()}"
+    other.mkdir()
+    with building(tmp_path / "run"):
+        pass
+    assert other.is_dir()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    """A path below a file: no user may write there, root neither."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExperimentError, match=r"cannot write the results to .*file/run: not a directory.*--output"):
+        with building(tmp_path / "file" / "run"):
+            pass
+
+
+def test_a_text_is_whole_or_absent(tmp_path):
+    write_text(tmp_path / "a.html", "one")
+    with pytest.raises(TypeError):
+        write_text(tmp_path / "a.html", 5)
+    assert (tmp_path / "a.html").read_text() == "one"
+    assert listing(tmp_path) == ["a.html"]
+
+
+def test_settings_survive_their_way_through_toml(tmp_path):
+    settings = {
+        "text": 'a "quoted" \\ word', "number": 1e-05, "large": 1e16, "count": 3, "flag": True, "none": None,
+        "list": [1.0, 2.5], "table": {"inner": 1, "deeper": {"stddev": 0.1}},
+    }  # fmt: skip
+    write_toml(tmp_path / "config.toml", settings, "Is it so?\nExpected: yes.")
+    text = (tmp_path / "config.toml").read_text()
+    assert tomllib.loads(text) == {key: value for key, value in settings.items() if value is not None}
+    assert text.startswith("# Is it so?\n# Expected: yes.\n")
+
+
+def test_rows_become_csv(tmp_path):
+    write_csv(tmp_path / "m.csv", [{"a": 1.5, "b": True}, {"a": -2.0, "b": False}])
+    assert (tmp_path / "m.csv").read_text().splitlines() == ["a,b", "1.5,True", "-2.0,False"]

@@ -1,0 +1,34 @@
+"""Numbers as a reader wants them."""
+
+import pytest
+
+from experiments.report import quantity
+from experiments.theme import power
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (-0.01182605, 0.0004, "−0.01183 ± 0.00040"),
+        (123456.0, 5000.0, "(1.235 ± 0.050)×10⁵"),
+        (1531.5, 12.0, "1532 ± 12"),
+        (0.0, 0.02, "0.000 ± 0.020"),
+        (2.5e-7, 1e-8, "(2.50 ± 0.10)×10⁻⁷"),
+        (0.5, None, "0.500"),
+        (12.3456, None, "12.3"),
+        (0.0, None, "0.00"),
+        (123456.0, None, "1.23×10⁵"),
+        (float("nan"), 1.0, "undefined"),
+        (1.0, float("nan"), "undefined"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_error_allows(value, error, text):
+    assert quantity(value, error) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.0, "1"), (250.0, "250"), (1000.0, "10³"), (2500.0, "2500"), (3e5, "3×10⁵"), (1e-3, "10⁻³"), (3.2e-4, "3.2×10⁻⁴")],
+)
+def test_a_power_of_ten_is_written_as_one(value, text):
+    assert power(value) == text

@@ -1,0 +1,225 @@
+"""A run from its file to its folder, on the task that compiles in seconds."""
+
+import csv
+import json
+import re
+import shutil
+import tomllib
+import types
+
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from experiments import environment
+from experiments.__main__ import main
+from experiments.bias_variance import video as video_module
+from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.registry import EXPERIMENTS
+from experiments.workspace import Workspace
+from mjxgrad.render import RenderingUnavailableError
+
+SETTINGS = """\
+# Does a <steep> step mislead?
+# Expected: yes.
+experiment = "bias_variance"
+task = "ramp"
+stddev = 0.1
+angles = [0.05, 0.12]
+stiffness = [1e1, 1e5]
+num_samples = 64
+reference_samples = 500
+"""
+
+
+def run(path, folder, *arguments):
+    return main(["run", str(path), "--output", str(folder), *arguments])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One run, and what it printed; copied by whoever changes it."""
+    folder = tmp_path_factory.mktemp("experiment")
+    (folder / "steep.toml").write_text(SETTINGS)
+    assert run(folder / "steep.toml", folder / "runs") == 0
+    return folder
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def test_the_folder_holds_all_that_was_promised(finished):
+    folder = finished / "runs" / "steep"
+    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()) == [
+        "config.toml", "environment.json",
+        "figures/bias_variance.png", "figures/choice.png", "figures/gradient.png", "figures/landscape.png",
+        "metrics.csv", "report.html", "summary.json",
+    ]  # fmt: skip
+
+
+def test_the_resolved_configuration_runs_again_as_the_same(finished, capsys):
+    folder = finished / "runs" / "steep"
+    settings = tomllib.loads((folder / "config.toml").read_text())
+    assert settings["num_samples"] == 64
+    assert settings["confidence"] == 0.95
+    # Named otherwise it would be another run: so a copy of it stands in for the file.
+    again = finished / "again" / "steep.toml"
+    again.parent.mkdir()
+    again.write_text((folder / "config.toml").read_text())
+    assert run(again, finished / "runs") == 0
+    assert capsys.readouterr().out.startswith("unchanged: ")
+
+
+def test_the_environment_says_what_made_it(finished):
+    facts = json.loads((finished / "runs" / "steep" / "environment.json").read_text())
+    assert facts["versions"]["mujoco"].startswith("3.17.")
+    assert facts["device"]["platform"]
+    assert facts["command"].startswith("python -m experiments run ")
+    assert facts["seconds"]["total"] >= facts["seconds"]["gradients"] > 0
+
+
+def test_the_metrics_agree_with_the_closed_form_of_the_ramp(finished):
+    """Slope s = 10, noise 0.1: F' = s (Φ((1/s − θ)/0.1) − Φ((−1/s − θ)/0.1)) + 2θ at θ = 0.05 is 6.347 (Φ(½) + Φ(1½) − 1)."""
+    with (finished / "runs" / "steep" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4
+    row = rows[0]
+    exact = 10 * (0.691462 + 0.933193 - 1) + 2 * 0.05
+    assert float(row["reference"]) == pytest.approx(exact, rel=2e-3)
+    for name in ("first_order", "zeroth_order"):
+        assert float(row[f"{name}_low"]) < exact < float(row[f"{name}_high"])
+
+
+def test_the_report_needs_nothing_beside_it(finished):
+    text = (finished / "runs" / "steep" / "report.html").read_text()
+    sources = re.findall(r'(?:src|href)="([^"]{0,20})', text)
+    assert len(sources) == 4
+    assert all(source.startswith("data:image/png") for source in sources)
+    assert not re.search(r"https?://|@import|url\(|<script|<link", text)
+
+
+def test_the_report_shows_question_verdict_and_settings_as_text(finished):
+    text = (finished / "runs" / "steep" / "report.html").read_text()
+    verdict = json.loads((finished / "runs" / "steep" / "summary.json").read_text())["verdict"]
+    assert "<h1>Does a &lt;steep&gt; step mislead?</h1>" in text
+    assert verdict in text
+    assert "measurably biased from 10⁵ 1/s² on" in verdict
+    assert "<dt>reference_samples</dt><dd>500</dd>" in text
+    assert str(finished) not in verdict
+
+
+def test_an_unchanged_run_says_so_and_where_its_report_is(copied, capsys):
+    before = (copied / "runs" / "steep" / "environment.json").read_text()
+    assert run(copied / "steep.toml", copied / "runs") == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"unchanged: {copied / 'runs' / 'steep' / 'report.html'}")
+    assert out.count("\n") == 1
+    assert (copied / "runs" / "steep" / "environment.json").read_text() == before
+
+
+def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch):
+    """A run that is reached raises here, and leaves the former result."""
+
+    def reached():
+        raise ValueError("reached")
+
+    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: lambda *_: reached())
+    assert run(copied / "steep.toml", copied / "runs") == 0
+    assert run(copied / "steep.toml", copied / "runs", "seed=1") == 2
+    assert run(copied / "steep.toml", copied / "runs", "--force") == 2
+    (copied / "runs" / "steep" / "report.html").rename(copied / "gone.html")
+    assert run(copied / "steep.toml", copied / "runs") == 2
+    (copied / "gone.html").rename(copied / "runs" / "steep" / "report.html")
+    monkeypatch.setattr(environment, "ROOT", copied)
+    assert run(copied / "steep.toml", copied / "runs") == 2
+    assert (copied / "runs" / "steep" / "metrics.csv").is_file()
+    assert [path.name for path in (copied / "runs").iterdir()] == ["steep"]
+
+
+def test_a_library_refusal_is_a_sentence_and_debug_shows_the_traceback(copied, monkeypatch, capsys):
+    def refuse(*_):
+        raise mg.DivergedError("the rollout diverged at step 3")
+
+    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: refuse)
+    assert run(copied / "steep.toml", copied / "runs", "--force") == 2
+    assert capsys.readouterr().err.endswith("\nthe rollout diverged at step 3\n")
+    with pytest.raises(mg.DivergedError):
+        run(copied / "steep.toml", copied / "runs", "--force", "--debug")
+
+
+def test_an_interruption_is_told_and_leaves_the_former_result(copied, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: interrupt)
+    assert run(copied / "steep.toml", copied / "runs", "--force") == 130
+    assert "earlier results are as they were" in capsys.readouterr().err
+    assert (copied / "runs" / "steep" / "report.html").is_file()
+
+
+def test_rollouts_that_are_all_nan_are_a_sentence_that_names_the_stiffness(copied, capsys):
+    """A slope of 1e200 times an angle that overflows: the cost is finite nowhere that counts."""
+    (copied / "nan.toml").write_text(SETTINGS.replace("angles = [0.05, 0.12]", "angles = [1e160, 2e160]"))
+    assert run(copied / "nan.toml", copied / "runs") == 2
+    assert "gives no estimate" in capsys.readouterr().err
+    assert not (copied / "runs" / "nan").exists()
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(finished, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert run(finished / "steep.toml", tmp_path / "file") == 2
+    assert "not a directory" in capsys.readouterr().err
+
+
+def test_a_sweep_leads_to_its_runs_and_goes_on_where_it_stopped(tmp_path, capsys):
+    (tmp_path / "both.toml").write_text(SETTINGS + "[sweep]\nseed = [0, 1]\n")
+    assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
+    capsys.readouterr()
+    top = tmp_path / "runs" / "both-sweep"
+    assert sorted(path.name for path in top.iterdir()) == ["report.html", "seed=0", "seed=1"]
+    text = (top / "report.html").read_text()
+    assert re.findall(r'href="([^"]*)"', text) == ["seed=0/report.html", "seed=1/report.html"]
+    shutil.rmtree(top / "seed=1")
+    assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
+    out = capsys.readouterr().out
+    assert out.count("unchanged: ") == 1
+    assert (top / "seed=1" / "report.html").is_file()
+
+
+def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise RenderingUnavailableError("install libosmesa6")
+
+    monkeypatch.setattr(video_module, "frames", refuse)
+    monkeypatch.setattr(video_module, "wall_contact", lambda *_: mg.Softness.sweep(stiffness=[1.0]))
+    option = types.SimpleNamespace(timestep=0.01)
+    scene = types.SimpleNamespace(mj_model=types.SimpleNamespace(opt=option))
+    thrown = types.SimpleNamespace(trajectory=lambda angle: types.SimpleNamespace(qpos=angle * np.ones((2, 1))))
+    task = types.SimpleNamespace(scene=scene, with_softness=lambda softness: thrown)
+    settings = BiasVarianceSettings.model_validate_json(
+        json.dumps(tomllib.loads(SETTINGS) | {"video": {"angles": [0.5], "stiffness": [1.0]}})
+    )
+    assert video_module.video(types.SimpleNamespace(task=task), settings, Workspace(tmp_path)) == (
+        None,
+        "install libosmesa6",
+    )
+
+
+@pytest.mark.slow
+def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(tmp_path):
+    import os
+    import subprocess
+    import sys
+
+    small = ["num_samples=8", "reference_samples=100", "stiffness=[1e2,1e4]", "angles=[0.65]"]
+    command = [sys.executable, "-m", "experiments", "run", "ball_wall", *small, "--output", str(tmp_path)]
+    result = subprocess.run(
+        command, env={**os.environ, "MUJOCO_GL": "disable"}, cwd=environment.ROOT, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "ball_wall" / "report.html").read_text()
+    assert "<b>No video.</b>" in text
+    assert "libosmesa6" in text
