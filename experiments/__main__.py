@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, 2 for a refusal that was explained, 130 for an interruption.
     """
-    options = _parser().parse_args(arguments)
+    options = _parse(arguments)
     # A run that is asked to stop clears up as it does for Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -37,6 +37,18 @@ def main(arguments: list[str] | None = None) -> int:
         print(str(error) or type(error).__name__, file=sys.stderr)
         return 2
     return 0
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = _parser()
+    options, rest = parser.parse_known_args(arguments)
+    # argparse takes overrides on one side of an option only; those on its other side are left over.
+    if options.command == "list" or any(item.startswith("-") for item in rest):
+        if rest:
+            parser.error(f"unrecognised arguments: {' '.join(rest)}")
+    else:
+        options.overrides += rest
+    return options
 
 
 def _list() -> int:

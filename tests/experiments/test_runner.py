@@ -106,7 +106,7 @@ def test_the_report_shows_question_verdict_and_settings_as_text(finished):
     verdict = json.loads((finished / "runs" / "steep" / "summary.json").read_text())["verdict"]
     assert "<h1>Does a &lt;steep&gt; step mislead?</h1>" in text
     assert verdict in text
-    assert "measurably biased from 10⁵ 1/s² on" in verdict
+    assert "measurably biased at 10⁵ 1/s²" in verdict
     assert "<dt>reference_samples</dt><dd>500</dd>" in text
     assert str(finished) not in verdict
 
