@@ -27,6 +27,7 @@ help:  ## list these targets
 	    printf 'make %-14s %s\n' "$$name" "$$(sed -n '1s/^# *//p' "experiments/$$name.toml")"; done
 
 setup: .venv/.installed  ## install the tested versions into .venv
+	@echo 'Installed in .venv. Next: make demo, make test; make help lists the rest.'
 
 .venv/.installed: pyproject.toml .ci/constraints.txt
 	@command -v $(PYTHON) >/dev/null || { \

@@ -7,7 +7,7 @@ import tempfile
 
 CANDIDATES = ("egl", "osmesa", "glfw")
 
-# MuJoCo chooses its OpenGL once, while it is imported, and a broken driver may end the process: so it is tried elsewhere.
+# MuJoCo chooses its OpenGL once, while it is imported, and a broken driver may end the process: so others try.
 PROBE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")

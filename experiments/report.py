@@ -189,10 +189,7 @@ def _table(table: Table) -> str:
     head = "".join(f'<th scope="col">{_text(column)}</th>' for column in table.columns)
     rows = []
     for i, row in enumerate(table.rows):
-        cells = [
-            f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>"
-            for j, cell in enumerate(row)
-        ]
+        cells = [f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>" for j, cell in enumerate(row)]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return (
         f'<figure class="table"><figcaption>{_text(table.caption)}</figcaption><div class="scroll"><table>'

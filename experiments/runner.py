@@ -14,7 +14,6 @@ from typing import Any
 
 from experiments import environment
 from experiments.config import Run, load_runs
-from experiments.failure import ExperimentError
 from experiments.opengl import OpenGL
 from experiments.output import building, write_csv, write_text, write_toml, writing
 from experiments.overview import overview
@@ -26,7 +25,7 @@ from experiments.workspace import CompileClock, Workspace
 def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> Path:
     """Run a configuration, every combination if it sweeps.
 
-    A result whose settings, source and versions are unchanged is kept, so an interrupted sweep goes on where it stopped.
+    A result whose settings, source and versions are unchanged is kept: an interrupted sweep goes on where it stopped.
 
     Args:
         file: a TOML file, or the name of one in `experiments/`.
@@ -108,9 +107,7 @@ def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> Non
     (folder / "environment.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps({"verdict": report.verdict}, indent=2) + "\n", encoding="utf-8")
     name = " · ".join([run.name, *(f"{key} = {value}" for key, value in run.varied.items())])
-    text = page(
-        report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts)
-    )
+    text = page(report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts))
     (folder / "report.html").write_text(text, encoding="utf-8")
 
 

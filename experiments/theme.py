@@ -1,6 +1,7 @@
 """How the figures look: one type size, few lines, colours that colour-blind readers can tell apart."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,7 +17,7 @@ FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
 DEFAULT, MUTED = "#cc79a7", "#8b94a1"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
 
-RULES = {
+RULES: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
     "axes.titlesize": 10,

@@ -50,8 +50,12 @@ class Workspace:
 
         ticking = threading.Thread(target=keep_alive, daemon=True)
         ticking.start()
+
+        def advance_to(done: int) -> None:
+            bar.update(done - bar.n)
+
         try:
-            yield lambda done: bar.update(done - bar.n) and None
+            yield advance_to
         finally:
             stop.set()
             ticking.join()
@@ -71,6 +75,6 @@ class CompileClock:
         self.seconds = 0.0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
-    def _listen(self, event: str, seconds: float, **_: object) -> None:
+    def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.endswith("backend_compile_duration"):
-            self.seconds += seconds
+            self.seconds += duration_secs

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from experiments.bias_variance.outcome import Interval, Outcome
 from experiments.report import Figure
@@ -146,8 +146,14 @@ def _panels(outcome: Outcome, *, rows: int, height: float):
         axis.set_title(f"{angle:g} rad")
     if outcome.has_default:
         axes[0, 0].annotate(
-            "default", (outcome.stiffness[-1], 1), xycoords=("data", "axes fraction"), xytext=(3, -2),
-            textcoords="offset points", va="top", fontsize=8, color=MUTED,
+            "default",
+            (outcome.stiffness[-1], 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, -2),
+            textcoords="offset points",
+            va="top",
+            fontsize=8,
+            color=MUTED,
         )
     figure.supxlabel(f"contact stiffness, {UNIT}", fontsize=9.5, color="#3b4452")
     return figure, axes
@@ -166,10 +172,16 @@ def _bars(axis: Axes, outcome: Outcome, interval: Interval, j: int, colour, mark
 
 def _robust_limits(axis: Axes, outcome: Outcome, j: int) -> None:
     """Keep one wild interval of a stiff contact from flattening all others."""
-    ends = np.concatenate([
-        outcome.reference.low[:, j], outcome.reference.high[:, j], outcome.zeroth.low[:, j], outcome.zeroth.high[:, j],
-        outcome.first.value[:, j], [0.0],
-    ])
+    ends = np.concatenate(
+        [
+            outcome.reference.low[:, j],
+            outcome.reference.high[:, j],
+            outcome.zeroth.low[:, j],
+            outcome.zeroth.high[:, j],
+            outcome.first.value[:, j],
+            [0.0],
+        ]
+    )
     ends = ends[np.isfinite(ends)]
     margin = 0.15 * (ends.max() - ends.min() or 1.0)
     axis.set_ylim(ends.min() - margin, ends.max() + margin)

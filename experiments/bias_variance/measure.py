@@ -113,5 +113,3 @@ def scene_warnings(problem: Problem, finite: Float[np.ndarray, "stiffness angles
             "not finite and were left out, so its means are over the others."
         )
     return sentences
-
-

@@ -23,7 +23,7 @@ class Outcome:
     r"""Both estimates at each stiffness and angle. Costs are in m², so gradients are in m²/rad.
 
     Attributes:
-        stiffness: effective, in 1/s²; of the sweep, ascending, and after it of the scene's default if that was asked for.
+        stiffness: effective, in 1/s²; of the sweep, ascending, and after it of MuJoCo's default if that was asked for.
         angles: in rad.
         has_default: whether the last row is MuJoCo's default contact, which differs from the sweep in impedance, too.
         stddev: of the noise, in rad.

@@ -71,7 +71,8 @@ def wall_contact(task: BallWall, stiffness: Float[np.ndarray, " rows"], settings
 def _ball_wall(settings: BiasVarianceSettings) -> Problem:
     task = ball_wall()
     knob = wall_contact(task, np.sort(settings.stiffness), settings)
-    for row in range(len(knob.stiffness)):
+    stiffness = np.asarray(knob.stiffness)
+    for row in range(len(stiffness)):
         # Outside of a trace, where the scene knows its values and warns of what its time step cannot follow.
         task.with_softness(jax.tree.map(lambda leaf, row=row: leaf[row], knob))
 
@@ -81,7 +82,7 @@ def _ball_wall(settings: BiasVarianceSettings) -> Problem:
     def objective(softness: mg.Softness) -> Objective:
         return task.objective(settings.stddev, softness)
 
-    return Problem(np.asarray(knob.stiffness), knob, settings.include_default, cost, objective, task)
+    return Problem(stiffness, knob, settings.include_default, cost, objective, task)
 
 
 class Ramp(eqx.Module):
@@ -90,6 +91,7 @@ class Ramp(eqx.Module):
     slope: Float[Array, ""]
 
     def __call__(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
+        """Give the cost."""
         return jnp.clip(self.slope * angle[0], -1, 1) + angle[0] ** 2
 
 

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from experiments.config import Finite, Positive, RunSettings, Settings
 
+
 class VideoSettings(Settings):
     """Rollouts side by side: each of some angles at each of some stiffnesses."""
 
@@ -26,7 +27,6 @@ class VideoSettings(Settings):
 class BiasVarianceSettings(RunSettings):
     """Bias and variance of both estimates against contact stiffness, at several points."""
 
-    experiment: Literal["bias_variance"]
     task: Literal["ball_wall", "ramp"]
     """What is differentiated."""
     stddev: Positive

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from experiments.bias_variance.outcome import Outcome
 from experiments.report import Table, quantity
@@ -39,7 +40,9 @@ def findings(outcome: Outcome) -> list[str]:
         The sentences that the numbers support; there may be none.
     """
     return [
-        sentence for sentence in (_worst_bias(outcome), _wrong_signs(outcome), _variance(outcome)) if sentence is not None
+        sentence
+        for sentence in (_worst_bias(outcome), _wrong_signs(outcome), _variance(outcome))
+        if sentence is not None
     ]
 
 
@@ -50,21 +53,30 @@ def table(outcome: Outcome) -> Table:
         use = "first" if outcome.prefers_first[i, j] else "zeroth"
         if outcome.is_biased[i, j]:
             emphasised.add((len(rows), 5))
-        rows.append([
-            name(outcome, i) if j == 0 else "",
-            f"{outcome.angles[j]:g}",
-            *(_with_half_width(interval, i, j) for interval in (outcome.first, outcome.zeroth, outcome.reference)),
-            _with_half_width(outcome.bias, i, j),
-            quantity(outcome.first_variance.value[i, j] / outcome.zeroth_variance.value[i, j]),
-            use,
-        ])
+        rows.append(
+            [
+                name(outcome, i) if j == 0 else "",
+                f"{outcome.angles[j]:g}",
+                *(_with_half_width(interval, i, j) for interval in (outcome.first, outcome.zeroth, outcome.reference)),
+                _with_half_width(outcome.bias, i, j),
+                quantity(outcome.first_variance.value[i, j] / outcome.zeroth_variance.value[i, j]),
+                use,
+            ]
+        )
     columns = (
-        "stiffness, 1/s²", "angle, rad", "first order", "zeroth order", "reference", "bias of first order",
-        "variance ratio", "use",
+        "stiffness, 1/s²",
+        "angle, rad",
+        "first order",
+        "zeroth order",
+        "reference",
+        "bias of first order",
+        "variance ratio",
+        "use",
     )
     percent = f"{outcome.confidence:.0%}"
     caption = (
-        f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.num_samples} rollouts each. "
+        f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.num_samples} rollouts "
+        "each. "
         "A bias in bold differs from zero beyond chance over the whole table. The ratio is the variance of a sample of "
         "first order over that of zeroth order. The last column is the estimate with the "
         f"smaller expected error at {outcome.budget} rollouts per gradient."
@@ -91,7 +103,7 @@ def _split(outcome: Outcome, good: np.ndarray) -> str:
     return _join(parts) + "."
 
 
-def _sides(good: np.ndarray, words: Callable[[np.ndarray], str], throughout: str) -> tuple[list[str], int]:
+def _sides(good: np.ndarray, words: Callable[[ArrayLike], str], throughout: str) -> tuple[list[str], int]:
     """Describe the groups (rows) where all agree and where not; with the number of cases that do not."""
     at_all, at_none = good.all(axis=1), ~good.any(axis=1)
     mixed = ~at_all & ~at_none
@@ -106,13 +118,13 @@ def _sides(good: np.ndarray, words: Callable[[np.ndarray], str], throughout: str
     return parts, int(good[mixed].size)
 
 
-def _angles(outcome: Outcome, columns: np.ndarray) -> str:
-    return f"at {_join([f'{angle:g}' for angle in outcome.angles[columns]])} rad"
+def _angles(outcome: Outcome, columns: ArrayLike) -> str:
+    return f"at {_join([f'{angle:g}' for angle in outcome.angles[np.asarray(columns)]])} rad"
 
 
-def _range(outcome: Outcome, rows: np.ndarray) -> str:
+def _range(outcome: Outcome, rows: ArrayLike) -> str:
     """Words for the stiffnesses of some rows of the sweep: a range if they are neighbours, else a list."""
-    picked = np.flatnonzero(rows)
+    picked = np.flatnonzero(np.asarray(rows))
     labels = [power(k) for k in outcome.stiffness[picked]]
     if len(picked) == 1:
         return f"at {labels[0]} 1/s²"
@@ -154,7 +166,7 @@ def _worst_bias(outcome: Outcome) -> str | None:
         return None
     first, reference = outcome.first.value[i, j], outcome.reference.value[i, j]
     return (
-        f"Largest bias: at {outcome.angles[j]:g} rad and stiffness {name(outcome, i)} the first-order mean is "
+        f"Largest bias: at {outcome.angles[j]:g} rad and stiffness {name(outcome, int(i))} the first-order mean is "
         f"{quantity(first)} where the truth is {quantity(reference)} m²/rad."
     )
 

@@ -35,10 +35,17 @@ def video(problem: Problem, settings: BiasVarianceSettings, workspace: Workspace
         return jax.vmap(lambda angle: thrown.trajectory(angle[None]).qpos)(angles)
 
     clips, captions = [], []
+
     def draw(qpos):
         return frames(
-            task.scene, np.asarray(qpos), timestep=task.scene.mj_model.opt.timestep, fps=wanted.fps, speed=wanted.speed,
-            width=wanted.width, height=wanted.height, camera="side",
+            task.scene,
+            np.asarray(qpos),
+            timestep=task.scene.mj_model.opt.timestep,
+            fps=wanted.fps,
+            speed=wanted.speed,
+            width=wanted.width,
+            height=wanted.height,
+            camera="side",
         )
 
     try:
@@ -58,4 +65,10 @@ def video(problem: Problem, settings: BiasVarianceSettings, workspace: Workspace
 
 
 def _speed(speed: float) -> str:
-    return "at real speed" if speed == 1 else f"{1 / speed:g} times slower than real" if speed < 1 else f"{speed:g} times faster"
+    return (
+        "at real speed"
+        if speed == 1
+        else f"{1 / speed:g} times slower than real"
+        if speed < 1
+        else f"{speed:g} times faster"
+    )

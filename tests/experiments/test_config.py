@@ -71,7 +71,7 @@ def test_a_misspelt_key_in_a_table_is_answered_from_that_table(write):
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("experiment=bias_varaince", 'experiment: there is no experiment "bias_varaince"; did you mean "bias_variance"?'),
+        ("experiment=bias_varianc", 'experiment: there is no experiment "bias_varianc"; did you mean "bias_variance"?'),
         ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of bias_variance'),
         ("task=ball_wal", 'task: there is no "ball_wal"; did you mean "ball_wall"?'),
         ("task=juggling", 'task: there is no "juggling"; choose one of ball_wall, ramp'),
@@ -91,8 +91,8 @@ def test_one_mistake_is_one_sentence(write, override, sentence):
 
 
 def test_overrides_are_toml_and_a_bare_word_is_a_string(write):
-    overrides = ["stiffness=[1e1, 1e3]", "task=ramp", "video.angles=[0.2]", "video.stiffness=[5]", "include_default=false"]
-    (run,) = load_runs(write(VALID), overrides)
+    in_toml = ["stiffness=[1e1, 1e3]", "video.angles=[0.2]", "video.stiffness=[5]", "include_default=false"]
+    (run,) = load_runs(write(VALID), [*in_toml, "task=ramp"])
     assert run.settings.stiffness == (10.0, 1000.0)
     assert run.settings.video.angles == (0.2,)
     assert run.settings.include_default is False

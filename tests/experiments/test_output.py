@@ -28,9 +28,14 @@ def test_a_folder_appears_whole_and_replaces_the_former(tmp_path):
 def test_a_failure_leaves_the_former_result_and_nothing_else(tmp_path, failure):
     with building(tmp_path / "run") as folder:
         (folder / "old").write_text("old")
-    with pytest.raises(failure), building(tmp_path / "run") as folder:
-        (folder / "half").write_text("half")
-        raise failure
+
+    def fail_half_way():
+        with building(tmp_path / "run") as folder:
+            (folder / "half").write_text("half")
+            raise failure
+
+    with pytest.raises(failure):
+        fail_half_way()
     assert listing(tmp_path) == ["run"]
     assert listing(tmp_path / "run") == ["old"]
 
@@ -59,9 +64,9 @@ def test_the_remains_of_a_run_that_still_goes_on_are_left_to_it(tmp_path):
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     """A path below a file: no user may write there, root neither."""
     (tmp_path / "file").write_text("")
-    with pytest.raises(ExperimentError, match=r"cannot write the results to .*file/run: not a directory.*--output"):
-        with building(tmp_path / "file" / "run"):
-            pass
+    sentence = r"cannot write the results to .*file/run: not a directory.*--output"
+    with pytest.raises(ExperimentError, match=sentence), building(tmp_path / "file" / "run"):
+        pass
 
 
 def test_a_text_is_whole_or_absent(tmp_path):

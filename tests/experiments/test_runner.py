@@ -82,7 +82,7 @@ def test_the_environment_says_what_made_it(finished):
 
 
 def test_the_metrics_agree_with_the_closed_form_of_the_ramp(finished):
-    """Slope s = 10, noise 0.1: F' = s (Φ((1/s − θ)/0.1) − Φ((−1/s − θ)/0.1)) + 2θ at θ = 0.05 is 6.347 (Φ(½) + Φ(1½) − 1)."""
+    """With slope s = 10 and noise 0.1 it is s (Φ((1/s − θ)/0.1) − Φ((−1/s − θ)/0.1)) + 2θ; here Φ(½) and Φ(1½)."""
     with (finished / "runs" / "steep" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4
