@@ -2,6 +2,7 @@
 
 import copy
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -162,7 +163,10 @@ def _free_camera(mj_model: mujoco.MjModel) -> mujoco.MjvCamera:
 
 def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
     try:
-        return mujoco.Renderer(mj_model, height, width)
+        with warnings.catch_warnings():
+            # glfw warns of what it is about to raise.
+            warnings.simplefilter("ignore")
+            return mujoco.Renderer(mj_model, height, width)
     # MuJoCo, PyOpenGL, glfw and the drivers each raise errors of their own here, some of no common class.
     except Exception as error:
         reason = str(error).partition(",")[0] or type(error).__name__
