@@ -119,7 +119,9 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
         f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
         _items(report.details),
         "</section>",
-        f'<p class="expected"><b>Expected beforehand.</b> {_text(expected)}</p>' if expected else "",
+        f'<p class="expected"><b>Expected beforehand.</b> {_text(expected[:1].upper() + expected[1:])}</p>'
+        if expected
+        else "",
         _warnings(report.warnings),
         _video(report, folder),
         *(_figure(figure, folder, number) for number, figure in enumerate(report.figures, start=1)),

@@ -6,6 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
+# A ratio of errors nearer to 1 is a tie: a few hundred samples know their variance no better.
+MARGIN = 1.25
+
 Cells = Float[np.ndarray, "stiffness angles"]
 
 
@@ -98,9 +101,14 @@ class Outcome:
         return np.sqrt(self.zeroth_variance.value / self.budget)
 
     @property
-    def prefers_first(self) -> Bool[np.ndarray, "stiffness angles"]:
-        """Where the first-order estimate is expected to be closer."""
-        return self.first_error < self.zeroth_error
+    def first_wins(self) -> Bool[np.ndarray, "stiffness angles"]:
+        """Where the first-order estimate is expected to be clearly closer."""
+        return MARGIN * self.first_error < self.zeroth_error
+
+    @property
+    def zeroth_wins(self) -> Bool[np.ndarray, "stiffness angles"]:
+        """Where the zeroth-order estimate is expected to be clearly closer."""
+        return MARGIN * self.zeroth_error < self.first_error
 
     def rows(self) -> list[dict[str, float | bool]]:
         """One row per stiffness and angle, for metrics.csv."""

@@ -19,14 +19,7 @@ def verdict(outcome: Outcome) -> str:
     Returns:
         One to three sentences.
     """
-    good = outcome.prefers_first[outcome.swept]
-    budget = f"With {outcome.budget} rollouts per gradient"
-    if good.all():
-        choice = f"{budget} the first-order estimate is the closer one at every stiffness and angle."
-    elif not good.any():
-        choice = f"{budget} the zeroth-order estimate is the closer one at every stiffness and angle."
-    else:
-        choice = f"{budget} {_split(outcome, good)}"
+    choice = f"With {outcome.budget} rollouts per gradient {_choice(outcome)}."
     return " ".join([choice, _bias(outcome), *_default(outcome)])
 
 
@@ -50,7 +43,7 @@ def table(outcome: Outcome) -> Table:
     """Tabulate both estimates, the reference and which estimate to use."""
     rows, emphasised = [], set()
     for i, j in np.ndindex(outcome.bias.value.shape):
-        use = "first" if outcome.prefers_first[i, j] else "zeroth"
+        use = "first" if outcome.first_wins[i, j] else "zeroth" if outcome.zeroth_wins[i, j] else "either"
         if outcome.is_biased[i, j]:
             emphasised.add((len(rows), 5))
         rows.append(
@@ -78,7 +71,7 @@ def table(outcome: Outcome) -> Table:
         f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.num_samples} rollouts "
         "each. "
         "A bias in bold differs from zero beyond chance over the whole table. The ratio is the variance of a sample of "
-        "first order over that of zeroth order. The last column is the estimate with the "
+        "first order over that of zeroth order. The last column is the estimate with the clearly "
         f"smaller expected error at {outcome.budget} rollouts per gradient."
     )
     return Table(columns, rows, caption, frozenset(emphasised))
@@ -95,27 +88,35 @@ def _with_half_width(interval, i: int, j: int) -> str:
     return quantity(value) if half < 1e-3 * abs(value) else quantity(value, half)
 
 
-def _split(outcome: Outcome, good: np.ndarray) -> str:
-    """Say where first order is better: by stiffness or by angle, whichever leaves less undecided."""
-    by_stiffness = _sides(good, lambda rows: _range(outcome, rows), "at every angle")
-    by_angle = _sides(good.T, lambda columns: _angles(outcome, columns), "at every stiffness")
+def _choice(outcome: Outcome) -> str:
+    """Say which estimate is closer: by stiffness or by angle, whichever leaves less undecided."""
+    first, zeroth = outcome.first_wins[outcome.swept], outcome.zeroth_wins[outcome.swept]
+    if not zeroth.any():
+        return f"first order is {_degree(first)} at every stiffness and angle"
+    if not first.any():
+        return f"zeroth order is {_degree(zeroth)} at every stiffness and angle"
+    by_stiffness = _sides(first, zeroth, lambda rows: f"at every angle {_range(outcome, rows)}")
+    by_angle = _sides(first.T, zeroth.T, lambda columns: f"{_angles(outcome, columns)} at every stiffness")
     parts, _ = min(by_stiffness, by_angle, key=lambda sides: sides[1])
-    return _join(parts) + "."
+    return _join(parts)
 
 
-def _sides(good: np.ndarray, words: Callable[[ArrayLike], str], throughout: str) -> tuple[list[str], int]:
-    """Describe the groups (rows) where all agree and where not; with the number of cases that do not."""
-    at_all, at_none = good.all(axis=1), ~good.any(axis=1)
-    mixed = ~at_all & ~at_none
-    parts = []
-    if at_all.any():
-        parts.append(f"first order is closer {throughout} {words(at_all)}")
-    if at_none.any():
-        parts.append(f"zeroth order is closer {throughout} {words(at_none)}")
+def _sides(first: np.ndarray, zeroth: np.ndarray, words: Callable[[ArrayLike], str]) -> tuple[list[str], int]:
+    """Describe the groups (rows) where one estimate never loses, and the others, with the number of their cases."""
+    ties = ~first.any(axis=1) & ~zeroth.any(axis=1)
+    sides = {"first order": (first, ~zeroth.any(axis=1) & ~ties), "zeroth order": (zeroth, ~first.any(axis=1) & ~ties)}
+    parts = [f"{name} is {_degree(wins[rows])} {words(rows)}" for name, (wins, rows) in sides.items() if rows.any()]
+    if ties.any():
+        parts.append(f"both are as close {words(ties)}")
+    mixed = first.any(axis=1) & zeroth.any(axis=1)
     if mixed.any():
-        rest = "the rest is mixed" if parts else "it is mixed"
-        parts.append(f"{rest} (first order is closer in {good[mixed].sum()} of {good[mixed].size} cases)")
-    return parts, int(good[mixed].size)
+        count = f"{first[mixed].sum()} to {zeroth[mixed].sum()} of {first[mixed].size} cases"
+        parts.append(f"it is mixed {words(mixed)} (first order to zeroth order: {count})")
+    return parts, int(first[mixed].size)
+
+
+def _degree(wins: np.ndarray) -> str:
+    return "closer" if wins.all() else "as close or closer"
 
 
 def _angles(outcome: Outcome, columns: ArrayLike) -> str:
@@ -142,10 +143,13 @@ def _bias(outcome: Outcome) -> str:
     if not biased.any():
         return f"No bias of the first-order estimate is seen in the sweep ({outcome.confidence:.0%} over all cases)."
     sentence = f"The first-order estimate is measurably biased {_range(outcome, biased)}"
-    # No bias seen is no bias only where one as large as the gradient itself would have been seen.
-    half_width = (outcome.bias.high - outcome.bias.low) / 2
-    is_blind = (half_width > np.abs(outcome.reference.value))[outcome.swept].any(axis=1) & ~biased
-    return f"{sentence}; {_range(outcome, is_blind)} it is too noisy to tell." if is_blind.any() else f"{sentence}."
+    # No bias seen is no bias only where one of half the gradient's own size would have been seen.
+    half_width = (outcome.bias.high - outcome.bias.low)[outcome.swept] / 2
+    size = np.abs(outcome.reference.value[outcome.swept]).max(axis=0)
+    is_blind = (half_width > size / 2).any(axis=1) & ~biased
+    sentence += f"; {_range(outcome, is_blind)} it is too noisy to tell" if is_blind.any() else ""
+    is_clean = ~biased & ~is_blind
+    return sentence + (f"; {_range(outcome, is_clean)} no bias is seen." if is_clean.any() else ".")
 
 
 def _default(outcome: Outcome) -> list[str]:

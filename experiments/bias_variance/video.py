@@ -1,5 +1,7 @@
 """Throws side by side."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,11 +38,15 @@ def video(problem: Problem, settings: BiasVarianceSettings, workspace: Workspace
 
     clips, captions = [], []
 
+    mj_model = copy.copy(task.scene.mj_model)
+    # Without a GPU the scene's fine shadows double the time of a frame, and in a small picture nobody sees them.
+    mj_model.vis.quality.shadowsize = min(1024, mj_model.vis.quality.shadowsize)
+
     def draw(qpos):
         return frames(
-            task.scene,
+            mj_model,
             np.asarray(qpos),
-            timestep=task.scene.mj_model.opt.timestep,
+            timestep=mj_model.opt.timestep,
             fps=wanted.fps,
             speed=wanted.speed,
             width=wanted.width,

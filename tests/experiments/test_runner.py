@@ -7,6 +7,7 @@ import shutil
 import tomllib
 import types
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -195,8 +196,7 @@ def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monk
 
     monkeypatch.setattr(video_module, "frames", refuse)
     monkeypatch.setattr(video_module, "wall_contact", lambda *_: mg.Softness.sweep(stiffness=[1.0]))
-    option = types.SimpleNamespace(timestep=0.01)
-    scene = types.SimpleNamespace(mj_model=types.SimpleNamespace(opt=option))
+    scene = types.SimpleNamespace(mj_model=mujoco.MjModel.from_xml_string("<mujoco/>"))
     thrown = types.SimpleNamespace(trajectory=lambda angle: types.SimpleNamespace(qpos=angle * np.ones((2, 1))))
     task = types.SimpleNamespace(scene=scene, with_softness=lambda softness: thrown)
     settings = BiasVarianceSettings.model_validate_json(
