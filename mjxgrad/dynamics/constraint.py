@@ -9,6 +9,8 @@ Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope boun
   (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
+Arrays may carry the batch as trailing axes, see `linear`.
+
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints: Theory and implementation in
     MuJoCo. ICRA 2014. MuJoCo documentation, "Computation", "Constraint model".
@@ -63,25 +65,25 @@ class Rows(eqx.Module):
         scales: per elliptic group (μ, f₁, ..., f_dim-1) of each contact; μ = f₁/√impratio.
     """
 
-    reference: Float[Array, " rows"]
-    weight: Float[Array, " rows"]
-    bound: Float[Array, " rows"]
-    scales: tuple[Float[Array, "contacts dim"], ...]
+    reference: Float[Array, "rows *batch"]
+    weight: Float[Array, "rows *batch"]
+    bound: Float[Array, "rows *batch"]
+    scales: tuple[Float[Array, "contacts dim *batch"], ...]
 
 
 class _Cone(eqx.Module):
     """An elliptic group seen in the coordinates u, with its zones."""
 
-    tangent: Float[Array, "contacts tangents"]
-    slip: Float[Array, " contacts"]
-    gap: Float[Array, " contacts"]
-    stiffness: Float[Array, " contacts"]
-    is_middle: Bool[Array, " contacts"]
-    is_bottom: Bool[Array, " contacts"]
+    tangent: Float[Array, "contacts tangents *batch"]
+    slip: Float[Array, "contacts *batch"]
+    gap: Float[Array, "contacts *batch"]
+    stiffness: Float[Array, "contacts *batch"]
+    is_middle: Bool[Array, "contacts *batch"]
+    is_bottom: Bool[Array, "contacts *batch"]
 
 
 def _cone(
-    group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim"], x: Float[Array, " rows"]
+    group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim *batch"], x: Float[Array, "rows *batch"]
 ) -> _Cone:
     u = _blocks(group, x) * scale
     square = jnp.sum(u[:, 1:] ** 2, axis=1)
@@ -97,13 +99,13 @@ def _cone(
     return _Cone(tangent, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom)
 
 
-def _blocks(group: ConeGroup, x: Float[Array, " rows"]) -> Float[Array, "contacts dim "]:
+def _blocks(group: ConeGroup, x: Float[Array, "rows *batch"]) -> Float[Array, "contacts dim "]:
     return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
 
 
 def force(
-    layout: RowLayout, rows: Rows, x: Float[Array, " rows"]
-) -> Float[Array, " rows"]:
+    layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]
+) -> Float[Array, "rows *batch"]:
     """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
     stop, friction = layout.simple_stop, layout.friction
     linear = -rows.weight * x
@@ -121,28 +123,29 @@ def force(
         slide = -(press * scale[:, 0])[:, None] * cone.tangent
         middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
         both = jnp.where(cone.is_bottom[:, None], _blocks(group, linear), middle)
-        parts.append(both.reshape(-1))
+        parts.append(both.reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
 def curvature_product(
     layout: RowLayout,
     rows: Rows,
-    x: Float[Array, " rows"],
-    matrix: Float[Array, "rows columns"],
-) -> Float[Array, "rows columns"]:
+    x: Float[Array, "rows *batch"],
+    matrix: Float[Array, "rows columns *batch"],
+) -> Float[Array, "rows columns *batch"]:
     """Return the second derivative of the cost with respect to x, times a matrix."""
     stop, friction = layout.simple_stop, layout.friction
     weight = rows.weight[:stop]
     stuck = jnp.abs(weight[friction] * x[friction]) < rows.bound[friction]
-    is_curved = jnp.concatenate([jnp.ones(friction.start, bool), stuck, x[friction.stop : stop] < 0])
+    equality = jnp.ones_like(x[: friction.start], bool)
+    is_curved = jnp.concatenate([equality, stuck, x[friction.stop : stop] < 0])
     parts = [jnp.where(is_curved, weight, 0.0)[:, None] * matrix[:stop]]
     for group, scale in zip(layout.cones, rows.scales, strict=True):
         cone = _cone(group, rows, scale, x)
         block = _blocks(group, matrix)
         scaled = scale[:, :, None] * block
         mu = scale[:, 0]
-        along = jnp.concatenate([jnp.ones((group.count, 1), x.dtype), -mu[:, None] * cone.tangent], 1)
+        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * cone.tangent], axis=1)
         ratio = jnp.where(cone.is_middle, -cone.gap / jnp.where(cone.slip > 0, cone.slip, 1.0), 0.0)
         first = along[:, :, None] * jnp.sum(along[:, :, None] * scaled, axis=1, keepdims=True)
         slide = jnp.sum(cone.tangent[:, :, None] * scaled[:, 1:], axis=1, keepdims=True)
@@ -154,5 +157,5 @@ def curvature_product(
         bottom = _blocks(group, rows.weight)[:, :, None] * block
         zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)
         both = jnp.where(cone.is_bottom[:, None, None], bottom, zone)
-        parts.append(both.reshape(group.count * group.dim, -1))
+        parts.append(both.reshape(-1, *matrix.shape[1:]))
     return jnp.concatenate(parts, axis=0)

@@ -1,35 +1,124 @@
-"""Linear algebra of joint-space size, where the batch is large and the matrices are small."""
+"""Linear algebra of joint-space size, for many small problems at once.
+
+Arrays may carry the batch as trailing axes. Then every operation runs along whole vectors of problems, which suits processors
+with vector units and GPUs alike: on 256 problems of 12 unknowns and 24 rows a product JᵀDJ and a Cholesky solve take a
+third and a fifth of the time of their batched counterparts, which work on one small matrix after another. Sums over short
+axes are written out, since XLA does not vectorise a reduction over the batch that is left.
+"""
+
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-# Up to this many joint-space dimensions a sum of broadcast products beats the batched matrix product: XLA's CPU back end
-# calls the latter once per matrix (256 matrices 24 × 12: 107 against 239 µs), and fuses the former.
-_BROADCAST_UP_TO = 32
+# Longer sums are left to a matrix product, and larger factorisations to LAPACK or cuSOLVER: written out they would take
+# longer to compile than they save.
+_LONGEST_SUM = 64
+_LARGEST_FACTOR = 16
+
+
+def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
+    """Return matrix x."""
+    if matrix.ndim == 2:
+        return matrix @ x
+    if matrix.shape[1] > _LONGEST_SUM:
+        return jnp.einsum("mn...,n...->m...", matrix, x, precision="highest")
+    return _add(matrix[:, i] * x[i] for i in range(matrix.shape[1]))
+
+
+def rmatvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
+    """Return matrixᵀ x."""
+    return matvec(jnp.swapaxes(matrix, 0, 1), x)
+
+
+def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array, "*batch"]:
+    """Return the inner product."""
+    if x.ndim == 1:
+        return jnp.sum(x * y)
+    return jnp.einsum("n,n...->...", jnp.ones(len(x), x.dtype), x * y, precision="highest")
 
 
 def gram(
-    left: Float[Array, "rows nv"], right: Float[Array, "rows nv"]
-) -> Float[Array, "nv nv"]:
+    left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]
+) -> Float[Array, "n n *batch"]:
     """Return leftᵀ right for a product known to be symmetric."""
-    if left.shape[1] <= _BROADCAST_UP_TO:
-        return jnp.sum(left[:, :, None] * right[:, None, :], axis=0)
-    product = jnp.einsum("ri,rj->ij", left, right, precision="highest")
-    return 0.5 * (product + product.T)
+    if left.ndim > 2 and len(left) <= _LONGEST_SUM:
+        return _add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
+    product = jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
+    return 0.5 * (product + jnp.swapaxes(product, 0, 1))
+
+
+def cholesky_solve(
+    matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]
+) -> Float[Array, "n *batch"]:
+    """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite."""
+    size = len(vector)
+    if matrix.ndim == 2:
+        return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), vector)
+    if size > _LARGEST_FACTOR:
+        leading = jnp.moveaxis(matrix, (0, 1), (-2, -1)), jnp.moveaxis(vector, 0, -1)[..., None]
+        factor = jnp.linalg.cholesky(leading[0])
+        return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
+    columns: list[Array] = []  # of the factor, from the diagonal down
+    for k in range(size):
+        column = matrix[k:, k]
+        for j, earlier in enumerate(columns):
+            column = column - earlier[k - j :] * earlier[k - j]
+        columns.append(column * jax.lax.rsqrt(column[0]))
+    forward, rest = [], vector
+    for column in columns:
+        forward.append(rest[0] / column[0])
+        rest = rest[1:] - column[1:] * forward[-1]
+    solution: list[Array] = []  # from the last entry up
+    for k in reversed(range(size)):
+        value = forward[k]
+        for above, known in zip(columns[k][1:], reversed(solution), strict=True):
+            value = value - above * known
+        solution.append(value / columns[k][0])
+    return jnp.stack(solution[::-1])
 
 
 def solve_positive_definite(
-    matrix: Float[Array, "nv nv"], vector: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
-    """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite.
+    matrix: Float[Array, "n n"], vector: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
-    Declared as a linear solve, so that its derivatives are solves too and none goes through the factorisation.
+    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation.
     """
-    factor = jax.lax.stop_gradient(jsl.cho_factor(matrix, lower=True)[0])
 
     def solve(_, b):
-        return jsl.cho_solve((factor, True), b)
+        return batch_last(cholesky_solve)(matrix, b)
 
     return jax.lax.custom_linear_solve(lambda x: matrix @ x, vector, solve, symmetric=True)
+
+
+def batch_last(function):
+    """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis."""
+
+    @functools.wraps(function)
+    def wrapped(*args):
+        batched = jax.custom_batching.custom_vmap(function)
+
+        @batched.def_vmap
+        def rule(size, is_batched, *args):
+            def move(x: Array, has_batch: bool) -> Array:
+                if has_batch:
+                    return jnp.moveaxis(x, 0, -1)
+                return jnp.broadcast_to(x[..., None], (*x.shape, size))
+
+            result = wrapped(*jax.tree.map(move, args, tuple(is_batched)))
+            return (
+                jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), result),
+                jax.tree.map(lambda _: True, result),
+            )
+
+        return batched(*args)
+
+    return wrapped
+
+
+def _add(terms) -> Array:
+    return functools.reduce(operator.add, terms)

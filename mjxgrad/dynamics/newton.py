@@ -15,9 +15,13 @@ The gradient is formed afresh in each iteration rather than updated along the li
 the rounding errors of a poor start.
 """
 
+import functools
+import operator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import constraint, linear
@@ -40,20 +44,20 @@ class Problem(eqx.Module):
         rows: parameters of the rows' laws.
     """
 
-    mass: Float[Array, "nv nv"]
-    force: Float[Array, " nv"]
-    jacobian: Float[Array, "rows nv"]
+    mass: Float[Array, "nv nv *batch"]
+    force: Float[Array, "nv *batch"]
+    jacobian: Float[Array, "rows nv *batch"]
     rows: Rows
 
-    def at(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> "Point":
+    def at(self, layout: RowLayout, acceleration: Float[Array, "nv *batch"]) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = self.jacobian @ acceleration - self.rows.reference
+        x = linear.matvec(self.jacobian, acceleration) - self.rows.reference
         row_force = constraint.force(layout, self.rows, x)
-        inertia = self.mass @ acceleration
-        pull = self.jacobian.T @ row_force
+        inertia = linear.matvec(self.mass, acceleration)
+        pull = linear.rmatvec(self.jacobian, row_force)
         return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
 
-    def hessian(self, layout: RowLayout, x: Float[Array, " rows"]) -> Float[Array, "nv nv"]:
+    def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
         """Return the second derivative of the cost, M + Jᵀ s'' J."""
         curved = constraint.curvature_product(layout, self.rows, x, self.jacobian)
         return self.mass + linear.gram(self.jacobian, curved)
@@ -71,32 +75,26 @@ class Point(eqx.Module):
         gradient: M a - f_smooth - Jᵀ f.
     """
 
-    acceleration: Float[Array, " nv"]
-    x: Float[Array, " rows"]
-    row_force: Float[Array, " rows"]
-    inertia: Float[Array, " nv"]
-    pull: Float[Array, " nv"]
-    gradient: Float[Array, " nv"]
+    acceleration: Float[Array, "nv *batch"]
+    x: Float[Array, "rows *batch"]
+    row_force: Float[Array, "rows *batch"]
+    inertia: Float[Array, "nv *batch"]
+    pull: Float[Array, "nv *batch"]
+    gradient: Float[Array, "nv *batch"]
 
-    def rounding(self) -> Float[Array, ""]:
+    def rounding(self) -> Float[Array, "*batch"]:
         """Return the size that the gradient has by rounding alone."""
         terms = jnp.abs(self.inertia) + jnp.abs(self.pull)
-        return 4 * jnp.finfo(terms.dtype).eps * jnp.sqrt(jnp.sum(terms**2))
-
-
-class _Iterate(eqx.Module):
-    point: Point
-    is_done: Bool[Array, ""]
-    num_iterations: Int[Array, ""]
+        return 4 * jnp.finfo(terms.dtype).eps * jnp.sqrt(linear.dot(terms, terms))
 
 
 def minimise(
     layout: RowLayout,
     problem: Problem,
-    start: Float[Array, " nv"],
-    tolerance: Float[Array, ""],
+    start: Float[Array, "nv *batch"],
+    tolerance: Float[Array, "*batch"],
     max_iterations: int,
-) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
+) -> tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]:
     """Return the acceleration of least cost and the number of iterations spent.
 
     Args:
@@ -107,61 +105,92 @@ def minimise(
             divided by the trace of the mass matrix, as MJX does. The search also ends where the gradient is rounding.
         max_iterations: upper bound.
     """
-    scale = 1 / jnp.maximum(jnp.trace(problem.mass), 1e-15)
+    run = functools.partial(_minimise, layout, max_iterations)
+    return linear.batch_last(run)(problem, start, tolerance)
+
+
+class _Iterate(eqx.Module):
+    """The loop's carry.
+
+    It holds the Hessian of the next iteration, not for that iteration's sake: a carried array is computed once and stored,
+    while XLA would write the sums that form an entry out again in each of the many places where the factorisation uses it.
+    """
+
+    point: Point
+    hessian: Float[Array, "nv nv *batch"]
+    is_done: Bool[Array, "*batch"]
+    num_iterations: Int[Array, "*batch"]
+
+
+def _minimise(
+    layout: RowLayout,
+    max_iterations: int,
+    problem: Problem,
+    start: Float[Array, "nv *batch"],
+    tolerance: Float[Array, "*batch"],
+) -> tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]:
+    """Iterate until every member of the batch is done; those that are do not move any more."""
+    trace = functools.reduce(operator.add, (problem.mass[i, i] for i in range(len(start))))
+    scale = 1 / jnp.maximum(trace, mujoco.mjMINVAL)
 
     def measure(acceleration, promised, num_iterations):
         point = problem.at(layout, acceleration)
-        norm = jnp.sqrt(jnp.sum(point.gradient**2))
+        norm = jnp.sqrt(linear.dot(point.gradient, point.gradient))
         is_small = (scale * norm < tolerance) | (scale * promised < tolerance)
-        return _Iterate(point, is_small | (norm <= point.rounding()), num_iterations)
+        is_done = is_small | (norm <= point.rounding()) | ~jnp.isfinite(norm)
+        is_done |= num_iterations >= max_iterations
+        return _Iterate(point, problem.hessian(layout, point.x), is_done, num_iterations)
 
     def iterate(state: _Iterate) -> _Iterate:
         point = state.point
-        direction = _descent(problem.hessian(layout, point.x), point.gradient)
+        direction = _descent(state.hessian, point.gradient)
         length = _line_search(layout, problem, point, direction)
-        promised = -0.5 * jnp.sum(point.gradient * direction)
-        moved = point.acceleration + length * direction
-        return measure(moved, promised, state.num_iterations + 1)
+        promised = -0.5 * linear.dot(point.gradient, direction)
+        length = jnp.where(state.is_done, 0.0, length)
+        moved = jnp.where(state.is_done, point.acceleration, point.acceleration + length * direction)
+        return measure(moved, promised, state.num_iterations + ~state.is_done)
 
-    def goes_on(state: _Iterate) -> Bool[Array, ""]:
-        is_finite = jnp.isfinite(jnp.sum(state.point.gradient))
-        return ~state.is_done & is_finite & (state.num_iterations < max_iterations)
-
-    start = jnp.where(jnp.all(jnp.isfinite(start)), start, jnp.zeros_like(start))
-    first = measure(start, jnp.asarray(jnp.inf, start.dtype), jnp.zeros((), jnp.int32))
-    last = jax.lax.while_loop(goes_on, iterate, first)
+    start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
+    none = jnp.zeros(start.shape[1:], jnp.int32)
+    first = measure(start, jnp.full(start.shape[1:], jnp.inf, start.dtype), none)
+    last = jax.lax.while_loop(lambda state: ~jnp.all(state.is_done), iterate, first)
     return last.point.acceleration, last.num_iterations
 
 
 def _descent(
-    hessian: Float[Array, "nv nv"], gradient: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
+    hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]
+) -> Float[Array, "nv *batch"]:
     """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
-    newton = -linear.solve_positive_definite(hessian, gradient)
-    return jnp.where(jnp.all(jnp.isfinite(newton)), newton, -gradient / jnp.diag(hessian))
+    newton = -linear.cholesky_solve(hessian, gradient)
+    diagonal = jnp.stack([hessian[i, i] for i in range(len(gradient))])
+    return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / diagonal)
 
 
 def _line_search(
-    layout: RowLayout, problem: Problem, point: Point, direction: Float[Array, " nv"]
-) -> Float[Array, ""]:
+    layout: RowLayout, problem: Problem, point: Point, direction: Float[Array, "nv *batch"]
+) -> Float[Array, "*batch"]:
     """Return the minimiser of the cost along a descent direction, or a shorter step that lowers it."""
-    along = problem.jacobian @ direction
-    smooth_slope = jnp.sum(direction * (point.inertia - problem.force))
-    smooth_curvature = jnp.sum(direction * (problem.mass @ direction))
+    along = linear.matvec(problem.jacobian, direction)
+    smooth_slope = linear.dot(direction, point.inertia - problem.force)
+    smooth_curvature = linear.dot(direction, linear.matvec(problem.mass, direction))
 
-    def slope(t: Float[Array, ""]) -> Float[Array, ""]:
+    def slope(t: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         forces = constraint.force(layout, problem.rows, point.x + t * along)
-        return smooth_slope + t * smooth_curvature - jnp.sum(forces * along)
+        return smooth_slope + t * smooth_curvature - linear.dot(forces, along)
 
-    # The inertial part alone bounds the root from above: the rows only add to the slope's growth.
-    start = jnp.sum(point.gradient * direction)
-    low, length = jnp.zeros_like(start), jnp.ones_like(start)
-    high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
-    for _ in range(_LINE_STEPS):
+    def improve(_, bracket):
+        low, high, length, _ = bracket
         value, curvature = jax.jvp(slope, (length,), (jnp.ones_like(length),))
         low, high = jnp.where(value < 0, length, low), jnp.where(value < 0, high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
-        length = jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        inside = (newton >= low) & (newton <= high)
+        return low, high, jnp.where(inside, newton, 0.5 * (low + high)), value
+
+    # The inertial part alone bounds the root from above: the rows only add to the slope's growth.
+    start = linear.dot(point.gradient, direction)
+    high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
+    bracket = (jnp.zeros_like(start), high, jnp.ones_like(start), start)
+    low, _, length, value = jax.lax.fori_loop(0, _LINE_STEPS, improve, bracket)
     has_converged = jnp.abs(value) <= _LINE_TOLERANCE * jnp.abs(start)
     # Up to the lower end of the bracket the cost has only fallen.
     return jnp.where(has_converged | (low == 0), length, low)
