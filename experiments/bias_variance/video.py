@@ -71,10 +71,4 @@ def video(problem: Problem, settings: BiasVarianceSettings, workspace: Workspace
 
 
 def _speed(speed: float) -> str:
-    return (
-        "at real speed"
-        if speed == 1
-        else f"{1 / speed:g} times slower than real"
-        if speed < 1
-        else f"{speed:g} times faster"
-    )
+    return "at real speed" if speed == 1 else f"at {speed:g} of real speed"
