@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -80,13 +81,9 @@ class SceneTask(Task):
             observe=_activations if has_activations else None,
         )
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
-        states = State(
-            qpos=trajectory.qpos[:-1],
-            qvel=trajectory.qvel[:-1],
-            act=trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0)),
-            time=self.state.time + elapsed,
-            warmstart=jnp.zeros_like(trajectory.qvel[:-1]),
-        )
+        activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))
+        qpos, qvel = trajectory.qpos[:-1], trajectory.qvel[:-1]
+        states = jax.vmap(State)(qpos, qvel, activations, self.state.time + elapsed, jnp.zeros_like(qvel))
         return finite_cost(self.cost(trajectory), trajectory), states
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad.diagnostics.reference import REACH, Landscape, cell_points, map_in_chunks
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
-from mjxgrad.estimators.sampling import DEFAULT_CHUNK_SIZE, Baseline, Plan, Samples, check_baseline, sample
+from mjxgrad.estimators.sampling import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
 from mjxgrad.estimators.shared import both_plan, both_results, both_summary
 from mjxgrad.estimators.zeroth import zeroth_order
 from mjxgrad.objective import Objective, ParameterNoise
@@ -67,13 +67,13 @@ class BiasVariance(eqx.Module):
 
 def bias_variance(
     objective_of_softness: Callable[[PyTree], Objective],
-    params: Float[Array, "points dim"],
+    params: Float[Array, "..."],
     key: PRNGKeyArray,
     *,
     softness: PyTree | Sequence[PyTree],
     num_samples: int = 256,
     num_reference: int = 2048,
-    baseline: Baseline = "leave_one_out",
+    baseline: str = "leave_one_out",
     confidence: float = 0.95,
     num_resamples: int = 1000,
     chunk_size: int | None = None,
@@ -81,9 +81,9 @@ def bias_variance(
 ) -> BiasVariance:
     r"""Measure both estimates of the gradient of a smoothed cost, at every softness and point.
 
-    The noise is the same at every softness, so that differences between them are not luck. Everything is compiled once,
-    in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept for the
-    bootstrap: memory grows with points × `num_samples` × dim.
+    The noise is the same at every softness, so that differences between them are not luck. Everything is compiled
+    once, in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept
+    for the bootstrap: memory grows with points × `num_samples` × dim.
 
     Args:
         objective_of_softness: gives the objective at one softness; traceable.
@@ -122,7 +122,9 @@ def bias_variance(
     measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
     rows = []
     for i in range(count):
-        measured, samples = jax.block_until_ready(measure(jax.tree.map(lambda leaf, i=i: leaf[i], stacked), params, key))
+        measured, samples = jax.block_until_ready(
+            measure(jax.tree.map(lambda leaf, i=i: leaf[i], stacked), params, key)
+        )
         rows.append((measured, _variance_intervals(samples, baseline, confidence, num_resamples)))
         if progress is not None:
             progress(i + 1, count)
@@ -146,7 +148,7 @@ class _Measurement(eqx.Module):
 
     objective_of_softness: Callable[[PyTree], Objective] = eqx.field(static=True)
     plan: Plan = eqx.field(static=True)
-    baseline: Baseline = eqx.field(static=True)
+    baseline: str = eqx.field(static=True)
     num_reference: int = eqx.field(static=True)
 
     def __call__(
@@ -222,7 +224,7 @@ def _table(
     bias_error = jnp.hypot(first.standard_error, measured.reference_error)
     count_first, count_zeroth = first.num_finite[..., None], zeroth.num_finite[..., None]
     # The reference averages over so many cells, or samples, that its t is a normal distribution.
-    many = 10**6
+    many = np.array(10**6)
     return BiasVariance(
         softness=softness,
         params=params,
@@ -246,7 +248,7 @@ def _table(
 
 
 def _variance_intervals(
-    samples: Samples, baseline: Baseline, confidence: float, num_resamples: int
+    samples: Samples, baseline: str, confidence: float, num_resamples: int
 ) -> Float[np.ndarray, "2 2 points"]:
     """Bootstrap both variances at each point: estimate, end of interval, point."""
     points = range(len(samples.costs))
@@ -258,7 +260,7 @@ def _variance_intervals(
     return np.moveaxis(np.array(intervals), 0, -1)
 
 
-def _terms(samples: Samples, baseline: Baseline) -> tuple[np.ndarray, np.ndarray]:
+def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
     """Give the samples of both estimates at one point; the leave-one-out baseline as the mean that it is up to 1/N."""
     is_noisy = samples.is_noisy > 0
     costs, scores = samples.costs[is_noisy, 0], samples.scores[is_noisy, 0]
@@ -288,7 +290,6 @@ def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:
         raise ValueError(
-            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; "
-            "see Softness.sweep"
+            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; see Softness.sweep"
         )
     return softness, lengths.pop()[0]

@@ -6,8 +6,8 @@ $$F'(\theta) = \int (f(x) - f(\theta)) \frac{x - \theta}{\sigma^2}
    \varphi\!\left(\frac{x - \theta}{\sigma}\right) \frac{dx}{\sigma},$$
 
 so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and $f$ evaluated at a random place in each:
-unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included, and an error that falls as 1/cells at a
-jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
+unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included, with an error that falls as 1/cells
+at a jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
 """
 
 from collections.abc import Callable

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 from scipy import stats
 
 Interval = Float[np.ndarray, "2 *shape"]

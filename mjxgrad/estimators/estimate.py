@@ -48,12 +48,12 @@ class GradientEstimate(eqx.Module):
     diagnosis: Diagnosis
 
     @property
-    def variance(self) -> Float[Array, ""]:
+    def variance(self) -> Float[Array, "*batch"]:
         """Trace of the covariance, per rollout."""
         return self.covariance_diagonal.sum(axis=-1)
 
     @property
-    def finite_fraction(self) -> Float[Array, ""]:
+    def finite_fraction(self) -> Float[Array, "*batch"]:
         """Share of the samples that were finite."""
         return self.num_finite / self.num_samples
 
@@ -96,7 +96,7 @@ def assemble(
     return GradientEstimate(
         value=value,
         standard_error=jnp.sqrt(squared_error),
-        covariance_diagonal=squared_error * num_finite,
+        covariance_diagonal=squared_error * num_finite.astype(squared_error.dtype),
         objective_mean=jnp.where(costs.count > 0, costs.mean, jnp.nan),
         objective_standard_error=jnp.sqrt(costs.squared_error()),
         num_samples=jnp.asarray(num_samples),

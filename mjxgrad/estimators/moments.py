@@ -36,21 +36,24 @@ class Moments(Summary):
         """Summarise the samples that the mask picks; the others may be NaN."""
         count = mask.sum()
         samples = _masked(samples, mask)
-        mean = samples.sum(axis=0) / jnp.maximum(count, 1)
+        divisor = as_real(jnp.maximum(count, 1), samples)
+        mean = samples.sum(axis=0) / divisor
+        # Once more about the mean: the sum of many costs of 1e6 is off by more than their spread in float32.
+        mean += _masked(samples - mean, mask).sum(axis=0) / divisor
         return cls(count, mean, (_masked(samples - mean, mask) ** 2).sum(axis=0))
 
     def merge(self, other: "Moments") -> "Moments":
         """Give the summary of both sets of samples."""
         count = self.count + other.count
         shift = other.mean - self.mean
-        share = other.count / jnp.maximum(count, 1)
+        share = as_real(other.count, shift) / as_real(jnp.maximum(count, 1), shift)
         squares = self.squares + other.squares + shift**2 * self.count * share
         return Moments(count, self.mean + shift * share, squares)
 
     def squared_error(self) -> Float[Array, "*shape"]:
         """Give the squared standard error of the mean, NaN for fewer than two samples."""
-        pairs = self.count * (self.count - 1.0)
-        return jnp.where(self.count > 1, self.squares / jnp.maximum(pairs, 1), jnp.nan)
+        count = as_real(self.count, self.squares)
+        return jnp.where(count > 1, self.squares / jnp.maximum(count * (count - 1), 1), jnp.nan)
 
 
 class Value(Summary):
@@ -112,6 +115,11 @@ class ScoreMoments(Summary):
         costs = self.costs.merge(other.costs)
         mine, theirs = self.about(costs.mean), other.about(costs.mean)
         return ScoreMoments(costs, mine[0] + theirs[0], mine[1] + theirs[1])
+
+
+def as_real(count: Int[Array, "*batch"], like: Float[Array, "..."]) -> Float[Array, "*batch"]:
+    """Give a count the type of what it is reckoned with: a quotient of integers would be of double precision."""
+    return count.astype(like.dtype)
 
 
 def _moved(sums: Float[Array, "..."], shift: Float[Array, ""], axis: int) -> Float[Array, "..."]:

@@ -18,8 +18,8 @@ Baseline = Literal["leave_one_out", "zero_noise", "none"]
 # checkpointed rollouts of a small scene stays within tens of megabytes.
 DEFAULT_CHUNK_SIZE = 512
 
-# Up to here forward mode wins: on the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took 0.53 s and
-# 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
+# Up to here forward mode wins: on the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took 0.53 s
+# and 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
 MOST_FORWARD_DIMENSIONS = 3
 
 
@@ -169,14 +169,16 @@ def stream(
     def one_chunk(start: Int[Array, ""]) -> tuple[Summary, ...]:
         return summarise(sample(objective, params, key, start + jnp.arange(size), plan))
 
-    def step(kept: tuple[Summary, ...], start: Int[Array, ""]) -> tuple[tuple[Summary, ...], None]:
+    # The start of a chunk is in the carry: an array of all starts would grow with the number of samples.
+    def step(carry: tuple[Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
+        start, kept = carry
         merged = tuple(old.merge(new) for old, new in zip(kept, one_chunk(start), strict=True))
-        return merged, None
+        return (start + size, merged), None
 
-    starts = size * jnp.arange(num_chunks)
-    shapes = jax.eval_shape(one_chunk, starts[0])
+    start = jnp.zeros((), int)
+    shapes = jax.eval_shape(one_chunk, start)
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return jax.lax.scan(step, empty, starts)[0]
+    return jax.lax.scan(step, (start, empty), None, length=num_chunks)[0][1]
 
 
 def check_baseline(baseline: str) -> None:

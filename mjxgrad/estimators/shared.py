@@ -5,7 +5,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first import first_order_result, first_order_summary
-from mjxgrad.estimators.sampling import Baseline, Plan, Samples, check_baseline, stream
+from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
 from mjxgrad.estimators.zeroth import zeroth_order_result, zeroth_order_summary
 from mjxgrad.objective import Objective
 
@@ -16,7 +16,7 @@ def first_and_zeroth_order(
     key: PRNGKeyArray,
     *,
     num_samples: int,
-    baseline: Baseline = "leave_one_out",
+    baseline: str = "leave_one_out",
     antithetic: bool = False,
     chunk_size: int | None = None,
 ) -> tuple[GradientEstimate, GradientEstimate]:
@@ -48,7 +48,7 @@ def first_and_zeroth_order(
     return both_results(kept, plan, baseline)
 
 
-def both_plan(num_samples: int, chunk_size: int | None, antithetic: bool, baseline: Baseline) -> Plan:
+def both_plan(num_samples: int, chunk_size: int | None, antithetic: bool, baseline: str) -> Plan:
     """Plan rollouts that serve both estimates."""
     return Plan(
         num_samples,
@@ -65,6 +65,6 @@ def both_summary(samples: Samples) -> tuple:
     return *first_order_summary(samples), *zeroth_order_summary(samples)
 
 
-def both_results(kept: tuple, plan: Plan, baseline: Baseline) -> tuple[GradientEstimate, GradientEstimate]:
+def both_results(kept: tuple, plan: Plan, baseline: str) -> tuple[GradientEstimate, GradientEstimate]:
     """Turn what was kept into both estimates."""
     return first_order_result(kept[:2], plan), zeroth_order_result(kept[2:], plan, baseline)

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
-from mjxgrad.estimators.moments import ScoreMoments, Value
-from mjxgrad.estimators.sampling import Baseline, Plan, Samples, check_baseline, stream
+from mjxgrad.estimators.moments import ScoreMoments, Value, as_real
+from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
 from mjxgrad.objective import Objective
 
 
@@ -15,7 +15,7 @@ def zeroth_order(
     key: PRNGKeyArray,
     *,
     num_samples: int,
-    baseline: Baseline = "leave_one_out",
+    baseline: str = "leave_one_out",
     antithetic: bool = False,
     chunk_size: int | None = None,
 ) -> GradientEstimate:
@@ -71,7 +71,7 @@ def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Value]:
     return moments, Value(samples.noise_free_cost())
 
 
-def zeroth_order_result(summary: tuple[ScoreMoments, Value], plan: Plan, baseline: Baseline) -> GradientEstimate:
+def zeroth_order_result(summary: tuple[ScoreMoments, Value], plan: Plan, baseline: str) -> GradientEstimate:
     """Turn what was kept into the estimate."""
     moments, noise_free = summary
     if baseline == "leave_one_out":
@@ -119,7 +119,7 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     """
     first, second = moments.about(moments.costs.mean)
     count = moments.costs.count
-    others = jnp.maximum(count - 1, 1).astype(first.dtype)
+    others = as_real(jnp.maximum(count - 1, 1), first)
     total = first[0] + first[1] / others
     total_square = second[0, 0] + 2 * second[0, 1] / others + second[1, 1] / others**2
     value, spread = _mean_and_squared_error(total, total_square, count)
@@ -132,6 +132,6 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
 def _mean_and_squared_error(
     total: Float[Array, " dim"], total_square: Float[Array, " dim"], count: Array
 ) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    count = as_real(count, total)
     mean = total / jnp.maximum(count, 1)
-    pairs = jnp.maximum(count * (count - 1.0), 1)
-    return mean, (total_square - count * mean**2) / pairs
+    return mean, (total_square - count * mean**2) / jnp.maximum(count * (count - 1), 1)

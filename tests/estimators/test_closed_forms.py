@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import closed_loop, open_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import STDDEV, assert_within_error
+from tests.estimators.textbook import STDDEV, assert_within_error, first_order, zeroth_order
 
 N = 100_000
 EVERY_WAY = [(baseline, pairs) for baseline in ("leave_one_out", "zero_noise", "none") for pairs in (False, True)]

@@ -1,0 +1,136 @@
+"""The claimed standard errors, by repetition."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from mjxgrad.objective import ParameterNoise, parameter_noise
+from tests.estimators import textbook
+from tests.estimators.textbook import first_order, zeroth_order
+
+EVERY_WAY = [(baseline, pairs) for baseline in ("leave_one_out", "zero_noise", "none") for pairs in (False, True)]
+
+
+def slanted(x: Float[Array, " 2"]) -> Float[Array, ""]:
+    """Mostly linear: then cost and score are strongly correlated, and the baseline's own error matters."""
+    return 2.0 + 3 * x[0] - x[1] + 4 * x[0] ** 2 + x[0] * x[1]
+
+
+class HalfMirrored(ParameterNoise):
+    """Mirrors one of two coordinates: also equally likely, but the scores of a pair do not cancel."""
+
+    def mirror(self, noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
+        return noise * jnp.array([-1.0, 1.0])
+
+
+def repeat(objective, estimator, point, *, times: int, seed: int, **settings):
+    keys = jax.random.split(jax.random.key(seed), times)
+    return jax.jit(jax.vmap(lambda key: estimator(objective, point, key, **settings)))(keys)
+
+
+def assert_errors_are_right(estimates, num_repetitions: int) -> None:
+    """The mean squared standard error is the variance of the estimates."""
+    values, squared = np.asarray(estimates.value), np.asarray(estimates.standard_error) ** 2
+    deviations = (values - values.mean(axis=0)) ** 2
+    variance = deviations.sum(axis=0) / (num_repetitions - 1)
+    # Both sides are means over repetitions; they are correlated, so the sum of their errors is the safe bound.
+    error = (deviations.std(axis=0) + squared.std(axis=0)) / np.sqrt(num_repetitions)
+    np.testing.assert_array_less(np.abs(squared.mean(axis=0) - variance), 3 * error)
+    np.testing.assert_array_less(error, 0.1 * variance)
+
+
+@pytest.mark.parametrize(("baseline", "antithetic"), EVERY_WAY)
+def test_zeroth_order_knows_its_error_even_from_three_samples(baseline, antithetic):
+    times = 20_000
+    objective = parameter_noise(slanted, jnp.array([0.3, 0.5]))
+    estimates = repeat(
+        objective,
+        zeroth_order,
+        jnp.array([0.4, -0.7]),
+        times=times,
+        seed=1,
+        num_samples=6 if antithetic else 3,
+        baseline=baseline,
+        antithetic=antithetic,
+    )
+    assert_errors_are_right(estimates, times)
+
+
+def test_pairs_whose_scores_do_not_cancel_know_their_error():
+    times = 20_000
+    objective = HalfMirrored(jax.tree_util.Partial(slanted), jnp.array([0.3, 0.5]), 2)
+    point = jnp.array([0.4, -0.7])
+    estimates = repeat(objective, zeroth_order, point, times=times, seed=2, num_samples=6, antithetic=True)
+    assert_errors_are_right(estimates, times)
+    # E f over the Gaussian has this gradient by hand: 3 + 8x + y and -1 + x.
+    exact = np.array([3 + 8 * 0.4 - 0.7, -1 + 0.4])
+    error = np.asarray(estimates.value).std(axis=0) / np.sqrt(times)
+    np.testing.assert_array_less(np.abs(np.asarray(estimates.value).mean(axis=0) - exact), 4 * error)
+
+
+def test_first_order_knows_its_error_even_from_three_samples():
+    times = 20_000
+    objective = parameter_noise(slanted, jnp.array([0.3, 0.5]))
+    assert_errors_are_right(
+        repeat(objective, first_order, jnp.array([0.4, -0.7]), times=times, seed=3, num_samples=3), times
+    )
+
+
+@pytest.mark.parametrize(("baseline", "antithetic"), EVERY_WAY)
+def test_errors_in_units_of_the_claimed_ones_have_variance_one(baseline, antithetic):
+    times = 400
+    objective = parameter_noise(textbook.step, textbook.STDDEV)
+    estimates = repeat(
+        objective,
+        zeroth_order,
+        jnp.array([0.07]),
+        times=times,
+        seed=4,
+        num_samples=200,
+        baseline=baseline,
+        antithetic=antithetic,
+    )
+    z = (np.asarray(estimates.value) - textbook.step_gradient(0.07)) / np.asarray(estimates.standard_error)
+    # The variance of a mean of squares of normal numbers is 2/times; t from 100 pairs adds 2 %.
+    assert abs((z**2).mean() - 1) < 4 * np.sqrt(2 / times)
+    assert abs(z.mean()) < 4 / np.sqrt(times)
+
+
+def test_two_samples_are_unbiased_at_a_step():
+    """The leave-one-out baseline is independent of its sample."""
+    times = 20_000
+    objective = parameter_noise(textbook.step, textbook.STDDEV)
+    values = np.asarray(repeat(objective, zeroth_order, jnp.array([0.07]), times=times, seed=5, num_samples=2).value)
+    assert abs(values.mean() - textbook.step_gradient(0.07)) < 4 * values.std() / np.sqrt(times)
+
+
+def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():
+    """facts.md section 5: 0.195 without it, 0.0975 with it, at N = 1000 and θ = 0."""
+    objective = parameter_noise(textbook.step, textbook.STDDEV)
+
+    def error(baseline):
+        estimate = zeroth_order(objective, jnp.array([0.0]), jax.random.key(6), num_samples=400_000, baseline=baseline)
+        return float(estimate.standard_error[0]) * np.sqrt(400)
+
+    # Without: Var(1[w>0]·w/σ²) = (1/2 - 1/2π)/σ². With: Var(±½·|w|... ) = (1/4 - 1/2π)/σ², here over N = 1000.
+    assert error("none") == pytest.approx(np.sqrt((1 / 2 - 1 / (2 * np.pi)) / 0.01 / 1000), rel=0.01)
+    assert error("leave_one_out") == pytest.approx(np.sqrt((1 / 4 - 1 / (2 * np.pi)) / 0.01 / 1000), rel=0.01)
+
+
+def test_the_mean_cost_knows_its_error():
+    times, point = 4000, 0.3
+    estimates = repeat(
+        parameter_noise(textbook.quadratic_sine, textbook.STDDEV),
+        first_order,
+        jnp.array([point]),
+        times=times,
+        seed=8,
+        num_samples=20,
+    )
+    # E x² = θ² + σ², E sin(ωx) = exp(-ω²σ²/2) sin(ωθ).
+    exact = point**2 + 0.01 + 0.1 * np.exp(-(20**2) * 0.01 / 2) * np.sin(20 * point)
+    means, errors = np.asarray(estimates.objective_mean), np.asarray(estimates.objective_standard_error)
+    assert abs(means.mean() - exact) < 4 * means.std() / np.sqrt(times)
+    assert (errors**2).mean() == pytest.approx(means.var(), rel=4 * np.sqrt(2 / times))

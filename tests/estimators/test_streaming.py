@@ -1,0 +1,148 @@
+"""Samples in chunks: memory, rounding, and honest counts of what was spent."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from mjxgrad import estimators
+from mjxgrad.objective import parameter_noise
+from tests.estimators import textbook
+from tests.estimators.textbook import first_and_zeroth_order, first_order, zeroth_order
+
+POINT = jnp.array([0.5, -1.2, 0.4])
+
+
+@pytest.fixture
+def key():
+    return jax.random.key(3)
+
+
+@pytest.fixture
+def objective():
+    return parameter_noise(textbook.bumpy, jnp.array([0.1, 0.4, 0.2]))
+
+
+@pytest.mark.parametrize("chunk_size", [2, 7, 64, 1000])
+@pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
+def test_the_size_of_chunks_changes_nothing_but_rounding(objective, key, chunk_size, baseline):
+    settings = {"num_samples": 130, "baseline": baseline, "antithetic": True}
+    for chunked, whole in zip(
+        first_and_zeroth_order(objective, POINT, key, chunk_size=chunk_size, **settings),
+        first_and_zeroth_order(objective, POINT, key, **settings),
+        strict=True,
+    ):
+        # Sums of 130 terms of order one, added in another order.
+        for name in ("value", "standard_error", "objective_mean", "num_finite", "num_rollouts"):
+            one, other = getattr(chunked, name), getattr(whole, name)
+            np.testing.assert_allclose(one, other, rtol=1e4 * jnp.finfo(POINT.dtype).eps)
+
+
+def test_memory_does_not_grow_with_the_number_of_samples(objective, key):
+    def temporary_bytes(num_samples: int) -> int:
+        def estimate(params, key):
+            return first_and_zeroth_order(objective, params, key, num_samples=num_samples, chunk_size=128)
+
+        return jax.jit(estimate).lower(POINT, key).compile().memory_analysis().temp_size_in_bytes
+
+    assert temporary_bytes(2**20) == temporary_bytes(2**10)
+
+
+def test_sharing_rollouts_gives_what_each_estimator_gives_alone(objective, key):
+    first, zeroth = first_and_zeroth_order(objective, POINT, key, num_samples=50)
+    alone = first_order(objective, POINT, key, num_samples=50), zeroth_order(objective, POINT, key, num_samples=50)
+    for shared, single in zip((first, zeroth), alone, strict=True):
+        np.testing.assert_allclose(shared.value, single.value, rtol=1e-10)
+        np.testing.assert_allclose(shared.standard_error, single.standard_error, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "settings", "rollouts", "gradients"),
+    [
+        (first_order, {}, 40, 40),
+        (zeroth_order, {}, 40, 0),
+        (zeroth_order, {"baseline": "zero_noise"}, 41, 0),
+        (zeroth_order, {"antithetic": True}, 40, 0),
+        (lambda *a, **k: first_and_zeroth_order(*a, **k)[1], {}, 40, 40),
+        (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {"baseline": "zero_noise"}, 41, 41),
+    ],
+)
+def test_rollouts_are_counted_as_they_are_spent(key, estimator, settings, rollouts, gradients):
+    calls = []
+
+    def counted(x: Float[Array, " 1"]) -> Float[Array, ""]:
+        jax.debug.callback(lambda _: calls.append(1), x)
+        return x[0] ** 3
+
+    estimate = estimator(parameter_noise(counted, 0.1), jnp.array([0.3]), key, num_samples=40, **settings)
+    jax.block_until_ready(estimate.value)
+    jax.effects_barrier()
+    assert len(calls) == rollouts == estimate.num_rollouts
+    assert estimate.num_gradient_rollouts == gradients
+    assert estimate.num_samples == estimate.num_finite == 40
+
+
+@pytest.mark.parametrize("offset", [1e6, -3e4])
+def test_adding_a_large_constant_changes_nothing(offset):
+    """Neither the estimate nor its variance: sums are kept about the mean, also in float32."""
+    point = jnp.array([0.3], jnp.float32)
+
+    def estimates(constant):
+        # Costs are multiples of 1/8, so that adding the constant loses nothing in float32.
+        objective = parameter_noise(lambda x: jnp.round(8 * 30 * x[0] ** 2) / 8 + constant, jnp.float32(0.1))
+        return zeroth_order(objective, point, jax.random.key(0), num_samples=5000, chunk_size=100)
+
+    plain, shifted = estimates(jnp.float32(0)), estimates(jnp.float32(offset))
+    assert plain.value.dtype == jnp.float32
+    # The mean itself is rounded to one part in 2^24 of the constant; the scores average to nearly nothing.
+    np.testing.assert_allclose(shifted.value, plain.value, rtol=0.01)
+    np.testing.assert_allclose(shifted.variance, plain.variance, rtol=0.01)
+
+
+def test_the_noise_of_a_sample_does_not_depend_on_the_number_of_samples(key):
+    """So a longer run contains the shorter one."""
+    seen = {}
+    for num_samples in (4, 9):
+        rows = []
+        objective = parameter_noise(lambda x, rows=rows: _remember(x, rows), 0.1)
+        jax.block_until_ready(first_order(objective, jnp.array([0.0]), key, num_samples=num_samples).value)
+        jax.effects_barrier()
+        seen[num_samples] = set(rows)
+    assert len(seen[4]) == 4
+    assert seen[4] < seen[9]
+
+
+def _remember(x, rows):
+    jax.debug.callback(lambda value: rows.append(float(value[0])), x)
+    return x[0]
+
+
+def test_estimates_can_be_compiled_and_batched(objective, key):
+    """The objective is a pytree: it goes through jit, and noise and points through vmap."""
+    compiled = jax.jit(estimators.zeroth_order, static_argnames=("num_samples", "baseline", "antithetic", "chunk_size"))
+    np.testing.assert_allclose(
+        compiled(objective, POINT, key, num_samples=50).value,
+        zeroth_order(objective, POINT, key, num_samples=50).value,
+        rtol=1e-10,
+    )
+    stddevs = jnp.array([0.1, 0.2])
+    batch = jax.vmap(
+        lambda point, stddev: first_order(parameter_noise(textbook.quadratic_sine, stddev), point, key, num_samples=10)
+    )(jnp.array([[0.1], [0.3]]), stddevs)
+    assert batch.value.shape == (2, 1)
+    assert batch.variance.shape == batch.finite_fraction.shape == (2,)
+    single = first_order(parameter_noise(textbook.quadratic_sine, 0.2), jnp.array([0.3]), key, num_samples=10)
+    np.testing.assert_allclose(batch.value[1], single.value, rtol=1e-10)
+
+
+def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(key):
+    """Few parameters are differentiated in forward mode, which such a function does not have."""
+
+    @jax.custom_vjp
+    def halved(x):
+        return x[0] ** 2
+
+    halved.defvjp(lambda x: (x[0] ** 2, x), lambda x, g: (jnp.array([g * x[0]]),))
+    estimate = first_order(parameter_noise(halved, 0.1), jnp.array([0.3]), key, num_samples=1000)
+    assert abs(estimate.value[0] - 0.3) < 4 * estimate.standard_error[0]

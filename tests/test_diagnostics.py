@@ -1,0 +1,222 @@
+"""Bias and variance, measured where both are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from mjxgrad.diagnostics import (
+    Landscape,
+    bias_variance,
+    bootstrap_variance_interval,
+    chi_square_variance_interval,
+    mean_interval,
+)
+from mjxgrad.diagnostics.reference import cell_points
+from mjxgrad.objective import parameter_noise
+from tests.estimators import textbook
+from tests.estimators.textbook import STDDEV
+
+POINTS = jnp.array([[-0.06], [0.02], [0.11]])
+WIDTHS = jnp.array([0.5, 0.1, 0.02])
+HEIGHTS = jnp.array([0.0, 0.4, 1.5])
+
+
+@pytest.fixture(scope="module")
+def ramps():
+    """A ramp ever steeper: no bias, and a variance that grows as it does."""
+    return bias_variance(
+        lambda width: parameter_noise(textbook.ramp(width), STDDEV),
+        POINTS,
+        jax.random.key(0),
+        softness=WIDTHS,
+        num_samples=4000,
+    )
+
+
+@pytest.fixture(scope="module")
+def jumps():
+    """A parabola with a jump at zero, which first order does not see."""
+    calls, progress = [], []
+
+    def objective(softness):
+        calls.append(1)
+        return parameter_noise(lambda x: x[0] ** 2 + softness["height"] * textbook.step(x), STDDEV)
+
+    table = bias_variance(
+        objective,
+        POINTS,
+        jax.random.key(1),
+        softness=[{"height": height} for height in HEIGHTS],
+        num_samples=4000,
+        baseline="zero_noise",
+        progress=lambda done, total: progress.append((done, total)),
+    )
+    return table, calls, progress
+
+
+def exact_ramp(quantity) -> np.ndarray:
+    return np.array([[quantity(float(p[0]), float(w)) for p in POINTS] for w in WIDTHS])
+
+
+def test_the_reference_is_the_gradient_of_the_smoothed_cost(ramps):
+    exact = exact_ramp(lambda point, width: 2 * textbook.ramp_probability(point, width) / width)
+    error = np.asarray(ramps.reference_error[..., 0])
+    assert ramps.reference_method == "landscape"
+    np.testing.assert_array_less(np.abs(ramps.reference[..., 0] - exact), 4 * error)
+    np.testing.assert_array_less(error, 0.01 * exact)
+
+
+def test_a_continuous_cost_shows_no_bias(ramps):
+    low, high = ramps.bias_interval
+    covers = (low < 0) & (high > 0)
+    # Nine intervals of 95 %, three of the same noise: one that misses is no surprise, three are.
+    assert covers.sum() >= 7
+    np.testing.assert_array_less(np.abs(ramps.bias), 4 * ramps.bias_error)
+
+
+def test_the_variance_of_a_steep_ramp_lies_in_its_interval(ramps):
+    def variance(point: float, width: float) -> float:
+        p = textbook.ramp_probability(point, width)
+        return (2 / width) ** 2 * p * (1 - p)
+
+    low, high = ramps.first_variance_interval
+    exact = exact_ramp(variance)
+    assert ((low < exact) & (exact < high)).sum() >= 7
+    np.testing.assert_array_less((high - low) / exact, 0.6)
+    np.testing.assert_allclose(ramps.first.variance, exact, rtol=0.2)
+
+
+def test_the_variance_intervals_contain_the_variances(ramps, jumps):
+    for table in (ramps, jumps[0]):
+        for estimate, (low, high) in (
+            (table.first, table.first_variance_interval),
+            (table.zeroth, table.zeroth_variance_interval),
+        ):
+            assert (low <= estimate.variance * (1 + 1e-9)).all()
+            assert (estimate.variance <= high * (1 + 1e-9)).all()
+
+
+def test_the_bias_of_first_order_is_the_jump_that_it_misses(jumps):
+    exact = -np.asarray(HEIGHTS)[:, None] * norm.pdf(np.asarray(POINTS)[:, 0] / STDDEV) / STDDEV
+    table, _, _ = jumps
+    np.testing.assert_array_less(np.abs(table.bias[..., 0] - exact), 4 * table.bias_error[..., 0])
+    low, high = table.bias_interval[..., 0]
+    assert (high[1:] < 0).all()
+    assert ((low[0] < 0) & (high[0] > 0)).sum() >= 2
+
+
+def test_the_landscape_is_the_cost(jumps):
+    table, _, _ = jumps
+    x = table.landscape.points
+    assert x.shape == table.landscape.costs.shape == (3, 2048)
+    np.testing.assert_allclose(table.landscape.costs, x**2 + HEIGHTS[:, None] * (x >= 0), rtol=1e-6)
+    np.testing.assert_allclose(table.cost, POINTS[:, 0] ** 2 + HEIGHTS[:, None] * (POINTS[:, 0] >= 0), rtol=1e-6)
+
+
+def test_everything_is_compiled_once_and_progress_is_told(jumps):
+    _, calls, progress = jumps
+    assert len(calls) == 1
+    assert progress == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_several_parameters_take_a_long_run_for_reference():
+    point, stddev = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2])
+    table = bias_variance(
+        lambda scale: parameter_noise(lambda x: scale * textbook.bumpy(x), jnp.asarray(stddev)),
+        jnp.asarray(point)[None],
+        jax.random.key(2),
+        softness=jnp.array([1.0, 3.0]),
+        num_samples=500,
+        num_reference=20_000,
+    )
+    exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(point, stddev)
+    assert table.reference_method == "zeroth_order"
+    assert table.landscape is None
+    np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
+    np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
+
+
+def test_the_reference_is_unbiased_and_its_error_on_the_safe_side():
+    """By repetition, at a jump: a quadrature rule would not know that it had missed it."""
+    times, point = 400, 0.07
+
+    def once(key):
+        points, cell = cell_points(key, jnp.array(-0.6), jnp.array(0.7), 300)
+        landscape = Landscape(points, 2.0 * (points >= 0) + points, cell)
+        return landscape.smoothed_gradient(jnp.array(point), jnp.array(STDDEV), jnp.array(2.0))
+
+    values, errors = map(np.asarray, jax.vmap(once)(jax.random.split(jax.random.key(0), times)))
+    exact = 2 * textbook.step_gradient(point) + 1
+    assert abs(values.mean() - exact) < 4 * values.std() / np.sqrt(times)
+    assert (np.abs(values - exact) < 2 * errors).mean() > 0.95
+    assert (errors**2).mean() < 4 * values.var()
+
+
+def test_the_smoothed_cost_is_the_mean_under_noise():
+    points, cell = cell_points(jax.random.key(0), jnp.array(-0.6), jnp.array(0.9), 2000)
+    value, error = Landscape(points, points**2, cell).smoothed_cost(jnp.array(0.25), jnp.array(STDDEV))
+    # E (θ + w)² = θ² + σ².
+    assert abs(value - (0.25**2 + STDDEV**2)) < 4 * error < 1e-3
+
+
+def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():
+    points, cell = cell_points(jax.random.key(0), jnp.array(-2.0), jnp.array(2.0), 1000)
+    landscape = Landscape(points, jnp.where(points > 1.0, jnp.nan, points), cell)
+    near, far = (landscape.smoothed_gradient(jnp.array(x), jnp.array(STDDEV), jnp.array(0.0))[0] for x in (0.9, 0.2))
+    assert np.isnan(near)
+    assert abs(far - 1) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"params": jnp.array([0.1])}, r"params must have shape \(points, dim\), got \(1,\)"),
+        ({"baseline": "mean"}, "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'"),
+        ({"num_samples": 1}, "num_samples must be at least 2, got 1"),
+        ({"num_reference": 3}, "num_reference must be at least 4, got 3"),
+        ({"softness": []}, "softness must have at least one value, got none"),
+        ({"softness": {"a": jnp.ones(2), "b": jnp.ones(3)}}, "softness must have the same leading axis in every leaf"),
+        ({"softness": [{"a": 1.0}, {"b": 1.0}]}, "softness must have the same parts set in every value, got 2"),
+        ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
+    ],
+)
+def test_bad_arguments_are_answered_with_what_is_right(arguments, sentence):
+    good = {"params": POINTS, "softness": WIDTHS, "num_samples": 8}
+    with pytest.raises(ValueError, match=sentence):
+        bias_variance(
+            lambda width: parameter_noise(textbook.ramp(width), STDDEV), key=jax.random.key(0), **(good | arguments)
+        )
+
+
+def test_intervals_of_means_cover_as_often_as_they_say():
+    samples = np.random.default_rng(0).normal(3.0, 2.0, (4000, 6))
+    error = samples.std(axis=1, ddof=1) / np.sqrt(6)
+    low, high = mean_interval(samples.mean(axis=1), error, 6, 0.9)
+    assert ((low < 3) & (high > 3)).mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
+
+
+def test_chi_square_intervals_cover_as_often_as_they_say_for_normal_samples():
+    samples = np.random.default_rng(1).normal(3.0, 2.0, (4000, 6))
+    low, high = chi_square_variance_interval(samples.var(axis=1, ddof=1), 6, 0.9)
+    assert ((low < 4) & (high > 4)).mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
+
+
+def test_bootstrap_intervals_cover_where_samples_are_not_normal():
+    """Two exponential coordinates, total variance 1 + 9; chi-square covers 68 % of the time here."""
+    rng, times = np.random.default_rng(2), 300
+    covers = 0
+    for _ in range(times):
+        samples = rng.exponential([1.0, 3.0], (400, 2))
+        low, high = bootstrap_variance_interval(samples, 0.9, num_resamples=300)
+        covers += low < 10 < high
+    # Percentile intervals of a skewed variance cover somewhat less than they say.
+    assert covers / times == pytest.approx(0.88, abs=4 * np.sqrt(0.1 / times))
+
+
+def test_samples_that_are_not_finite_do_not_enter_a_bootstrap():
+    samples = np.random.default_rng(3).normal(size=(50, 1))
+    spoiled = np.concatenate([samples, [[np.nan], [np.inf]]])
+    np.testing.assert_array_equal(bootstrap_variance_interval(spoiled), bootstrap_variance_interval(samples))
+    assert np.isnan(bootstrap_variance_interval(spoiled[-3:])).all()
