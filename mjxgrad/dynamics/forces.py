@@ -1,0 +1,177 @@
+"""Actuation, passive and applied forces, for the models in which they are plain.
+
+Drop-ins for MJX's stages. Whatever a model has beyond joint transmissions, motors and position servos without dynamics, and joint springs
+and dampers, is left to MJX: each function says what.
+"""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import linear, rotation, smooth, spatial, springs, tree
+from mjxgrad.dynamics.spatial import contract, pick
+
+_Disable = mujoco.mjtDisableBit
+_Joint = mujoco.mjtJoint
+_ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_ON_AXES = (_Joint.mjJNT_HINGE, _Joint.mjJNT_SLIDE)
+_BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+
+
+def _drives_axes(model: mjx.Model) -> bool:
+    """Whether all actuators act on hinges and slides."""
+    if not np.isin(model.actuator_trntype, _ON_JOINTS).all():
+        return False
+    return bool(np.isin(model.jnt_type[model.actuator_trnid[:, 0]], _ON_AXES).all())
+
+
+def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find lengths and moments of actuators; a drop-in for `mjx.transmission`.
+
+    Args:
+        model: `actuator_gear`. Anything but hinges and slides is left to MJX.
+        data: `qpos`; poses of sites and tendons if actuators act on them.
+
+    Returns:
+        Data with `actuator_length` and `actuator_moment`.
+    """
+    if not model.nu or not _drives_axes(model):
+        return mjx.transmission(model, data)
+    gear, joint = model.actuator_gear[:, 0], model.actuator_trnid[:, 0]
+    drives = (model.jnt_dofadr[joint][:, None] == np.arange(model.nv)).astype(float)
+    length = gear * pick(model.jnt_qposadr[joint], data.qpos)
+    moment = spatial.scale(gear, jnp.asarray(drives, gear.dtype))
+    return data.tree_replace({"actuator_length": length, "_impl.actuator_moment": moment})
+
+
+def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Run the velocity-dependent stages; a drop-in for `mjx.fwd_velocity`.
+
+    Args:
+        model: any.
+        data: with all that depends on position.
+
+    Returns:
+        Data with velocities, passive forces and bias forces.
+    """
+    if model.nu:
+        rate = contract("uv,v->u", data._impl.actuator_moment, data.qvel)
+        data = data.tree_replace({"_impl.actuator_velocity": rate})
+    if model.ntendon:
+        rate = contract("tv,v->t", data._impl.ten_J, data.qvel)
+        data = data.tree_replace({"_impl.ten_velocity": rate})
+    data = smooth.rne(model, passive(model, smooth.com_vel(model, data)))
+    return mjx.tendon_bias(model, data) if model.ntendon else data
+
+
+def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find spring and damper forces; a drop-in for `mjx.passive` whose springs have their derivative at rest.
+
+    Args:
+        model: stiffness and damping of joints. Tendons, gravity compensation and media are left to MJX.
+        data: `qpos`, normalised, and `qvel`.
+
+    Returns:
+        Data with `qfrc_passive` and `qfrc_gravcomp`.
+    """
+    flags = model.opt.disableflags
+    compensates = model.flg_gravcomp and not flags & _Disable.mjDSBL_GRAVITY
+    if model.ntendon or compensates or model.opt._impl.has_fluid_params:
+        return springs.restore_derivative(model, mjx.passive(model, data))
+    none = jnp.zeros_like(data.qvel)
+    # MJX leaves out both where either is disabled.
+    if flags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
+        return data.replace(qfrc_passive=none, qfrc_gravcomp=none)
+    force = _springs(model, data.qpos) - model.dof_damping * data.qvel
+    return data.replace(qfrc_passive=force, qfrc_gravcomp=none)
+
+
+def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    forces = []
+    for run in tree.joint_runs(model):
+        q, rest = qpos[run.qpos], model.qpos_spring[run.qpos]
+        stiffness = model.jnt_stiffness[run.joints]
+        if run.kind in _ON_AXES:
+            forces.append(stiffness * (rest - q))
+            continue
+        q, rest = q.reshape(-1, run.width), rest.reshape(-1, run.width)
+        inverse = rotation.conjugate(rest[:, -4:])
+        stretch = rotation.logarithm(spatial.multiply(inverse, q[:, -4:]))
+        if run.kind == _Joint.mjJNT_FREE:
+            stretch = jnp.concatenate([q[:, :3] - rest[:, :3], stretch], axis=1)
+        forces.append(-(stiffness[:, None] * stretch).reshape(-1))
+    return jnp.concatenate(forces)
+
+
+def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find actuator forces; a drop-in for `mjx.fwd_actuation`.
+
+    Args:
+        model: motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
+        data: with `ctrl`, and actuator lengths, velocities and moments.
+
+    Returns:
+        Data with `act_dot`, `actuator_force` and `qfrc_actuator`.
+    """
+    if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION or not _is_plain(model):
+        return mjx.fwd_actuation(model, data)
+    control = data.ctrl
+    if not model.opt.disableflags & _Disable.mjDSBL_CLAMPCTRL:
+        control = _clamp(control, model.actuator_ctrllimited, model.actuator_ctrlrange)
+    force = model.actuator_gainprm[:, 0] * control
+    is_servo = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    if is_servo.any():
+        constant, on_length, on_velocity = model.actuator_biasprm[:, :3].T
+        bias = constant + on_length * data.actuator_length
+        force += jnp.where(is_servo, bias + on_velocity * data._impl.actuator_velocity, 0.0)
+    force = _clamp(force, model.actuator_forcelimited, model.actuator_forcerange)
+    total = contract("uv,u->v", data._impl.actuator_moment, force)
+    limited = model.jnt_actfrclimited
+    if limited.any():
+        bounds = pick(model.dof_jntid, model.jnt_actfrcrange)
+        total = _clamp(total, limited[model.dof_jntid], bounds)
+    return data.replace(
+        act_dot=jnp.zeros_like(data.act), actuator_force=force, qfrc_actuator=total
+    )
+
+
+def _is_plain(model: mjx.Model) -> bool:
+    """Whether forces are those of motors or servos without dynamics."""
+    return bool(
+        not model.na
+        and not model.flg_gravcomp
+        and not np.any(model.tendon_actfrclimited)
+        and _drives_axes(model)
+        and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
+        and np.isin(model.actuator_biastype, _BIASES).all()
+    )
+
+
+def _clamp(
+    x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "n 2"]
+) -> Float[Array, " n"]:
+    if not is_limited.any():
+        return x
+    return jnp.where(is_limited, jnp.clip(x, bounds[:, 0], bounds[:, 1]), x)
+
+
+def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Add up all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
+
+    Args:
+        model: any.
+        data: with passive, bias and actuator forces, and the mass matrix; `xfrc_applied` acts at the bodies' centres of
+            mass (N, N m).
+
+    Returns:
+        Data with `qfrc_smooth` and `qacc_smooth`.
+    """
+    push, torque = data.xfrc_applied[:, :3], data.xfrc_applied[:, 3:]
+    lever = data.xipos - pick(model.body_rootid, data.subtree_com)
+    wrench = jnp.concatenate([torque + spatial.cross(lever, push), push], axis=1)
+    applied = data.qfrc_applied + smooth.generalised_force(model, data, wrench)
+    total = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
+    unconstrained = linear.solve_positive_definite(mjx.full_m(model, data), total)
+    return data.replace(qfrc_smooth=total, qacc_smooth=unconstrained)

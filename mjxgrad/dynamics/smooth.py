@@ -1,0 +1,271 @@
+r"""Kinematics, inertia and bias forces: the smooth stages of a step, without recursion.
+
+MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes. Then
+nothing has to be transformed between bodies, and what is usually a recursion over the tree is a sum over ancestors or
+descendants: a product with a constant 0/1 matrix. Only orientations multiply; their products from the root are formed by
+doubling, in a number of rounds that is logarithmic in the depth of the tree.
+
+MJX walks the tree level by level and gathers and scatters between levels, which reverse mode multiplies. The stages here fill the
+same fields of `mjx.Data` with the same values. One difference is meant: bodies fixed to a mocap body follow it, as in C MuJoCo.
+
+References:
+    Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.
+    MuJoCo documentation, "Computation", "General framework".
+"""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics.spatial import combine, contract, pick
+
+_Joint = mujoco.mjtJoint
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Place bodies, joints, geoms and sites; a drop-in for `mjx.kinematics`.
+
+    Args:
+        model: joints of any type and number.
+        data: `qpos` and the poses of mocap bodies. Quaternions need not be normalised.
+
+    Returns:
+        Data with positions (m) and orientations in the world, and normalised quaternions in `qpos`.
+    """
+    frames = tree.frames(model)
+    qpos, turn, way, origin = _joint_motion(model, data.qpos)
+    quat, mat = _orientations(model, data, frames, turn)
+    fixed = spatial.rotation_matrix(
+        pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY)
+    )
+    is_free = (model.jnt_type == _Joint.mjJNT_FREE)[:, None]
+    axis = jnp.where(is_free, jnp.asarray(_UP, qpos.dtype), spatial.rotate(fixed, model.jnt_axis))
+    before = np.concatenate([frames.before_body, frames.before_joint, frames.before_joint])
+    local = jnp.concatenate([model.body_pos, spatial.rotate(fixed, model.jnt_pos), axis])
+    turned = spatial.rotate(pick(before, mat, np.eye(3)), local)
+    from_parent, to_anchor, axis = jnp.split(turned, [model.nbody, model.nbody + model.njnt])
+    if model.nmocap:
+        is_mocap = (model.body_mocapid >= 0)[:, None]
+        from_parent = jnp.where(is_mocap, pick(model.body_mocapid, data.mocap_pos), from_parent)
+    moved = origin + spatial.scale(way, axis)
+    moved -= spatial.rotate(pick(frames.after_joint, mat), model.jnt_pos)
+    of_bodies, of_anchors = tree.displacements(model)
+    steps = jnp.concatenate([from_parent, to_anchor, moved])
+    positions = combine(np.concatenate([of_bodies, of_anchors]), steps)
+    xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
+    xquat, xmat = pick(frames.of_body, quat), pick(frames.of_body, mat)
+    bodies = np.arange(model.nbody)
+    xipos, ximat = _place(bodies, xpos, xmat, model.body_ipos, model.body_iquat)
+    data = data.replace(qpos=qpos, xanchor=xanchor, xaxis=axis, xpos=xpos, xquat=xquat, xmat=xmat)
+    data = data.replace(xipos=xipos, ximat=ximat)
+    if model.ngeom:
+        placed = _place(model.geom_bodyid, xpos, xmat, model.geom_pos, model.geom_quat)
+        data = data.replace(geom_xpos=placed[0], geom_xmat=placed[1])
+    if model.nsite:
+        placed = _place(model.site_bodyid, xpos, xmat, model.site_pos, model.site_quat)
+        data = data.replace(site_xpos=placed[0], site_xmat=placed[1])
+    return data
+
+
+def _joint_motion(
+    model: mjx.Model, qpos: Float[Array, " nq"]
+) -> tuple[
+    Float[Array, " nq"], Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]
+]:
+    """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
+    dtype = qpos.dtype
+    kept, turns, ways, origins = [], [], [], []
+    for run in tree.joint_runs(model):
+        q, count = qpos[run.qpos], run.joints.stop - run.joints.start
+        turn = jnp.asarray(np.tile(_IDENTITY, (count, 1)), dtype)
+        way, origin = jnp.zeros(count, dtype), jnp.zeros((count, 3), dtype)
+        if run.kind == _Joint.mjJNT_SLIDE:
+            way = q - model.qpos0[run.qpos]
+        elif run.kind == _Joint.mjJNT_HINGE:
+            half = 0.5 * (q - model.qpos0[run.qpos])
+            axes = model.jnt_axis[run.joints]
+            turn = jnp.concatenate(
+                [jnp.cos(half)[:, None], spatial.scale(jnp.sin(half), axes)], axis=1
+            )
+        else:
+            q = q.reshape(count, run.width)
+            turn = spatial.normalise(q[:, -4:])
+            if run.kind == _Joint.mjJNT_FREE:
+                origin = q[:, :3]
+                q = jnp.concatenate([origin, turn], axis=1).reshape(-1)
+            else:
+                q = turn.reshape(-1)
+        for values, value in zip((kept, turns, ways, origins), (q, turn, way, origin), strict=True):
+            values.append(value)
+    if not kept:
+        return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))
+    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))
+
+
+def _orientations(
+    model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
+) -> tuple[Float[Array, "turns 4"], Float[Array, "turns 3 3"]]:
+    """Return quaternions and matrices after each turn, in the world.
+
+    Both are carried through the products, so that XLA can remove the quaternions where nobody reads them.
+    """
+    has_joint = frames.joint >= 0
+    own = pick(frames.joint, turn, _IDENTITY * (frames.mocap < 0)[:, None])
+    if model.nmocap:
+        own += pick(frames.mocap, spatial.normalise(data.mocap_quat))
+    quat = own
+    if (frames.body >= 0).any():
+        fixed = pick(frames.body, model.body_quat, _IDENTITY)
+        quat = spatial.multiply(fixed, own) if has_joint.any() else fixed
+    mat = spatial.rotation_matrix(quat)
+    for jump in frames.jumps:
+        quat = spatial.multiply(pick(jump, quat, _IDENTITY), quat)
+        mat = spatial.compose(pick(jump, mat, np.eye(3)), mat)
+    return quat, mat
+
+
+def _place(
+    body: np.ndarray,
+    xpos: Float[Array, "nbody 3"],
+    xmat: Float[Array, "nbody 3 3"],
+    pos: Float[Array, "n 3"],
+    quat: Float[Array, "n 4"],
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
+    """Return world position and orientation of what is fixed to bodies."""
+    mat = pick(body, xmat)
+    placed = pick(body, xpos) + spatial.rotate(mat, pos)
+    return placed, spatial.compose(mat, spatial.rotation_matrix(quat))
+
+
+def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find centres of mass, inertias about them, and joint axes as motions; a drop-in for `mjx.com_pos`.
+
+    Args:
+        model: masses (kg) and principal inertias (kg m²). Bodies may have no mass.
+        data: with poses, as `kinematics` leaves them.
+
+    Returns:
+        Data with `subtree_com` (m), `cinert` and `cdof`.
+    """
+    mass = model.body_mass
+    moments = jnp.concatenate([spatial.scale(mass, data.xipos), mass[:, None]], axis=1)
+    sums = combine(tree.descendants(model), moments)
+    is_massless = sums[:, 3:] < mujoco.mjMINVAL
+    centre = sums[:, :3] / jnp.where(is_massless, 1.0, sums[:, 3:])
+    centre = jnp.where(is_massless, data.xipos, centre)
+    offset = data.xipos - pick(model.body_rootid, centre)
+    central = contract("nij,nj,nkj->nik", data.ximat, model.body_inertia, data.ximat)
+    inertia = spatial.inertia_about(offset, mass, central)
+    return data.tree_replace(
+        {"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)}
+    )
+
+
+def _joint_axes(
+    model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]
+) -> Float[Array, "nv 6"]:
+    """Return the motion of unit joint velocities about the centre of mass of their tree."""
+    angular, linear = [], []
+    for run in tree.joint_runs(model):
+        axis = data.xaxis[run.joints]
+        if run.kind in (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL):
+            columns = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
+            axis = columns.reshape(-1, 3)
+        still = jnp.zeros_like(axis)
+        if run.kind == _Joint.mjJNT_FREE:
+            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)
+            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))
+            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))
+        elif run.kind == _Joint.mjJNT_SLIDE:
+            angular.append(still)
+            linear.append(axis)
+        else:
+            angular.append(axis)
+            linear.append(still)
+    if not angular:
+        return jnp.zeros((0, 6), data.qpos.dtype)
+    turning = jnp.concatenate(angular)
+    root = pick(model.body_rootid[model.dof_bodyid], centre)
+    lever = root - pick(model.dof_jntid, data.xanchor)
+    return jnp.concatenate(
+        [turning, jnp.concatenate(linear) + spatial.cross(turning, lever)], axis=1
+    )
+
+
+def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find velocities of bodies and rates of joint axes; a drop-in for `mjx.com_vel`.
+
+    Args:
+        model: gives the tree.
+        data: `qvel`, and `cdof` as `com_pos` leaves it.
+
+    Returns:
+        Data with `cvel` and `cdof_dot`.
+    """
+    motion = spatial.scale(data.qvel, data.cdof)
+    sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
+    velocity, before = sums[: model.nbody], sums[model.nbody :]
+    return data.replace(cvel=velocity, cdof_dot=spatial.cross_motion(before, data.cdof))
+
+
+def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find the mass matrix from composite inertias; a drop-in for `mjx.crb`.
+
+    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself.
+
+    Args:
+        model: `dof_armature` is added to the diagonal (kg or kg m²).
+        data: with `cinert` and `cdof`, as `com_pos` leaves them.
+
+    Returns:
+        Data with `crb` and `M`, in whichever of MJX's two formats the data has.
+    """
+    if data._impl.M.ndim == 1:
+        return mjx.crb(model, data)
+    below = tree.descendants(model)
+    below[0] = 0
+    carried = combine(below[model.dof_bodyid], data._impl.cinert)
+    momentum = contract("nij,nj->ni", spatial.inertia_matrix(carried), data.cdof)
+    products = contract("ik,jk->ij", momentum, data.cdof)
+    is_pair = np.zeros((model.nv, model.nv))
+    is_pair[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = 1
+    lower = products * jnp.asarray(is_pair, products.dtype)
+    mirrored = products.T * jnp.asarray(np.triu(is_pair.T, 1), products.dtype)
+    diagonal = model.dof_armature[:, None] * jnp.eye(model.nv, dtype=products.dtype)
+    return data.tree_replace(
+        {"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal}
+    )
+
+
+def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find gravity, Coriolis and centrifugal forces; a drop-in for `mjx.rne`.
+
+    Args:
+        model: `opt.gravity` (m/s²).
+        data: with `cinert`, `cdof`, `cvel` and `cdof_dot`.
+
+    Returns:
+        Data with `qfrc_bias` (N or N m), the joint forces that keep the acceleration at zero.
+    """
+    acceleration = combine(tree.moving_dofs(model), spatial.scale(data.qvel, data.cdof_dot))
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
+        acceleration += jnp.concatenate([jnp.zeros_like(upwards), upwards])
+    inertia = spatial.inertia_matrix(data._impl.cinert)
+    both = jnp.stack([acceleration, data.cvel], axis=-1)
+    both = contract("nij,njk->nik", inertia, both)
+    force = both[..., 0] + spatial.cross_force(data.cvel, both[..., 1])
+    return data.replace(qfrc_bias=generalised_force(model, data, force))
+
+
+def generalised_force(
+    model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]
+) -> Float[Array, " nv"]:
+    """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
+    carried = combine(tree.moving_dofs(model).T, force)
+    return contract("ni,ni->n", data.cdof, carried)

@@ -1,0 +1,194 @@
+"""Who moves whom: the structure of a model as constant arrays.
+
+All of it is read off static fields of the model, so that lengths, masses and axes may be traced.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjxgrad._mjx import mjx
+
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_BALL = mujoco.mjtJoint.mjJNT_BALL
+_SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
+
+
+@dataclass(frozen=True)
+class Run:
+    """Neighbouring joints of one type. Their coordinates are neighbours too, so a slice and a reshape gather them.
+
+    Attributes:
+        kind: the type.
+        joints: their place among the joints.
+        qpos: their place among the positions.
+        width: positions per joint.
+    """
+
+    kind: mujoco.mjtJoint
+    joints: slice
+    qpos: slice
+    width: int
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The turns of which the orientation of a body is made: one for each joint that rotates, one for each other body.
+
+    An index of -1 stands for the world.
+
+    Attributes:
+        body: frame that is turned by the body's own quaternion; the others have -1 (turns -> bodies).
+        joint: joint of a turn, -1 for bodies without (turns -> joints).
+        mocap: mocap body of a turn, -1 for the others (turns -> mocap).
+        jumps: for k = 0, 1, ... the turn that is 2ᵏ before; after multiplying by all of them in order every turn
+            holds the product from the root.
+        of_body: last turn of a body.
+        before_body: turn that a body's position refers to.
+        before_joint: turn that a joint's position and axis refer to.
+        is_first: whether no joint of the same body rotates before this one, so that the body's quaternion applies.
+        after_joint: turn of a joint that moves its body about its anchor, -1 for the others.
+    """
+
+    body: np.ndarray
+    joint: np.ndarray
+    mocap: np.ndarray
+    jumps: tuple[np.ndarray, ...]
+    of_body: np.ndarray
+    before_body: np.ndarray
+    before_joint: np.ndarray
+    is_first: np.ndarray
+    after_joint: np.ndarray
+
+
+def joint_runs(model: mjx.Model) -> tuple[Run, ...]:
+    """Return the joints in order, neighbours of one type together."""
+    runs, start = [], 0
+    for end in range(1, model.njnt + 1):
+        if end < model.njnt and model.jnt_type[end] == model.jnt_type[start]:
+            continue
+        kind = mujoco.mjtJoint(int(model.jnt_type[start]))
+        width = {_FREE: 7, _BALL: 4}.get(kind, 1)
+        first = int(model.jnt_qposadr[start])
+        runs.append(
+            Run(kind, slice(start, end), slice(first, first + width * (end - start)), width)
+        )
+        start = end
+    return tuple(runs)
+
+
+def frames(model: mjx.Model) -> Frames:
+    """Return the turns of a model."""
+    body, joint, mocap, previous = [], [], [], []
+    of_body, before_body = np.full(model.nbody, -1), np.full(model.nbody, -1)
+    before_joint, after_joint = np.full(model.njnt, -1), np.full(model.njnt, -1)
+    is_first = np.ones(model.njnt, bool)
+    for b in range(model.nbody):
+        last = of_body[model.body_parentid[b]] if model.body_parentid[b] else -1
+        before_body[b] = last
+        begun = len(body)
+        for j in joints_of(model, b):
+            before_joint[j], is_first[j] = last, len(body) == begun
+            if model.jnt_type[j] == _SLIDE:
+                continue
+            is_free = model.jnt_type[j] == _FREE
+            body.append(b if is_first[j] and not is_free else -1)
+            joint.append(j)
+            mocap.append(-1)
+            previous.append(last)
+            last = len(body) - 1
+            after_joint[j] = -1 if is_free else last
+        if len(body) == begun:
+            is_mocap = model.body_mocapid[b] >= 0
+            body.append(-1 if is_mocap or b == 0 else b)
+            joint.append(-1)
+            mocap.append(model.body_mocapid[b])
+            previous.append(last)
+            last = len(body) - 1
+        of_body[b] = last
+    return Frames(
+        *(np.array(x, int) for x in (body, joint, mocap)),
+        _jumps(np.array(previous, int)),
+        of_body,
+        before_body,
+        before_joint,
+        is_first,
+        after_joint,
+    )
+
+
+def _jumps(previous: np.ndarray) -> tuple[np.ndarray, ...]:
+    jumps = []
+    while (previous >= 0).any():
+        jumps.append(previous)
+        previous = np.where(previous >= 0, previous[previous], -1)
+    return tuple(jumps)
+
+
+def joints_of(model: mjx.Model, body: int) -> range:
+    """Return the joints of a body."""
+    first = int(model.body_jntadr[body])
+    return range(first, first + int(model.body_jntnum[body]))
+
+
+def displacements(model: mjx.Model) -> tuple[np.ndarray, np.ndarray]:
+    """Return of which steps the positions of bodies and of joint anchors are the sums.
+
+    The steps are, in order: from the parent to each body, from each body to its joints' anchors, and what each joint
+    adds: the way of a slide, the position of a free joint, or the way back from the anchor to the body.
+    """
+    num_body, num_joint = model.nbody, model.njnt
+    bodies = np.zeros((num_body, num_body + 2 * num_joint))
+    anchors = np.zeros((num_joint, num_body + 2 * num_joint))
+    for b in range(1, num_body):
+        path = bodies[model.body_parentid[b]].copy()
+        path[b] = 1
+        for j in joints_of(model, b):
+            to_anchor, moved = num_body + j, num_body + num_joint + j
+            if model.jnt_type[j] == _FREE:
+                path[:] = 0
+                path[moved] = 1
+                anchors[j] = path
+                continue
+            anchors[j] = path
+            anchors[j, to_anchor] = 1
+            path[moved] = 1
+            path[to_anchor] = model.jnt_type[j] != _SLIDE
+        bodies[b] = path
+    return bodies, anchors
+
+
+def moving_dofs(model: mjx.Model) -> np.ndarray:
+    """Return which joint velocities move which body, (nbody, nv)."""
+    moves = np.zeros((model.nbody, model.nv))
+    for body in range(1, model.nbody):
+        moves[body] = moves[model.body_parentid[body]]
+        first = model.body_dofadr[body]
+        moves[body, first : first + model.body_dofnum[body]] = 1
+    return moves
+
+
+def earlier_dofs(model: mjx.Model) -> np.ndarray:
+    """Return which joint velocities turn the axis of which other, (nv, nv).
+
+    Those of all joints before it. The three axes of a ball joint turn with its parent (`cdof_dot` is MuJoCo's convention, not
+    a total derivative); those of a free joint's rotation are counted after its translation.
+    """
+    moves, earlier = moving_dofs(model), np.zeros((model.nv, model.nv))
+    for dof in range(model.nv):
+        body, joint = model.dof_bodyid[dof], model.dof_jntid[dof]
+        first = model.jnt_dofadr[joint]
+        if model.jnt_type[joint] == _FREE and dof >= first + 3:
+            first += 3
+        earlier[dof] = moves[model.body_parentid[body]]
+        earlier[dof, model.body_dofadr[body] : first] = 1
+    return earlier
+
+
+def descendants(model: mjx.Model) -> np.ndarray:
+    """Return which bodies hang on which body, itself included, (nbody, nbody)."""
+    below = np.eye(model.nbody)
+    for body in range(model.nbody - 1, 0, -1):
+        below[model.body_parentid[body]] += below[body]
+    return below
