@@ -38,7 +38,9 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     """Return the inner product."""
     if x.ndim == 1:
         return jnp.sum(x * y)
-    return jnp.einsum("n,n...->...", jnp.ones(len(x), x.dtype), x * y, precision="highest")
+    if len(x) > _LONGEST_SUM:
+        return jnp.sum(x * y, axis=0)
+    return _add(a * b for a, b in zip(x, y, strict=True))
 
 
 def gram(

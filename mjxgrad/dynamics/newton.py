@@ -28,8 +28,9 @@ from mjxgrad.dynamics import constraint, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 
 # Newton steps along the search line. Near the solution the first, of length one, is already exact; far from it an inexact
-# search costs an outer iteration and not the answer.
-_LINE_STEPS = 8
+# search costs an outer iteration and not the answer. On a box and a ball that slide on a plane, 2 to 12 steps needed the
+# same number of outer iterations within two per cent.
+_LINE_STEPS = 4
 # A line search has converged where the slope has fallen to this part of its value at the start.
 _LINE_TOLERANCE = 1e-3
 
@@ -190,7 +191,10 @@ def _line_search(
     start = linear.dot(point.gradient, direction)
     high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     bracket = (jnp.zeros_like(start), high, jnp.ones_like(start), start)
-    low, _, length, value = jax.lax.fori_loop(0, _LINE_STEPS, improve, bracket)
+    # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA writes
+    # each step out again wherever the next one uses its length.
+    unroll = jax.default_backend() != "cpu"
+    low, _, length, value = jax.lax.fori_loop(0, _LINE_STEPS, improve, bracket, unroll=unroll)
     has_converged = jnp.abs(value) <= _LINE_TOLERANCE * jnp.abs(start)
     # Up to the lower end of the bracket the cost has only fallen.
     return jnp.where(has_converged | (low == 0), length, low)
