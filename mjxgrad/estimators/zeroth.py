@@ -117,8 +117,7 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     $\mathbb{E}[k^2] = c^2 + V_k$; together they give an estimate of $V$ that is unbiased for
     every $n \ge 2$, and never negative without pairs.
     """
-    first, second = moments.about(moments.costs.mean)
-    count = moments.costs.count
+    first, second, count = moments.first, moments.second, moments.costs.count
     others = as_real(jnp.maximum(count - 1, 1), first)
     total = first[0] + first[1] / others
     total_square = second[0, 0] + 2 * second[0, 1] / others + second[1, 1] / others**2

@@ -61,10 +61,8 @@ def test_sharing_rollouts_gives_what_each_estimator_gives_alone(objective, key):
     ("estimator", "settings", "rollouts", "gradients"),
     [
         (first_order, {}, 40, 40),
-        (zeroth_order, {}, 40, 0),
         (zeroth_order, {"baseline": "zero_noise"}, 41, 0),
         (zeroth_order, {"antithetic": True}, 40, 0),
-        (lambda *a, **k: first_and_zeroth_order(*a, **k)[1], {}, 40, 40),
         (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {"baseline": "zero_noise"}, 41, 41),
     ],
 )
@@ -95,9 +93,9 @@ def test_adding_a_large_constant_changes_nothing(offset):
 
     plain, shifted = estimates(jnp.float32(0)), estimates(jnp.float32(offset))
     assert plain.value.dtype == jnp.float32
-    # The mean itself is rounded to one part in 2^24 of the constant; the scores average to nearly nothing.
-    np.testing.assert_allclose(shifted.value, plain.value, rtol=0.01)
-    np.testing.assert_allclose(shifted.variance, plain.variance, rtol=0.01)
+    # Only the order of the terms of sums over 5000 samples differs.
+    np.testing.assert_allclose(shifted.value, plain.value, rtol=1e-4)
+    np.testing.assert_allclose(shifted.variance, plain.variance, rtol=1e-4)
 
 
 def test_the_noise_of_a_sample_does_not_depend_on_the_number_of_samples(key):
