@@ -7,7 +7,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contacts import ContactPair, contact_parameters
 
 
-def largest_stable_step(damping_ratio: float, integrator: int) -> float:
+def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:
     r"""Largest $h \omega_0$ at which a contact at full impedance does not gain energy.
 
     The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and
@@ -17,7 +17,7 @@ def largest_stable_step(damping_ratio: float, integrator: int) -> float:
 
     Args:
         damping_ratio: $\zeta$.
-        integrator: of MuJoCo, `mujoco.mjtIntegrator`.
+        integrator: of the model.
 
     Returns:
         The limit of $h \omega_0$; the limit of $h b$ is $2 \zeta$ times this.
@@ -59,11 +59,12 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
         for x in (parameters.solref, parameters.stiffness, parameters.damping)
     )
     timestep = float(model.opt.timestep)
+    integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
     messages: dict[str, list[ContactPair]] = {}
     for pair, (first, second), k, b in zip(pairs, solref, stiffness, damping, strict=True):
         for message in (
             _altered_by_refsafe(first, second, b, timestep),
-            _beyond_stability(k, b, timestep, int(model.opt.integrator)),
+            _beyond_stability(k, b, timestep, integrator),
         ):
             if message:
                 messages.setdefault(message, []).append(pair)
@@ -79,7 +80,6 @@ def name_pairs(pairs: list[ContactPair]) -> str:
 
 def format_number(x: float) -> str:
     """Three digits; whole numbers up to 99999 in full."""
-    x = float(x)
     if np.isinf(x):
         return "∞" if x > 0 else "−∞"
     if 1e3 <= abs(x) < 99999.5:
@@ -101,7 +101,7 @@ def _altered_by_refsafe(
 
 
 def _beyond_stability(
-    stiffness: float, damping: float, timestep: float, integrator: int
+    stiffness: float, damping: float, timestep: float, integrator: mujoco.mjtIntegrator
 ) -> str | None:
     if stiffness <= 0:
         return None

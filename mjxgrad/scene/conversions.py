@@ -88,6 +88,13 @@ def _noslip(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion("noslip_iterations", str(given), "0", "the scene has no friction")
 
 
+def _exact_diagonal(model: mujoco.MjModel) -> Iterator[Conversion]:
+    # Refused before, if there is a constraint for it to act on.
+    if model.opt.enableflags & _ENABLE.mjENBL_DIAGEXACT.value:
+        model.opt.enableflags &= ~_ENABLE.mjENBL_DIAGEXACT.value
+        yield Conversion("flag diagexact", "enable", "disable", "the scene has no constraints")
+
+
 def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.wind.any() and not has_medium(model):
         given = " ".join(f"{w:g}" for w in model.opt.wind)
@@ -126,7 +133,7 @@ def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
          model.tendon_damping),
     )  # fmt: skip
     for word, actuators, addresses, armature, damping in targets:
-        for target, actuator in enumerate(actuators):
+        for target, actuator in enumerate(actuators.tolist()):
             if actuator < 0:
                 continue
             gear = model.actuator_gear[model.actuator_outadr[actuator], 0]
@@ -182,9 +189,9 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     clamped = model.actuator_ctrllimited[model.actuator_ctrladr].astype(bool)
     differs = muscle | ((affine_gain | affine_bias) & limited) | (affine_gain & clamped)
     if differs.any():
-        which = np.flatnonzero(differs)
+        which = np.flatnonzero(differs).tolist()
         first = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, which[0])
-        more = f" + {which.size - 1}" if which.size > 1 else ""
+        more = f" + {len(which) - 1}" if len(which) > 1 else ""
         reason = "its velocity derivative ignores force and control limits and muscles"
         yield Conversion(
             f"integrator at {first}{more}",
@@ -258,6 +265,7 @@ BEFORE_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = 
 AFTER_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
     _solver,
     _noslip,
+    _exact_diagonal,
     _actuator_inertia,
     _least_friction,
     _implicitfast,

@@ -42,9 +42,9 @@ class Refusal:
 
 def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     """An element as messages call it: its kind with its name or its number."""
-    name = mujoco.mj_id2name(model, kind, int(index))
+    name = mujoco.mj_id2name(model, kind, index)
     word = kind.name.removeprefix("mjOBJ_").lower()
-    return f"{word} {name!r}" if name else f"{word} {int(index)}"
+    return f"{word} {name!r}" if name else f"{word} {index}"
 
 
 def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray]):
@@ -53,7 +53,7 @@ def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray
     def find(model: mujoco.MjModel) -> list[str]:
         rows = np.asarray(condition(model))
         rows = rows.reshape(rows.shape[0], -1).any(axis=1) if rows.size else np.zeros(0, bool)
-        return [element_name(model, kind, i) for i in np.flatnonzero(rows)]
+        return [element_name(model, kind, i) for i in np.flatnonzero(rows).tolist()]
 
     return find
 
@@ -156,7 +156,7 @@ def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _has_frictional_rows(model: mujoco.MjModel) -> bool:
-    return (
+    return bool(
         any(pair.condim > 1 for pair in contact_pairs(model))
         or (model.dof_frictionloss > 0).any()
         or (model.tendon_frictionloss > 0).any()

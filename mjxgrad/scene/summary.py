@@ -56,7 +56,7 @@ def _heading(scene: "Scene") -> str:
         f"time step {1e3 * float(opt.timestep):g} ms",
         integrator if integrator == "RK4" else integrator.capitalize(),
         f"{cone} cones" + (f", impratio {float(opt.impratio):g}" if opt.impratio != 1 else ""),
-        f"Newton to {format_number(opt.tolerance)} in {opt.iterations} iterations",
+        f"Newton to {format_number(float(opt.tolerance))} in {opt.iterations} iterations",
         f"gravity {gravity:.3g} m/s²",
         str(scene.data.qpos.dtype),
     )
@@ -92,7 +92,7 @@ def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
     parameters = scene.contact_parameters()
     columns = (
         [str(pair.condim) for pair in scene.pairs],
-        [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref)],
+        [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()],
         _numbers(parameters.stiffness),
         _numbers(parameters.damping),
         _numbers(parameters.natural_frequency),
@@ -102,17 +102,17 @@ def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
         _numbers(1e3 * parameters.width),
         _numbers(parameters.stability),
         [_friction(pair.condim, row)
-         for pair, row in zip(scene.pairs, np.asarray(parameters.friction), strict=True)],
+         for pair, row in zip(scene.pairs, np.asarray(parameters.friction).tolist(), strict=True)],
         _numbers(1e3 * parameters.margin),
     )  # fmt: skip
     return list(zip(*columns, strict=True))
 
 
 def _numbers(values) -> list[str]:
-    return [format_number(x) for x in np.asarray(values)]
+    return [format_number(x) for x in np.asarray(values).tolist()]
 
 
-def _friction(condim: int, friction: np.ndarray) -> str:
+def _friction(condim: int, friction: Sequence[float]) -> str:
     """Sliding, torsional and rolling coefficients, as far as the contact has them."""
     if condim == 1:
         return "none"

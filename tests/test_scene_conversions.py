@@ -1,0 +1,214 @@
+"""What is converted moves as before; what cannot quite is warned about."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad._mjx import mjx
+from mjxgrad.scene import SceneWarning, load_scene
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
+  <worldbody>
+    <body name="b" pos="0 0 0.5" gravcomp="0.3">
+      <joint name="j" axis="0 1 0" stiffness="5" damping="1" {joint}/>
+      <geom name="g" type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0"/>
+    </body>
+  </worldbody>
+  {rest}
+</mujoco>
+"""
+BALL = """
+<mujoco>
+  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1" friction="{friction}" condim="{condim}"/>
+    <body name="b" pos="0 0 0.095">
+      <freejoint/><geom name="g" size="0.1" friction="{friction}" condim="{condim}"/>
+    </body>
+  </worldbody>
+  {rest}
+</mujoco>
+"""
+BOX = """
+<mujoco>
+  <option timestep="0.005" {option}/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.095" euler="1 2 0"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+TENDON = "<tendon><fixed name='t'><joint joint='j' coef='2'/></fixed></tendon>"
+
+
+def _pendulum(**parts):
+    return PENDULUM.format(**(dict.fromkeys(("option", "flag", "joint", "rest"), "") | parts))
+
+
+def _ball(friction="1", condim=3, **parts):
+    blank = dict.fromkeys(("option", "flag", "rest"), "")
+    return BALL.format(friction=friction, condim=condim, **(blank | parts))
+
+
+# Source, and the setting that the conversion names.
+EXACT = {
+    "energy": (_ball(flag="<flag energy='enable'/>"), "flag energy"),
+    "fwdinv": (_ball(flag="<flag fwdinv='enable'/>"), "flag fwdinv"),
+    "island": (_ball(flag="<flag island='disable'/>"), "flag island"),
+    "multiccd": (_ball(flag="<flag multiccd='disable'/>"), "flag multiccd"),
+    "CG": (_ball(option="solver='CG'"), "solver"),
+    "PGS": (_ball(option="solver='PGS'"), "solver"),
+    "noslip": (_ball(condim=1, option="noslip_iterations='9'"), "noslip_iterations"),
+    "diagexact": (_pendulum(flag="<flag diagexact='enable'/>"), "flag diagexact"),
+    "wind": (_pendulum(option="wind='3 0 0'"), "wind"),
+    "wind and implicitfast": (_pendulum(option="wind='3 0 0' integrator='implicitfast'"), "wind"),
+    "no springs": (_pendulum(flag="<flag spring='disable'/>"), "flag spring"),
+    "no dampers": (_pendulum(flag="<flag damper='disable'/>"), "flag damper"),
+    "neither": (_pendulum(flag="<flag spring='disable' damper='disable'/>"), "flag eulerdamp"),
+    "actuator inertia": (
+        _pendulum(rest="<actuator><motor name='a' joint='j' gear='2' armature='0.5' damping='0.3'/>"
+                  "</actuator>"), "actuator 'a' armature, damping"),
+    "actuator inertia of a tendon": (
+        _pendulum(rest=TENDON + "<actuator><motor name='a' tendon='t' gear='2' armature='0.5' "
+                  "damping='0.3'/></actuator>"), "actuator 'a' armature, damping"),
+    "frictionless pyramid": (_ball(friction="0 0 0"), "friction of floor – g"),
+    "frictionless cone": (_ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
+    "rolls freely": (_ball(friction="1 0 0", condim=6), "friction of floor – g"),
+    "frictionless pair": (
+        _ball(rest="<contact><pair geom1='g' geom2='floor' friction='0 0 0 0 0'/></contact>"),
+        "friction of floor – g"),
+}  # fmt: skip
+
+
+def _velocities(model, steps=8):
+    data = mujoco.MjData(model)
+    data.qvel[:] = np.linspace(0.5, -0.7, model.nv)
+    data.ctrl[:] = 0.7
+    velocities = []
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        velocities.append(data.qvel.copy())
+    return np.array(velocities)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", EXACT)
+def test_a_conversion_is_reported_and_moves_the_same(case):
+    """C MuJoCo steps the file and the converted model."""
+    source, what = EXACT[case]
+    scene = load_scene(source)
+    assert [c.what for c in scene.conversions] == [what]
+    assert scene.conversions[0].exact
+    given = _velocities(mujoco.MjModel.from_xml_string(source))
+    # Iterative solvers stop early by their own measure, so CG and PGS agree less closely.
+    tolerance = 1e-6 if what == "solver" else 1e-12
+    np.testing.assert_allclose(_velocities(scene.mj_model), given, atol=tolerance)
+
+
+@pytest.mark.parametrize("case", ["no springs", "no dampers", "neither", "actuator inertia"])
+def test_mjx_moves_the_converted_scene_as_c_mujoco_does_and_only_that(case):
+    source, _ = EXACT[case]
+    model = mujoco.MjModel.from_xml_string(source)
+    given = _velocities(model)
+    step = jax.jit(mjx.step)
+
+    def roll(mjx_model, data):
+        data = data.replace(qvel=jnp.linspace(0.5, -0.7, model.nv), ctrl=jnp.full(model.nu, 0.7))
+        velocities = []
+        for _ in given:
+            data = step(mjx_model, data)
+            velocities.append(np.array(data.qvel))
+        return np.array(velocities)
+
+    scene = load_scene(source)
+    np.testing.assert_allclose(roll(scene.model, scene.data), given, atol=1e-8)
+    plain = roll(mjx.put_model(model), mjx.make_data(model))
+    assert not np.allclose(plain, given, atol=1e-4)
+
+
+def test_pgs_with_elliptic_cones_does_not_reach_the_optimum_and_is_warned_about():
+    source = BOX.format(option="solver='PGS' cone='elliptic' iterations='10000' tolerance='0'")
+    with pytest.warns(SceneWarning, match="solver: Newton instead of PGS.*stops short"):
+        scene = load_scene(source)
+    given = _velocities(mujoco.MjModel.from_xml_string(source))
+    assert np.abs(_velocities(scene.mj_model) - given).max() > 1e-2
+
+
+def test_sleep_is_warned_about():
+    with pytest.warns(SceneWarning, match="flag sleep: disable instead of enable"):
+        load_scene(_ball(flag="<flag sleep='enable'/>"))
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    ["<position kv='2' forcerange='-.1 .1' {}/>",
+     "<general gaintype='affine' gainprm='1 0 -2' ctrlrange='-.1 .1' ctrllimited='true' {}/>",
+     "<muscle lengthrange='-1 1' {}/>"],
+)  # fmt: skip
+def test_implicitfast_with_limited_actuators_is_warned_about(actuator):
+    rest = "<actuator>" + actuator.format("name='a' joint='j'") + "</actuator>"
+    with pytest.warns(SceneWarning, match="integrator at actuator 'a'.*derivative ignores"):
+        load_scene(_pendulum(option="integrator='implicitfast'", rest=rest))
+
+
+def test_implicitfast_with_a_free_body_is_warned_about():
+    with pytest.warns(SceneWarning, match="gyroscopic derivative"):
+        load_scene(BOX.format(option="integrator='implicitfast'"))
+
+
+def test_the_search_on_distance_fields_is_warned_about_because_its_normal_is_off():
+    source = """
+    <mujoco>
+      <worldbody>
+        <geom name="can" type="cylinder" size="0.2 0.1"/>
+        <body pos="0.15 0.02 0.19"><freejoint/><geom name="ball" size="0.1"/></body>
+      </worldbody>
+    </mujoco>
+    """
+    with pytest.warns(SceneWarning, match=r"'ball' \(sphere\) with 'can' \(cylinder\).*distance"):
+        scene = load_scene(source)
+    data = jax.jit(lambda m, d: mjx.collision(m, mjx.kinematics(m, d)))(scene.model, scene.data)
+    # The ball lies on the flat top, so the true normal is vertical.
+    normal = np.abs(np.array(data._impl.contact.frame[0, 0, 2]))
+    assert np.degrees(np.arccos(normal)) > 10
+
+
+def test_a_sensor_that_mjx_lacks_is_warned_about_and_the_others_stay():
+    sensors = (
+        "<sensor><jointpos joint='j'/><e_potential name='energy'/>"
+        "<jointvel name='late' joint='j' delay='0.02' nsample='5'/></sensor>"
+    )
+    with pytest.warns(SceneWarning, match="reads 0") as said:
+        scene = load_scene(_pendulum(rest=sensors))
+    assert ["'energy'" in str(said[0].message), "'late'" in str(said[1].message)] == [True, True]
+    data = scene.data.replace(qpos=jnp.array([0.3]), time=jnp.array(1.0))
+    data = jax.jit(lambda m, d: mjx.sensor_pos(m, mjx.kinematics(m, d)))(scene.model, data)
+    np.testing.assert_array_equal(data.sensordata, [0.3, 0, 0])
+    # The C model keeps all three.
+    assert mujoco.mjtSensor.mjSENS_E_POTENTIAL in scene.mj_model.sensor_type
+
+
+def test_frictionless_contacts_beside_elliptic_ones_have_rows_of_both_kinds():
+    source = """
+    <mujoco>
+      <option cone="elliptic"/>
+      <worldbody>
+        <geom type="plane" size="1 1 1" condim="1"/>
+        <body pos="0 0 0.09"><freejoint/><geom size="0.1" condim="1"/></body>
+        <body pos="1 0 0.09"><freejoint/><geom size="0.1" condim="4"/></body>
+      </worldbody>
+    </mujoco>
+    """
+    scene = load_scene(source)
+    with pytest.raises(NotImplementedError, match="condim=1"):
+        mjx.make_data(scene.mj_model)
+    kinds = mujoco.mjtConstraint
+    # One frictionless pair, then two pairs of condim 4, ball on floor and ball on ball.
+    expected = [kinds.mjCNSTR_CONTACT_FRICTIONLESS] + 8 * [kinds.mjCNSTR_CONTACT_ELLIPTIC]
+    assert [int(t) for t in scene.data._impl.efc_type] == [int(t) for t in expected]
+    np.testing.assert_array_equal(scene.data._impl.contact.efc_address, [0, 1, 5])
+    assert scene.data._impl.efc_J.shape == (9, 12)

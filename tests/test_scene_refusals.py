@@ -1,0 +1,178 @@
+"""What MJX cannot simulate is refused by name, and for a reason."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad._mjx import mjx
+from mjxgrad.scene import SceneError, load_scene
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
+  {asset}
+  <worldbody>
+    <site name="top" pos="0 0 1"/>
+    <body name="b" pos="0 0 0.5">
+      <joint name="j" axis="0 1 0" {joint}/>
+      <geom name="g" type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0" {geom}/>
+      <site name="s" pos="0.3 0 0"/>
+    </body>
+  </worldbody>
+  {rest}
+</mujoco>
+"""
+BALL = """
+<mujoco>
+  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
+  {asset}
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+    <body name="b" pos="0 0 0.095"><freejoint/><geom name="g" size="0.1" {geom}/></body>
+    {body}
+  </worldbody>
+  {rest}
+</mujoco>
+"""
+FIXED_TENDON = "<tendon><fixed name='t' {}><joint joint='j' coef='1'/></fixed></tendon>"
+TETRAHEDRON = "<asset><mesh name='m' vertex='0 0 0 .1 0 0 0 .1 0 0 0 .1'/></asset>"
+
+
+def _fill(template, **parts):
+    blank = dict.fromkeys(("option", "flag", "asset", "joint", "geom", "rest", "body"), "")
+    return template.format(**(blank | parts))
+
+
+def _actuator(attributes, kind="motor", target="joint='j'"):
+    return f"<actuator><{kind} name='a' {target} {attributes}/></actuator>"
+
+
+# Source, what the message must name, and its remedy.
+REFUSED = {
+    "implicit": (_fill(PENDULUM, option="integrator='implicit'"), "integrator='implicit'", "RK4"),
+    "discrete": (_fill(PENDULUM, option="integrator='discrete'"), "integrator='discrete'", "RK4"),
+    "override": (_fill(BALL, flag="<flag override='enable'/>"), "<flag override", "o_solref"),
+    "diagexact": (_fill(BALL, flag="<flag diagexact='enable'/>"), "<flag diagexact", "remove"),
+    "noslip": (_fill(BALL, option="noslip_iterations='9'"), "noslip_iterations=9", "impratio"),
+    "noslip for friction loss": (
+        _fill(PENDULUM, option="noslip_iterations='9'", joint="frictionloss='1'"),
+        "noslip_iterations=9", "impratio"),
+    "joint stiffness polynomial": (
+        _fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
+    "joint damping polynomial": (
+        _fill(PENDULUM, joint="damping='1 2 3'"), "joint 'j'", "linear coefficient"),
+    "tendon stiffness polynomial": (
+        _fill(PENDULUM, rest=FIXED_TENDON.format("stiffness='1 2 3'")), "tendon 't'", "linear"),
+    "tendon damping polynomial": (
+        _fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
+    "actuator damping polynomial": (
+        _fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
+    "surface velocity": (_fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
+    "adhesion of a geom": (_fill(BALL, geom="adhesion='5'"), "geom 'g'", "remove"),
+    "adhesion of a pair": (
+        _fill(BALL, rest="<contact><pair name='p' geom1='g' geom2='floor' adhesion='3'/></contact>"),
+        "pair 'p'", "remove"),
+    "ellipsoid fluid": (
+        _fill(PENDULUM, option="density='100'", geom="fluidshape='ellipsoid'"), "geom 'g'",
+        "fluidshape='none'"),
+    "fluid and implicitfast": (
+        _fill(PENDULUM, option="density='100' integrator='implicitfast'"), "density=100", "Euler"),
+    "slider crank": (
+        _fill(PENDULUM, rest=_actuator("cranksite='s' slidersite='top' cranklength='2'", target="")),
+        "actuator 'a' (slidercrank)", "joint, tendon or site"),
+    "adhesion actuator": (
+        _fill(BALL, rest=_actuator("body='b' ctrlrange='0 1'", "adhesion", "")),
+        "actuator 'a' (body)", "joint, tendon or site"),
+    "user dynamics": (
+        _fill(PENDULUM, rest=_actuator("dyntype='user' actdim='1'", "general")),
+        "actuator 'a' (user)", "filterexact"),
+    "user gain": (
+        _fill(PENDULUM, rest=_actuator("gaintype='user'", "general")), "actuator 'a' (user)",
+        "affine"),
+    "user bias": (
+        _fill(PENDULUM, rest=_actuator("biastype='user'", "general")), "actuator 'a' (user)",
+        "affine"),
+    "disabled actuator group": (
+        _fill(PENDULUM, option="actuatorgroupdisable='1'", rest=_actuator("group='1'")),
+        "actuator 'a'", "actuatorgroupdisable"),
+    "early activation": (
+        _fill(PENDULUM,
+              rest=_actuator("dyntype='filter' dynprm='0.1' actearly='true'", "general")),
+        "actuator 'a'", "actearly"),
+    "delay": (
+        _fill(PENDULUM, rest=_actuator("delay='0.02' nsample='5'")), "actuator 'a'", "nsample"),
+    "mixed solref": (
+        _fill(BALL, geom="solref='0.02 -5'"), "0.02 -5 in geom_solref of geom 'g'", "positive"),
+    "mixed solref of an equality": (
+        _fill(PENDULUM, rest="<equality><joint name='e' joint1='j' solref='0.02 -5'/></equality>"),
+        "0.02 -5 in eq_solref of equality 'e'", "positive"),
+    "limit at both ends": (
+        _fill(PENDULUM, joint="range='-5 5' limited='true' margin='0.1'"), "joint 'j'", "half"),
+    "tendon limit at both ends": (
+        _fill(PENDULUM, rest=FIXED_TENDON.format("range='-.1 .1' limited='true' margin='.2'")),
+        "tendon 't'", "half"),
+    "cylinder with box": (
+        _fill(BALL, body="<body pos='0 0 1'><freejoint/><geom name='can' type='cylinder' "
+              "size='.1 .1'/></body><geom name='wall' type='box' size='.1 .1 .1'/>"),
+        "'can' (cylinder) with 'wall' (box)", "<exclude>"),
+    "mesh with margin": (
+        _fill(BALL, asset=TETRAHEDRON, body="<body pos='0 0 1'><freejoint/><geom name='stone' "
+              "type='mesh' mesh='m' margin='.01'/></body>"),
+        "'floor' (plane) with 'stone' (mesh)", "margin='0'"),
+    "flex": (
+        _fill(BALL, body="<body name='rag' pos='0 0 2'><flexcomp name='cloth' type='grid' count='2 2 1' "
+              "spacing='.1 .1 .1' dim='2' mass='1'/></body>"), "flex 'cloth'", "rigid"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("feature", REFUSED)
+def test_refusal_names_the_culprit_and_the_remedy(feature):
+    source, culprit, remedy = REFUSED[feature]
+    with pytest.raises(SceneError) as error:
+        load_scene(source)
+    message = str(error.value)
+    assert culprit in message
+    assert remedy in message
+
+
+def test_an_excluded_pair_is_no_obstacle():
+    source = REFUSED["cylinder with box"][0].replace("name='wall'", "name='wall' conaffinity='0'")
+    source = source.replace("name='wall'", "name='wall' contype='0'")
+    assert load_scene(source).mj_model.ngeom == 4
+
+
+def test_with_contact_disabled_no_pair_is_an_obstacle():
+    source = REFUSED["cylinder with box"][0].replace(
+        "></option>", "><flag contact='disable'/></option>"
+    )
+    assert load_scene(source).pairs == ()
+
+
+def test_unused_settings_are_no_obstacle():
+    # An ellipsoid fluid shape without fluid, noslip without friction, a group without actuators.
+    load_scene(_fill(PENDULUM, geom="fluidshape='ellipsoid'"))
+    load_scene(_fill(PENDULUM, option="noslip_iterations='9'"))
+    load_scene(_fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))
+    load_scene(_fill(PENDULUM, flag="<flag diagexact='enable'/>"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("feature", sorted(set(REFUSED) - {"flex", "mesh with margin"}))
+def test_a_refused_feature_raises_or_moves_differently_in_plain_mjx(feature):
+    """Once this fails, MJX has learnt the feature and its refusal can go."""
+    model = mujoco.MjModel.from_xml_string(REFUSED[feature][0])
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.7
+    data.qvel[:] = np.linspace(0.5, -0.7, model.nv)
+    try:
+        theirs = mjx.put_model(model)
+        ours = mjx.make_data(model).replace(ctrl=jnp.array(data.ctrl), qvel=jnp.array(data.qvel))
+        step = jax.jit(mjx.step)
+        for _ in range(8):
+            mujoco.mj_step(model, data)
+            ours = step(theirs, ours)
+    except NotImplementedError:
+        return
+    assert np.abs(np.array(ours.qvel) - data.qvel).max() > 1e-6

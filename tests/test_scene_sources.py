@@ -1,0 +1,130 @@
+"""What `load_scene` takes, and what it says when it cannot."""
+
+import subprocess
+import sys
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad.scene import SceneError, load_scene
+
+FALLING = """
+<mujoco>
+  <worldbody>
+    <body name="b"><joint name="j" type="slide" axis="0 0 1"/><geom name="g" size="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def falling_file(tmp_path):
+    path = tmp_path / "falling.xml"
+    path.write_text(FALLING)
+    return path
+
+
+def test_file_string_and_model_give_the_same_scene(falling_file):
+    model = mujoco.MjModel.from_xml_string(FALLING)
+    scenes = [load_scene(source) for source in (falling_file, str(falling_file), FALLING, model)]
+    for scene in scenes:
+        assert scene.mj_model.nv == 1
+        np.testing.assert_array_equal(scene.model.body_mass, model.body_mass)
+
+
+def test_a_model_given_is_not_changed():
+    model = mujoco.MjModel.from_xml_string(FALLING)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY.value
+    scene = load_scene(model, timestep=0.25)
+    assert model.opt.timestep == 0.002
+    assert model.opt.enableflags
+    assert scene.mj_model.opt.timestep == scene.model.opt.timestep == 0.25
+
+
+def test_every_leaf_is_an_array_of_the_default_precision():
+    scene = load_scene(FALLING)
+    leaves = jax.tree.leaves((scene.model, scene.data))
+    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    assert scene.model.body_mass.dtype == scene.data.qpos.dtype == np.result_type(float)
+
+
+def test_the_template_stands_at_the_reference_pose():
+    scene = load_scene(FALLING.replace('axis="0 0 1"', 'axis="0 0 1" ref="0.7"'))
+    np.testing.assert_allclose(scene.data.qpos, [0.7])
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(
+        FileNotFoundError, match=r"source must be .*got '.*nowhere\.xml'.*not exist"
+    ):
+        load_scene(tmp_path / "nowhere.xml")
+
+
+def test_a_folder_is_no_scene(tmp_path):
+    with pytest.raises(IsADirectoryError, match="got the folder"):
+        load_scene(tmp_path)
+
+
+def test_something_else_is_no_scene():
+    # In a process of its own, because here the run-time type check is quicker to refuse.
+    code = "import mjxgrad.scene as s\ntry:\n  s.load_scene(3)\nexcept TypeError as e:\n  print(e)"
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert said.startswith("source must be an MJCF file")
+    assert said.endswith("got int\n")
+
+
+def test_malformed_mjcf_is_answered_in_the_words_of_mujoco(falling_file):
+    falling_file.write_text(FALLING.replace('type="slide"', 'type="slyde"'))
+    with pytest.raises(SceneError, match=r"falling\.xml must be MJCF .* says: .*slyde") as error:
+        load_scene(falling_file)
+    assert "\n" not in str(error.value)
+
+
+def test_a_scene_in_which_nothing_can_move_is_refused():
+    with pytest.raises(SceneError, match=r"got none \(nv = 0\).*give a body a joint"):
+        load_scene("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+
+
+@pytest.mark.parametrize("timestep", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_timestep_must_be_positive(timestep):
+    with pytest.raises(ValueError, match="timestep must be positive"):
+        load_scene(FALLING, timestep=timestep)
+
+
+def test_several_unsupported_features_are_named_at_once():
+    source = FALLING.replace("<worldbody>", "<option integrator='implicit'/><worldbody>").replace(
+        'name="g"', 'name="g" surfacevel="1 0 0 0 0 0"'
+    )
+    with pytest.raises(SceneError, match="for 2 reasons") as error:
+        load_scene(source)
+    assert "integrator='implicit'" in str(error.value)
+    assert "geom 'g'" in str(error.value)
+
+
+def test_importing_prints_nothing():
+    command = [sys.executable, "-c", "import mjxgrad.scene"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == ""
+
+
+def test_float32_asks_for_no_more_than_it_resolves():
+    # Precision is a global switch of JAX, so the other one needs a process of its own.
+    code = (
+        "import sys, mjxgrad.scene as s\n"
+        f"scene = s.load_scene('''{FALLING}''')\n"
+        f"kept = s.load_scene('''{FALLING}''', keep_everything=True)\n"
+        "print(scene.data.qpos.dtype, scene.model.opt.tolerance, kept.model.opt.tolerance)\n"
+        "print([c.what for c in scene.conversions])"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        "import jax; jax.config.update('jax_enable_x64', False)\n" + code,
+    ]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
+    dtype, raised, kept = output[0].split()
+    assert dtype == "float32"
+    np.testing.assert_allclose([float(raised), float(kept)], [1e-6, 1e-8], rtol=1e-6)
+    assert "tolerance" in output[1]
