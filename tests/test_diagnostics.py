@@ -220,3 +220,15 @@ def test_samples_that_are_not_finite_do_not_enter_a_bootstrap():
     spoiled = np.concatenate([samples, [[np.nan], [np.inf]]])
     np.testing.assert_array_equal(bootstrap_variance_interval(spoiled), bootstrap_variance_interval(samples))
     assert np.isnan(bootstrap_variance_interval(spoiled[-3:])).all()
+
+
+def test_points_have_noise_of_their_own_and_softnesses_share_it():
+    table = bias_variance(
+        lambda scale: parameter_noise(lambda x: scale * textbook.quadratic_sine(x), STDDEV),
+        jnp.array([[0.3], [0.3]]),
+        jax.random.key(4),
+        softness=jnp.array([1.0, 2.0]),
+        num_samples=8,
+    )
+    assert (table.first.value[:, 0] != table.first.value[:, 1]).all()
+    np.testing.assert_allclose(table.first.value[1], 2 * table.first.value[0], rtol=1e-9)

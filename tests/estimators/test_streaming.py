@@ -144,3 +144,24 @@ def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(ke
     halved.defvjp(lambda x: (x[0] ** 2, x), lambda x, g: (jnp.array([g * x[0]]),))
     estimate = first_order(parameter_noise(halved, 0.1), jnp.array([0.3]), key, num_samples=1000)
     assert abs(estimate.value[0] - 0.3) < 4 * estimate.standard_error[0]
+
+
+@pytest.mark.parametrize("antithetic", [False, True])
+@pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
+def test_each_baseline_is_what_it_is_called(key, baseline, antithetic):
+    """The formula, term by term, from the same noise: g = mean of (f - b) s."""
+    point, units = 0.3, 10 // (1 + antithetic)
+    objective = parameter_noise(textbook.quadratic_sine, 0.1, dim=1)
+    noise = np.array([objective.sample_noise(jax.random.fold_in(key, i))[0] for i in range(units)])
+    noise = np.stack([noise, -noise] if antithetic else [noise], axis=1)
+    x = point + noise
+    costs, scores = x**2 + 0.1 * np.sin(20 * x), noise / 0.01
+    others = (costs.mean(axis=1).sum() - costs.mean(axis=1)) / (units - 1)
+    baselines = {"leave_one_out": others, "zero_noise": point**2 + 0.1 * np.sin(20 * point), "none": 0.0}
+    terms = ((costs - np.broadcast_to(baselines[baseline], units)[:, None]) * scores).mean(axis=1)
+    estimate = zeroth_order(
+        objective, jnp.array([point]), key, num_samples=10, baseline=baseline, antithetic=antithetic
+    )
+    np.testing.assert_allclose(estimate.value[0], terms.mean(), rtol=1e-9)
+    if baseline != "leave_one_out":
+        np.testing.assert_allclose(estimate.standard_error[0], terms.std(ddof=1) / np.sqrt(units), rtol=1e-9)
