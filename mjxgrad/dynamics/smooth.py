@@ -159,7 +159,9 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     centre = sums[:, :3] / jnp.where(is_massless, 1.0, sums[:, 3:])
     centre = jnp.where(is_massless, data.xipos, centre)
     offset = data.xipos - pick(model.body_rootid, centre)
-    central = contract("nij,nj,nkj->nik", data.ximat, model.body_inertia, data.ximat)
+    central = spatial.compose(
+        data.ximat * model.body_inertia[:, None], data.ximat.transpose(0, 2, 1)
+    )
     inertia = spatial.inertia_about(offset, mass, central)
     return data.tree_replace(
         {"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)}
@@ -230,7 +232,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     below = tree.descendants(model)
     below[0] = 0
     carried = combine(below[model.dof_bodyid], data._impl.cinert)
-    momentum = contract("nij,nj->ni", spatial.inertia_matrix(carried), data.cdof)
+    momentum = spatial.momentum(carried, data.cdof)
     products = contract("ik,jk->ij", momentum, data.cdof)
     is_pair = np.zeros((model.nv, model.nv))
     is_pair[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = 1
@@ -256,10 +258,9 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
         acceleration += jnp.concatenate([jnp.zeros_like(upwards), upwards])
-    inertia = spatial.inertia_matrix(data._impl.cinert)
-    both = jnp.stack([acceleration, data.cvel], axis=-1)
-    both = contract("nij,njk->nik", inertia, both)
-    force = both[..., 0] + spatial.cross_force(data.cvel, both[..., 1])
+    inertia = data._impl.cinert
+    rate = spatial.cross_force(data.cvel, spatial.momentum(inertia, data.cvel))
+    force = spatial.momentum(inertia, acceleration) + rate
     return data.replace(qfrc_bias=generalised_force(model, data, force))
 
 
@@ -268,4 +269,4 @@ def generalised_force(
 ) -> Float[Array, " nv"]:
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
-    return contract("ni,ni->n", data.cdof, carried)
+    return spatial.dot(data.cdof, carried)

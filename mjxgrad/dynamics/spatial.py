@@ -1,9 +1,4 @@
-"""Rotations, cross products and inertias as products with constant tables.
-
-Every operation here is bilinear. It is written as one product with a constant table, which arranges the first factor as
-a small matrix, and one product of that matrix with the second factor. The derivatives of matrix products are matrix products, so
-reverse mode needs no more than twice the instructions of the function. Written in components, as `jnp.cross` is, the same
-derivative is a sum of padded slices, which XLA fuses by computing the inputs again for each of them.
+"""Rotations, cross products and inertias of many bodies at once.
 
 Motions are (angular, linear), forces (torque, force), about one point for a whole kinematic tree and in world axes. All
 functions take one leading axis of items.
@@ -14,64 +9,75 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad.dynamics.bilinear import Bilinear
 
-def _quaternion_tables() -> tuple[np.ndarray, np.ndarray]:
-    """Return tables L, R with p q = L(p) q and p q = R(q) p."""
-    left = np.zeros((4, 4, 4))
-    for i in range(4):
-        left[0, i, i] = 1
-    for i in (1, 2, 3):
-        left[i, i, 0], left[i, 0, i] = 1, -1
-    for i, j, k in ((1, 2, 3), (2, 3, 1), (3, 1, 2)):
-        left[i, k, j], left[j, k, i] = 1, -1
-    return left, left.transpose(2, 1, 0)
-
-
-def _motion_table(cross: np.ndarray) -> np.ndarray:
-    """Return the table of v × m: (ω × m_ω, ω × m_v + v × m_ω)."""
-    table = np.zeros((6, 6, 6))
-    table[:3, :3, :3] = table[:3, 3:, 3:] = table[3:, 3:, :3] = cross
-    return table
-
-
-def _inertia_table(cross: np.ndarray) -> np.ndarray:
-    """Return the 6 × 6 matrix of an inertia (xx, yy, zz, xy, xz, yz, m c, m)."""
-    table = np.zeros((10, 6, 6))
-    for entry, (i, j) in enumerate(_ENTRIES):
-        table[entry, i, j] = table[entry, j, i] = 1
-    table[6:9, :3, 3:] = cross
-    table[6:9, 3:, :3] = -cross
-    table[9, 3:, 3:] = np.eye(3)
-    return table
-
-
-def _offset_table() -> np.ndarray:
-    """Return the table from (inertia about the centre of mass, m o oᵀ, m o, m) to an inertia, o the centre of mass."""
-    table = np.zeros((22, 10))
-    for entry, (i, j) in enumerate(_ENTRIES):
-        table[3 * i + j, entry] = 1
-        table[9 + 3 * i + j, entry] -= 1
-        if i == j:  # m |o|² on the diagonal
-            table[[9, 13, 17], entry] += 1
-    table[18:, 6:] = np.eye(4)
-    return table
-
-
+_CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+# Entries of a symmetric matrix in the order in which MuJoCo keeps those of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-_LEFT, _RIGHT = _quaternion_tables()
-_CONJUGATE = np.diag([1.0, -1.0, -1.0, -1.0])
-# q v q* in two halves: the imaginary rows of L(q) and the imaginary columns of R(q*).
-_ROTATION = np.concatenate(
-    [
-        _LEFT[:, 1:].reshape(4, 12),
-        _CONJUGATE @ _RIGHT[:, :, 1:].reshape(4, 12),
-    ],
-    axis=1,
-)
-_CROSS = _LEFT[1:, 1:, 1:]
-_MOTION = _motion_table(_CROSS)
-_INERTIA = _inertia_table(_CROSS)
-_OFFSET = _offset_table()
+
+
+def _cross_table() -> np.ndarray:
+    table = np.zeros((3, 3, 3))
+    for i, j, k in _CYCLES:
+        table[k, i, j], table[k, j, i] = 1, -1
+    return table
+
+
+def _quaternion_table() -> np.ndarray:
+    """Return the table of the Hamilton product of (w, x, y, z)."""
+    table = np.zeros((4, 4, 4))
+    table[1:, 1:, 1:] = _CROSS
+    for i in range(4):
+        table[i, 0, i] = table[i, i, 0] = 1
+        table[0, i, i] = 1 if i == 0 else -1
+    return table
+
+
+def _rotation_table() -> np.ndarray:
+    """Return the table of the matrix of v ↦ q v q*, with each pair of entries of q once."""
+    conjugate = np.array([1, -1, -1, -1])
+    turned = np.einsum("man,nlb,b->malb", _QUATERNION, _QUATERNION, conjugate)
+    table = turned[1:, :, 1:].transpose(0, 2, 1, 3).reshape(9, 4, 4)
+    return np.triu(table + np.tril(table, -1).transpose(0, 2, 1))
+
+
+def _motion_table() -> np.ndarray:
+    """Return the table of v × m = (ω × m_ω, ω × m_v + v × m_ω)."""
+    table = np.zeros((6, 6, 6))
+    table[:3, :3, :3] = table[3:, :3, 3:] = table[3:, 3:, :3] = _CROSS
+    return table
+
+
+def _momentum_table() -> np.ndarray:
+    """Return the table of inertia times motion, (I ω + h × v, m v - h × ω), h the mass times its offset."""
+    table = np.zeros((6, 10, 6))
+    for entry, (i, j) in enumerate(_ENTRIES):
+        table[i, entry, j] = table[j, entry, i] = 1
+    table[:3, 6:9, 3:] = _CROSS
+    table[3:, 6:9, :3] = -_CROSS
+    table[3:, 9, 3:] = np.eye(3)
+    return table
+
+
+def _steiner_table() -> np.ndarray:
+    """Return the table of |o|² m - o (m o)ᵀ, as entries, from o and m o."""
+    table = np.zeros((6, 3, 3))
+    for entry, (i, j) in enumerate(_ENTRIES):
+        table[entry, i, j] -= 1
+        if i == j:
+            table[entry] += np.eye(3)
+    return table
+
+
+_CROSS = _cross_table()
+_QUATERNION = _quaternion_table()
+_cross = Bilinear(_CROSS)
+_multiply = Bilinear(_QUATERNION)
+_rotation = Bilinear(_rotation_table())
+_cross_motion = Bilinear(_motion_table())
+_cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
+_momentum = Bilinear(_momentum_table())
+_steiner = Bilinear(_steiner_table())
 
 
 def contract(subscripts: str, *factors: Array) -> Array:
@@ -100,14 +106,14 @@ def pick(
     return selected + jnp.asarray(missing * default, x.dtype)
 
 
-def _arrange(x: Float[Array, "n a"], table: np.ndarray) -> Float[Array, "n b c"]:
-    flat = jnp.asarray(table.reshape(len(table), -1), x.dtype)
-    return jnp.matmul(x, flat, precision="highest").reshape(-1, *table.shape[1:])
+def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
+    """Return the scalar product of each item."""
+    return Bilinear(np.eye(a.shape[1])[None])(a, b)[:, 0]
 
 
 def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Return items times a factor each."""
-    return contract("n,nk->nk", factor, x)
+    return Bilinear(np.eye(x.shape[1])[:, None])(factor[:, None], x)
 
 
 def rotate(matrix: Float[Array, "n 3 3"], x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -122,41 +128,38 @@ def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, 
 
 def cross(a: Float[Array, "n 3"], b: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Return a × b."""
-    return rotate(_arrange(a, _CROSS), b)
+    return _cross(a, b)
 
 
 def multiply(p: Float[Array, "n 4"], q: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z)."""
-    return contract("nij,nj->ni", _arrange(p, _LEFT), q)
+    return _multiply(p, q)
 
 
 def rotation_matrix(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
-    """Return v ↦ q v q*, the rotation of a unit quaternion; quadratic in q whatever its norm."""
-    halves = jnp.matmul(q, jnp.asarray(_ROTATION, q.dtype), precision="highest")
-    left, right = halves[:, :12].reshape(-1, 3, 4), halves[:, 12:].reshape(-1, 4, 3)
-    return contract("nij,njk->nik", left, right)
+    """Return the matrix of v ↦ q v q*, a rotation if q has norm one; quadratic in q whatever its norm."""
+    return _rotation(q, q).reshape(-1, 3, 3)
 
 
 def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Return items of norm one; zero stays zero, with derivative one."""
-    square = contract("nk,nk->n", q, q)
-    is_zero = square == 0
-    return scale(jax.lax.rsqrt(jnp.where(is_zero, 1.0, square)), q)
+    square = dot(q, q)
+    return scale(jax.lax.rsqrt(jnp.where(square == 0, 1.0, square)), q)
 
 
 def cross_motion(v: Float[Array, "n 6"], motion: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
     """Return v × motion, the rate of a motion fixed to a body of velocity v."""
-    return contract("nij,nj->ni", _arrange(v, _MOTION), motion)
+    return _cross_motion(v, motion)
 
 
 def cross_force(v: Float[Array, "n 6"], force: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
     """Return v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
-    return -contract("nji,nj->ni", _arrange(v, _MOTION), force)
+    return _cross_force(v, force)
 
 
-def inertia_matrix(inertia: Float[Array, "n 10"]) -> Float[Array, "n 6 6"]:
-    """Return the matrix from motion to momentum."""
-    return _arrange(inertia, _INERTIA)
+def momentum(inertia: Float[Array, "n 10"], motion: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
+    """Return inertia times motion."""
+    return _momentum(inertia, motion)
 
 
 def inertia_about(
@@ -173,8 +176,6 @@ def inertia_about(
         Rotational inertia about the point (xx, yy, zz, xy, xz, yz), mass times offset, and mass.
     """
     moment = scale(mass, offset)
-    second = contract("ni,nj->nij", moment, offset)
-    parts = [central.reshape(-1, 9), second.reshape(-1, 9), moment, mass[:, None]]
-    return jnp.matmul(
-        jnp.concatenate(parts, axis=1), jnp.asarray(_OFFSET, offset.dtype), precision="highest"
-    )
+    flat = central.reshape(-1, 9)
+    entries = jnp.concatenate([flat[:, ::4], flat[:, 1:3], flat[:, 5:6]], axis=1)
+    return jnp.concatenate([entries + _steiner(offset, moment), moment, mass[:, None]], axis=1)
