@@ -112,7 +112,7 @@ class OpenLoop(Objective):
 
     task: Task
     stddev: Float[Array, "..."]
-    dim: int = eqx.field(static=True)
+    dim: int | None = eqx.field(static=True)
 
     def ravel(self, controls: Float[Array, "horizon nu"]) -> Float[Array, " dim"]:
         """Flatten controls to parameters."""
@@ -209,7 +209,7 @@ def parameter_noise(
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {stddev.shape}")
     if stddev.ndim == 1:
         dim = stddev.shape[0]
-    return ParameterNoise(_as_pytree(function), stddev, dim)
+    return ParameterNoise(function=_as_pytree(function), stddev=stddev, dim=dim)
 
 
 def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
@@ -230,7 +230,7 @@ def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
             controls.
     """
     stddev = _action_stddev(task, stddev)
-    return OpenLoop(task, stddev, task.horizon * task.num_controls)
+    return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
 
 
 def closed_loop(
@@ -267,10 +267,14 @@ def closed_loop(
         reinforcement learning. Machine Learning 8, 1992, theorem 1.
     """
     stddev = _action_stddev(task, stddev)
-    if params is None:
-        return ClosedLoop(task, _as_pytree(policy), stddev, _unchanged, None)
-    flat, unravel = ravel_pytree(params)
-    return ClosedLoop(task, _as_pytree(policy), stddev, unravel, flat.size)
+    flat, unravel = (None, _unchanged) if params is None else ravel_pytree(params)
+    return ClosedLoop(
+        task=task,
+        policy=_as_pytree(policy),
+        stddev=stddev,
+        unravel=unravel,
+        dim=None if flat is None else flat.size,
+    )
 
 
 def _unchanged(params: Float[Array, " dim"]) -> Float[Array, " dim"]:
@@ -289,8 +293,9 @@ def _scalar(value: Array, name: str) -> Float[Array, ""]:
 
 def _as_pytree(function: Callable) -> Callable:
     """Wrap a plain function so that an objective is a pytree of arrays, fit for jit and vmap."""
-    is_pytree = isinstance(function, eqx.Module | jax.tree_util.Partial)
-    return function if is_pytree else jax.tree_util.Partial(function)
+    if isinstance(function, eqx.Module):
+        return function  # pyright: ignore[reportReturnType]
+    return function if isinstance(function, jax.tree_util.Partial) else jax.tree_util.Partial(function)
 
 
 def _positive(stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:

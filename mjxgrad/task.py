@@ -59,7 +59,7 @@ class SceneTask(Task):
     horizon: int = eqx.field(static=True)
 
     @property
-    def num_controls(self) -> int:
+    def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Give the number of actuators."""
         return self.scene.model.nu
 

@@ -158,9 +158,11 @@ class _Measurement(eqx.Module):
         samples_key, reference_key = jax.random.split(key)
         samples = self._samples(objective, params, samples_key)
         first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), self.plan, self.baseline))(samples)
-        is_line = isinstance(objective, ParameterNoise) and objective.dim == 1
-        reference = self._line if is_line else self._long_run
-        return _Cell(first, zeroth, *reference(objective, params, reference_key)), samples
+        if isinstance(objective, ParameterNoise) and objective.dim == 1:
+            reference = self._line(objective, params, reference_key)
+        else:
+            reference = self._long_run(objective, params, reference_key)
+        return _Cell(first, zeroth, *reference), samples
 
     def _samples(self, objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray) -> Samples:
         """Roll out for both estimates, all points through one compiled body."""

@@ -1,5 +1,7 @@
 """The first-order estimate: the mean of the derivatives of the samples."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -54,8 +56,8 @@ def first_order_summary(samples: Samples) -> tuple[Moments, Moments]:
     return gradients, Moments.of(samples.costs.mean(axis=1), mask)
 
 
-def first_order_result(summary: tuple[Moments, Moments], plan: Plan) -> GradientEstimate:
-    """Turn what was kept into the estimate."""
+def first_order_result(summary: tuple[Any, ...], plan: Plan) -> GradientEstimate:
+    """Turn what `first_order_summary` kept into the estimate."""
     gradients, costs = summary
     return assemble(
         gradients.mean,

@@ -10,6 +10,7 @@ References:
 """
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ class Summary(eqx.Module):
     """What is kept of samples; all leaves zero means of none."""
 
     @abstractmethod
-    def merge(self, other: "Summary") -> "Summary":
+    def merge(self, other: Any) -> Any:
         """Give the summary of both sets of samples."""
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -83,15 +83,15 @@ class Samples(eqx.Module):
 
     Attributes:
         costs: one per rollout.
-        gradients: of the cost, or None.
-        scores: of the noise, or None.
+        gradients: of the cost; of length zero if not asked for.
+        scores: of the noise; likewise.
         is_noisy: False for units that fill up the last chunk and for the one without noise.
         is_noise_free: True for the one without noise.
     """
 
     costs: Float[Array, "units rollouts"]
-    gradients: Float[Array, "units rollouts dim"] | None
-    scores: Float[Array, "units rollouts dim"] | None
+    gradients: Float[Array, "units rollouts gradient_dim"]
+    scores: Float[Array, "units rollouts score_dim"]
     is_noisy: Bool[Array, " units"]
     is_noise_free: Bool[Array, " units"]
 
@@ -151,7 +151,7 @@ def stream(
     key: PRNGKeyArray,
     plan: Plan,
     summarise: Callable[[Samples], tuple[Summary, ...]],
-) -> tuple[Summary, ...]:
+) -> tuple[Any, ...]:
     """Roll out a plan chunk by chunk, keeping only summaries.
 
     Args:
@@ -198,17 +198,18 @@ def check_baseline(baseline: str) -> None:
 
 def _evaluate(
     objective: Objective, params: Float[Array, " dim"], noise: PyTree, plan: Plan
-) -> tuple[Float[Array, ""], Float[Array, " dim"] | None, Float[Array, " dim"] | None]:
+) -> tuple[Float[Array, ""], Float[Array, " gradient_dim"], Float[Array, " score_dim"]]:
     """Roll out once for all that is wanted of it."""
+    nothing = jnp.zeros(0, params.dtype)
 
-    def cost_and_score(at: Float[Array, " dim"]) -> tuple[Float[Array, ""], Array | None]:
+    def cost_and_score(at: Float[Array, " dim"]) -> tuple[Float[Array, ""], Array]:
         if plan.with_score:
             return objective.value_and_score(at, noise)
-        return objective.value(at, noise), None
+        return objective.value(at, noise), nothing
 
     if not plan.with_gradient:
         cost, score = cost_and_score(params)
-        return cost, None, score
+        return cost, nothing, score
     if params.size <= MOST_FORWARD_DIMENSIONS:
         try:
             return _forward(cost_and_score, params)
@@ -219,11 +220,11 @@ def _evaluate(
 
 
 def _forward(
-    cost_and_score: Callable[[Array], tuple[Array, Array | None]], params: Float[Array, " dim"]
-) -> tuple[Float[Array, ""], Float[Array, " dim"], Float[Array, " dim"] | None]:
+    cost_and_score: Callable[[Array], tuple[Array, Array]], params: Float[Array, " dim"]
+) -> tuple[Float[Array, ""], Float[Array, " dim"], Float[Array, " score_dim"]]:
     """Differentiate in forward mode, one tangent per parameter."""
 
-    def along(tangent: Float[Array, " dim"]) -> tuple[Array, Array, Array | None]:
+    def along(tangent: Float[Array, " dim"]) -> tuple[Array, Array, Array]:
         return jax.jvp(cost_and_score, (params,), (tangent,), has_aux=True)
 
     tangents = jnp.eye(params.size, dtype=params.dtype)

@@ -1,5 +1,7 @@
 """The zeroth-order estimate: the covariance of cost and score."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -71,8 +73,8 @@ def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Value]:
     return moments, Value(samples.noise_free_cost())
 
 
-def zeroth_order_result(summary: tuple[ScoreMoments, Value], plan: Plan, baseline: str) -> GradientEstimate:
-    """Turn what was kept into the estimate."""
+def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> GradientEstimate:
+    """Turn what `zeroth_order_summary` kept into the estimate."""
     moments, noise_free = summary
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
