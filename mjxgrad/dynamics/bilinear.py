@@ -1,11 +1,12 @@
 """Bilinear maps of short vectors whose reverse mode costs no more than the map.
 
-A cross product is written in components: slices, products, one concatenation. XLA fuses that into one loop. JAX's derivative of
-a slice, though, is a padded array, and the sum of many of those is what makes reverse mode slow. A batched matrix product
-instead keeps its factors, arranged as matrices, for the backward pass, and runs as one small product after another.
+A cross product is written in components: slices, products, one concatenation. XLA fuses that into one loop. JAX's
+derivative of a slice, though, is a padded array, and the sum of many of those is what makes reverse mode slow. A
+batched matrix product instead keeps one factor, arranged as a matrix, for the backward pass, and runs as one small
+product after another.
 
-So the map is a primitive of its own. Its transposes with respect to either factor are again bilinear maps of short vectors, with
-the same terms in another order; hence derivatives of every order and mode are such maps.
+So the map is a primitive of its own. Its transposes with respect to either factor are again bilinear maps of short
+vectors, with the same terms in another order; hence derivatives of every order and mode are such maps.
 """
 
 from collections.abc import Sequence

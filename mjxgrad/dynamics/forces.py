@@ -1,6 +1,6 @@
 """Actuation, passive and applied forces, for the models in which they are plain.
 
-Drop-ins for MJX's stages. Whatever a model has beyond joint transmissions, motors and position servos without dynamics, and joint springs
+Drop-ins for MJX's stages. Whatever a model has beyond actuators of hinges and slides without dynamics, joint springs
 and dampers, is left to MJX: each function says what.
 """
 

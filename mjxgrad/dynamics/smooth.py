@@ -1,12 +1,13 @@
 r"""Kinematics, inertia and bias forces: the smooth stages of a step, without recursion.
 
-MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes. Then
-nothing has to be transformed between bodies, and what is usually a recursion over the tree is a sum over ancestors or
-descendants: a product with a constant 0/1 matrix. Only orientations multiply; their products from the root are formed by
-doubling, in a number of rounds that is logarithmic in the depth of the tree.
+MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
+Then nothing has to be transformed between bodies, and what is usually a recursion over the tree is a sum over
+ancestors or descendants: a product with a constant 0/1 matrix. Only orientations multiply; their products from the
+root are formed by doubling, in a number of rounds that is logarithmic in the depth of the tree.
 
-MJX walks the tree level by level and gathers and scatters between levels, which reverse mode multiplies. The stages here fill the
-same fields of `mjx.Data` with the same values. One difference is meant: bodies fixed to a mocap body follow it, as in C MuJoCo.
+MJX walks the tree level by level and gathers and scatters between levels, which reverse mode multiplies. The stages
+here fill the same fields of `mjx.Data` with the same values. One difference is meant: bodies fixed to a mocap body
+follow it, as in C MuJoCo.
 
 References:
     Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.

@@ -108,13 +108,15 @@ def frames(model: mjx.Model) -> Frames:
             last = len(body) - 1
         of_body[b] = last
     return Frames(
-        *(np.array(x, int) for x in (body, joint, mocap)),
-        _jumps(np.array(previous, int)),
-        of_body,
-        before_body,
-        before_joint,
-        is_first,
-        after_joint,
+        body=np.array(body, int),
+        joint=np.array(joint, int),
+        mocap=np.array(mocap, int),
+        jumps=_jumps(np.array(previous, int)),
+        of_body=of_body,
+        before_body=before_body,
+        before_joint=before_joint,
+        is_first=is_first,
+        after_joint=after_joint,
     )
 
 
@@ -172,8 +174,8 @@ def moving_dofs(model: mjx.Model) -> np.ndarray:
 def earlier_dofs(model: mjx.Model) -> np.ndarray:
     """Return which joint velocities turn the axis of which other, (nv, nv).
 
-    Those of all joints before it. The three axes of a ball joint turn with its parent (`cdof_dot` is MuJoCo's convention, not
-    a total derivative); those of a free joint's rotation are counted after its translation.
+    Those of all joints before it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not the
+    total derivative); those of a free joint's rotation are counted after its translation.
     """
     moves, earlier = moving_dofs(model), np.zeros((model.nv, model.nv))
     for dof in range(model.nv):
