@@ -99,7 +99,9 @@ def _cone(
     return _Cone(tangent, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom)
 
 
-def _blocks(group: ConeGroup, x: Float[Array, "rows *batch"]) -> Float[Array, "contacts dim "]:
+def _blocks(
+    group: ConeGroup, x: Float[Array, "rows *rest"]
+) -> Float[Array, "contacts dim *rest"]:
     return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, implicit, linear, springs
+from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.newton import Problem
 
@@ -142,7 +143,7 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.ntendon:
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
-    data = mjx.collision(model, data)
+    data = collide(model, data)
     data = assembly.make_constraint(model, data)
     if model.nu:
         data = mjx.transmission(model, data)
