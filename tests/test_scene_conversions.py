@@ -76,7 +76,8 @@ EXACT = {
         _pendulum(rest=TENDON + "<actuator><motor name='a' tendon='t' gear='2' armature='0.5' "
                   "damping='0.3'/></actuator>"), "actuator 'a' armature, damping"),
     "frictionless pyramid": (_ball(friction="0 0 0"), "friction of floor – g"),
-    "frictionless cone": (_ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
+    "frictionless cone": (
+        _ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
     "rolls freely": (_ball(friction="1 0 0", condim=6), "friction of floor – g"),
     "frictionless pair": (
         _ball(rest="<contact><pair geom1='g' geom2='floor' friction='0 0 0 0 0'/></contact>"),
@@ -175,6 +176,37 @@ def test_the_search_on_distance_fields_is_warned_about_because_its_normal_is_off
     # The ball lies on the flat top, so the true normal is vertical.
     normal = np.abs(np.array(data._impl.contact.frame[0, 0, 2]))
     assert np.degrees(np.arccos(normal)) > 10
+
+
+def _num_touching(scene):
+    """Contacts found in C MuJoCo and in MJX."""
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    collide = jax.jit(lambda m, d: mjx.collision(m, mjx.kinematics(m, d)))
+    distances = collide(scene.model, scene.data)._impl.contact.dist
+    return data.ncon, int((distances < 0).sum())
+
+
+def test_where_mjx_finds_other_contacts_the_summary_says_so():
+    lying = load_scene(
+        """
+        <mujoco>
+          <worldbody>
+            <geom type="capsule" size="0.1 0.3" euler="0 90 0"/>
+            <body pos="0 0 0.19"><freejoint/>
+              <geom type="capsule" size="0.1 0.3" euler="0 90 0"/>
+            </body>
+          </worldbody>
+        </mujoco>
+        """
+    )
+    assert _num_touching(lying) == (2, 1)
+    assert "parallel capsules: MJX makes one contact, C MuJoCo two" in lying.summary()
+    tilted = load_scene(BOX.format(option=""))
+    # The lower corners are at 95 − 100 (1 ± 0.0175 ± 0.035) mm: −10.2, −6.7, −3.2 and 0.3.
+    assert _num_touching(tilted) == (3, 1)
+    assert "corners within 1 mm of the deepest" in tilted.summary()
+    assert "unlike C MuJoCo" not in load_scene(_ball()).summary()
 
 
 def test_a_sensor_that_mjx_lacks_is_warned_about_and_the_others_stay():

@@ -57,7 +57,7 @@ REFUSED = {
     "diagexact": (_fill(BALL, flag="<flag diagexact='enable'/>"), "<flag diagexact", "remove"),
     "noslip": (_fill(BALL, option="noslip_iterations='9'"), "noslip_iterations=9", "impratio"),
     "noslip for friction loss": (
-        _fill(PENDULUM, option="noslip_iterations='9'", joint="frictionloss='1'"),
+        _fill(PENDULUM, option="noslip_iterations='9'", joint="frictionloss='9'"),
         "noslip_iterations=9", "impratio"),
     "joint stiffness polynomial": (
         _fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
@@ -72,7 +72,8 @@ REFUSED = {
     "surface velocity": (_fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
     "adhesion of a geom": (_fill(BALL, geom="adhesion='5'"), "geom 'g'", "remove"),
     "adhesion of a pair": (
-        _fill(BALL, rest="<contact><pair name='p' geom1='g' geom2='floor' adhesion='3'/></contact>"),
+        _fill(BALL, rest="<contact><pair name='p' geom1='g' geom2='floor' adhesion='3'/>"
+              "</contact>"),
         "pair 'p'", "remove"),
     "ellipsoid fluid": (
         _fill(PENDULUM, option="density='100'", geom="fluidshape='ellipsoid'"), "geom 'g'",
@@ -80,7 +81,8 @@ REFUSED = {
     "fluid and implicitfast": (
         _fill(PENDULUM, option="density='100' integrator='implicitfast'"), "density=100", "Euler"),
     "slider crank": (
-        _fill(PENDULUM, rest=_actuator("cranksite='s' slidersite='top' cranklength='2'", target="")),
+        _fill(PENDULUM,
+              rest=_actuator("cranksite='s' slidersite='top' cranklength='2'", target="")),
         "actuator 'a' (slidercrank)", "joint, tendon or site"),
     "adhesion actuator": (
         _fill(BALL, rest=_actuator("body='b' ctrlrange='0 1'", "adhesion", "")),
@@ -122,8 +124,9 @@ REFUSED = {
               "type='mesh' mesh='m' margin='.01'/></body>"),
         "'floor' (plane) with 'stone' (mesh)", "margin='0'"),
     "flex": (
-        _fill(BALL, body="<body name='rag' pos='0 0 2'><flexcomp name='cloth' type='grid' count='2 2 1' "
-              "spacing='.1 .1 .1' dim='2' mass='1'/></body>"), "flex 'cloth'", "rigid"),
+        _fill(BALL, body="<body name='rag' pos='0 0 2'><flexcomp name='cloth' type='grid' "
+              "count='2 2 1' spacing='.1 .1 .1' dim='2' mass='1'/></body>"),
+        "flex 'cloth'", "rigid"),
 }  # fmt: skip
 
 

@@ -208,9 +208,9 @@ def test_derivatives_are_those_of_the_closed_form(unequal):
 
 def test_reverse_mode_agrees_with_forward_mode_in_every_part(unequal):
     def total(softness):
-        parameters = unequal.with_softness(softness).contact_parameters()
-        return sum(jnp.sum(leaf**1.5) for leaf in (parameters.stiffness, parameters.damping,
-                                                    parameters.impedance, parameters.width))  # fmt: skip
+        got = unequal.with_softness(softness).contact_parameters()
+        parts = (got.stiffness, got.damping, got.impedance, got.width)
+        return sum(jnp.sum(part**1.5) for part in parts)
 
     softness = Softness(stiffness=900.0, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
     forward, reverse = jax.jacfwd(total)(softness), jax.grad(total)(softness)
@@ -220,12 +220,16 @@ def test_reverse_mode_agrees_with_forward_mode_in_every_part(unequal):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10)
 
 
-def test_undamped_direct_contact_has_finite_derivatives():
-    scene = load_scene(BALLS.format(one='solref="-3000 0"', two='solref="-3000 0"'))
+@pytest.mark.parametrize("solref", ["-3000 0", "0 -70"])
+def test_contact_without_damping_or_stiffness_or_weights_has_finite_derivatives(solref):
+    one = f'solref="{solref}"'
+    source = BALLS.format(one=one, two=one + ' solmix="0"').replace('"plane"', '"plane" solmix="0"')
+    scene = load_scene(source)
 
     def total(model):
         parameters = eqx.tree_at(lambda s: s.model, scene, model).contact_parameters()
-        return parameters.stiffness.sum() + parameters.damping.sum() + parameters.stability.sum()
+        frequency = parameters.natural_frequency.sum()
+        return parameters.stiffness.sum() + parameters.damping.sum() + frequency
 
     gradient = jax.grad(total, allow_int=True)(scene.model)
     assert np.isfinite(gradient.geom_solref).all()

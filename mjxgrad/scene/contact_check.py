@@ -71,6 +71,29 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     return [f"contact of {name_pairs(same)}: {text}" for text, same in messages.items()]
 
 
+def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
+    """Say where MJX finds other contact points than C MuJoCo does.
+
+    Args:
+        model: of C MuJoCo.
+        pairs: its pairs that can touch.
+
+    Returns:
+        One sentence per kind of difference that the scene can meet.
+    """
+    geom = mujoco.mjtGeom
+    kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
+    flat = {frozenset((geom.mjGEOM_PLANE, t)) for t in (geom.mjGEOM_BOX, geom.mjGEOM_MESH)}
+    messages = []
+    if kinds & flat:
+        messages.append(
+            "box or mesh on plane: MJX keeps only corners within 1 mm of the deepest one"
+        )
+    if frozenset((geom.mjGEOM_CAPSULE,)) in kinds:
+        messages.append("parallel capsules: MJX makes one contact, C MuJoCo two")
+    return messages
+
+
 def name_pairs(pairs: list[ContactPair]) -> str:
     """Two pairs by name, or the first of them and how many more there are."""
     if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):

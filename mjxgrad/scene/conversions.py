@@ -215,17 +215,16 @@ def _distance_field_pairs(model: mujoco.MjModel) -> Iterator[Conversion]:
             (_GEOM.mjGEOM_CYLINDER,),
         )
     }
-    for pair in contact_pairs(model):
-        types = frozenset(_GEOM(t) for t in model.geom_type[[pair.geom1, pair.geom2]])
-        if types in searched:
-            reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
-            yield Conversion(
-                f"contact of {describe_pair(model, pair)}",
-                "exact",
-                "MJX's search on distance fields",
-                reason,
-                exact=False,
-            )
+    found = [
+        describe_pair(model, pair)
+        for pair in contact_pairs(model)
+        if frozenset(_GEOM(t) for t in model.geom_type[[pair.geom1, pair.geom2]]) in searched
+    ]
+    if found:
+        more = f" + {len(found) - 1} more" if len(found) > 1 else ""
+        reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
+        what = f"contact of {found[0]}{more}"
+        yield Conversion(what, "exact", "search on distance fields", reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:

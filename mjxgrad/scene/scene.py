@@ -109,7 +109,7 @@ class Scene(eqx.Module):
         """Describe the scene for a human: sizes, options, contacts, conversions, omissions.
 
         Returns:
-            Text of several lines, at most 120 characters wide.
+            Text of several lines, fit for a terminal about 120 characters wide.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -119,12 +119,20 @@ class Scene(eqx.Module):
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
     present = getattr(target, name, None)
-    if isinstance(present, np.ndarray) and np.issubdtype(present.dtype, np.floating):
-        if present.size != value.size:
-            raise ValueError(
-                f"to_mujoco needs one scene, got {name} of shape {value.shape}; "
-                f"take one element of the batch"
-            )
-        present[...] = value.reshape(present.shape)
-    elif isinstance(present, float):
-        setattr(target, name, float(value))
+    if not isinstance(present, float | np.ndarray):
+        return
+    given = np.asarray(present)
+    if not np.issubdtype(given.dtype, np.floating):
+        return
+    if given.size != value.size:
+        raise ValueError(
+            f"to_mujoco needs one scene, got {name} of shape {value.shape}; "
+            f"take one element of the batch"
+        )
+    value = value.reshape(given.shape)
+    # What float32 alone has rounded keeps the digits of the file.
+    changed = value != given.astype(value.dtype)
+    if isinstance(present, float):
+        setattr(target, name, float(value if changed else given))
+    else:
+        present[changed] = value[changed]

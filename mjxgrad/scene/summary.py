@@ -8,10 +8,12 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad.scene.contact_check import format_number, name_pairs
+from mjxgrad.scene.contact_check import contact_differences, format_number, name_pairs
 
 if TYPE_CHECKING:
     from mjxgrad.scene.scene import Scene
+
+_WIDTH = 118  # characters; what a laptop's terminal shows
 
 
 def summarise(scene: "Scene") -> str:
@@ -25,6 +27,7 @@ def summarise(scene: "Scene") -> str:
         _table("Converted", [(c.what, f"{c.given} → {c.used}", c.reason + _note(c.exact))
                              for c in scene.conversions]),
         _table("Left out", [(o.what, o.reason) for o in scene.omissions]),
+        _bullets("Contacts unlike C MuJoCo", contact_differences(scene.mj_model, scene.pairs)),
         _bullets("Warnings", scene.warnings()),
     ]  # fmt: skip
     return "\n\n".join(section for section in sections if section)
@@ -135,19 +138,25 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
     if not rows:
         return ""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    align = str.rjust if is_numeric else str.ljust
     lines = []
     for first, *others in rows:
-        align = str.rjust if is_numeric else str.ljust
         cells = [align(cell, width) for cell, width in zip(others, widths[1:], strict=True)]
-        lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
-    return "\n  ".join([title, *lines])
+        line = "  " + "  ".join([first.ljust(widths[0]), *cells]).rstrip()
+        if not is_numeric and len(line) > _WIDTH:
+            # Only sentences wrap: a broken row of numbers could not be read.
+            line = textwrap.fill(
+                line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      "
+            )
+        lines.append(line)
+    return "\n".join([title, *lines])
 
 
 def _bullets(title: str, sentences: Sequence[str]) -> str:
     if not sentences:
         return ""
     wrapped = (
-        textwrap.fill(sentence, 110, initial_indent="  ", subsequent_indent="    ")
+        textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ")
         for sentence in sentences
     )
     return "\n".join([title, *wrapped])
