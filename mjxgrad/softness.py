@@ -26,9 +26,13 @@ from mjxgrad.contacts import (
 )
 
 
-def _as_float(value: Any) -> Array | None:
+def _as_float(value: Any) -> Array:
     # Integers are converted too: 10000 is a natural way to write a stiffness.
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def _as_optional_float(value: Any) -> Array | None:
+    return None if value is None else _as_float(value)
 
 
 class Softness(eqx.Module):
@@ -53,10 +57,12 @@ class Softness(eqx.Module):
         pairs: change only these pairs, by the names of their geoms.
     """
 
-    stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_float, default=None)
-    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=_as_float, default=None)
-    impedance: Float[Array, "..."] | None = eqx.field(converter=_as_float, default=None)
-    width: Float[Array, "..."] | None = eqx.field(converter=_as_float, default=None)
+    stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    damping_ratio: Float[Array, "..."] | None = eqx.field(
+        converter=_as_optional_float, default=None
+    )
+    impedance: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    width: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
     geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
 

@@ -5,6 +5,7 @@ import math
 import os
 import warnings
 from pathlib import Path
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -187,4 +188,4 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
         "_impl.efc_type": efc_type,
         "_impl.contact.efc_address": make_efc_address(mjx_model, condim, efc_type),
     }
-    return data.tree_replace(rows | sizes)
+    return cast(mjx.Data, data.tree_replace(rows | sizes))

@@ -6,6 +6,7 @@ comparing: some features raise in MJX, without naming the element, and many more
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 
 import mujoco
 import numpy as np
@@ -58,7 +59,7 @@ def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray
     return find
 
 
-def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type, theirs: type, prefix: str):
+def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type, prefix: str):
     """Names of elements whose type MJX does not know, with that type."""
 
     def find(model: mujoco.MjModel) -> list[str]:
