@@ -18,7 +18,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, implicit, linear, springs
+from mjxgrad.dynamics import assembly, forces, implicit, linear, smooth
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.newton import Problem
@@ -134,21 +134,21 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Run MJX's stages up to the unconstrained acceleration, with our own constraint rows."""
-    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    """Run the stages up to the unconstrained acceleration; tendons, cameras and collisions are MJX's."""
+    data = smooth.com_pos(model, smooth.kinematics(model, data))
     data = mjx.camlight(model, data)
     if model.ntendon:
         data = mjx.tendon(model, data)
-    data = mjx.crb(model, data)
+    data = smooth.crb(model, data)
     if model.ntendon:
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = collide(model, data)
     data = assembly.make_constraint(model, data)
     if model.nu:
-        data = mjx.transmission(model, data)
-    data = springs.restore_derivative(model, mjx.fwd_velocity(model, data))
-    return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        data = forces.transmission(model, data)
+    data = forces.fwd_velocity(model, data)
+    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data))
 
 
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:

@@ -81,7 +81,7 @@ def test_elliptic_cone_without_any_contact_pair_runs(step):
     assert jnp.isfinite(step(model, data).qpos).all()
 
 
-CARTPOLE = """<mujoco><option timestep=".01"/><worldbody>
+CARTPOLE = """<mujoco><option timestep=".01" iterations="4" ls_iterations="6"/><worldbody>
   <body><joint type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom type="box" size=".1 .1 .1" mass="1"/>
     <body><joint type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/></body></body>
 </worldbody></mujoco>"""
