@@ -68,7 +68,7 @@ class Rows(eqx.Module):
     reference: Float[Array, "rows *batch"]
     weight: Float[Array, "rows *batch"]
     bound: Float[Array, "rows *batch"]
-    scales: tuple[Float[Array, "contacts dim *batch"], ...]
+    scales: tuple[Float[Array, "_ _ *batch"], ...]
 
 
 class _Cone(eqx.Module):
