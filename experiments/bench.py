@@ -116,9 +116,7 @@ def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int
 
     def body(carry: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
         qpos, qvel, act, warm = carry
-        moved = mjx.step(
-            scene.model, data.replace(qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warm)
-        )
+        moved = mjx.step(scene.model, data.replace(qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warm))
         return (moved.qpos, moved.qvel, moved.act, moved.qacc_warmstart), None
 
     start = (data.qpos, data.qvel, data.act, data.qacc_warmstart)
@@ -147,9 +145,7 @@ def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
 
     original, jax.lax.while_loop = jax.lax.while_loop, scan_loop
     try:
-        function = jax.vmap(
-            jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps))
-        )
+        function = jax.vmap(jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps)))
         return _time("mjx patched, value_and_grad", function, states, min(options.runs, 3))
     finally:
         jax.lax.while_loop = original

@@ -1,6 +1,8 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
+from mjxgrad import diagnostics, estimators, tasks
 from mjxgrad.dynamics import forward, solve, step
+from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.rollout import (
     DivergedError,
     State,
@@ -14,15 +16,22 @@ from mjxgrad.softness import Softness
 
 __all__ = [
     "DivergedError",
+    "Objective",
     "Scene",
     "Softness",
     "State",
     "Trajectory",
     "check_trajectory",
+    "closed_loop",
+    "diagnostics",
+    "estimators",
     "forward",
     "initial_state",
     "load_scene",
+    "open_loop",
+    "parameter_noise",
     "rollout",
     "solve",
     "step",
+    "tasks",
 ]

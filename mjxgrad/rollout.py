@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import forward, step
@@ -65,9 +65,9 @@ class DivergedError(FloatingPointError):
 
 def initial_state(
     scene: Scene,
-    qpos: Float[Array, " nq"] | None = None,
-    qvel: Float[Array, " nv"] | None = None,
-    act: Float[Array, " na"] | None = None,
+    qpos: Float[ArrayLike, " nq"] | None = None,
+    qvel: Float[ArrayLike, " nv"] | None = None,
+    act: Float[ArrayLike, " na"] | None = None,
 ) -> State:
     """Return the state at the scene's reference pose, at rest, with the given parts replaced.
 
@@ -92,9 +92,9 @@ def initial_state(
 def rollout(
     scene: Scene,
     state: State,
-    controls: Float[Array, "horizon nu"] | Policy | None = None,
+    controls: Float[ArrayLike, "_ _"] | Policy | None = None,
     params: PyTree = None,
-    noise: Float[Array, "horizon nu"] | None = None,
+    noise: Float[ArrayLike, "_ _"] | None = None,
     *,
     horizon: int | None = None,
     observe: Observe | None = None,
@@ -240,8 +240,8 @@ def _check_state(scene: Scene, state: State) -> None:
             )
 
 
-def _horizon(horizon: int | None, **sequences: Array | None) -> int:
-    lengths = {k: int(v.shape[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
+def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
+    lengths = {k: int(jnp.shape(v)[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
     if horizon is not None:
         lengths["horizon"] = horizon
     if not lengths:

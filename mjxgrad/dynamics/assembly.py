@@ -356,7 +356,7 @@ def contact_jacobian(
     data: mjx.Data,
     position: Float[Array, "contacts 3"],
     frame: Float[Array, "contacts 3 3"],
-    bodies: Array,
+    bodies: Array | np.ndarray,
     dim: int,
 ) -> Float[Array, "contacts dim nv"]:
     """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames.

@@ -105,6 +105,9 @@ def minimise(
         tolerance: on the norm of the gradient, and on the decrease that the quadratic model still promises, both
             divided by the trace of the mass matrix, as MJX does. The search also ends where the gradient is rounding.
         max_iterations: upper bound.
+
+    Returns:
+        The acceleration, NaN where the problem is not finite, and the number of iterations.
     """
     run = functools.partial(_minimise, layout, max_iterations)
     return linear.batch_last(run)(problem, start, tolerance)
@@ -155,7 +158,9 @@ def _minimise(
     none = jnp.zeros(start.shape[1:], jnp.int32)
     first = measure(start, jnp.full(start.shape[1:], jnp.inf, start.dtype), none)
     last = jax.lax.while_loop(lambda state: ~jnp.all(state.is_done), iterate, first)
-    return last.point.acceleration, last.num_iterations
+    # Non-finite forces or rows have no minimiser: the start must not pass for one.
+    is_sound = jnp.all(jnp.isfinite(last.point.gradient), axis=0)
+    return jnp.where(is_sound, last.point.acceleration, jnp.nan), last.num_iterations
 
 
 def _descent(

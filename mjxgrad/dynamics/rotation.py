@@ -20,8 +20,8 @@ def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
 
 
 def multiply(
-    p: Float[Array, "*batch 4"], q: Float[Array, "*batch 4"]
-) -> Float[Array, "*batch 4"]:
+    p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]
+) -> Float[Array, "*#batch 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z)."""
     real = p[..., :1] * q[..., :1] - jnp.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
     imaginary = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + jnp.cross(p[..., 1:], q[..., 1:])

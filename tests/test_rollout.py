@@ -1,0 +1,163 @@
+"""Rollouts: what is kept, what is flagged, what is refused."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+
+PUSHED = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><geom type="plane" size="1 1 1"/>
+  <body pos="0 0 1"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+    <geom size=".1" mass="2"/></body></worldbody>
+  <actuator><motor joint="x" gear="3"/></actuator></mujoco>"""
+H, MASS, GEAR, STEPS = 0.01, 2.0, 3.0, 6
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return mg.load_scene(PUSHED)
+
+
+@pytest.fixture(scope="module")
+def roll(scene):
+    """Roll out from rest; one compilation serves most tests."""
+    return jax.jit(lambda controls, noise: mg.rollout(scene, mg.initial_state(scene), controls, noise=noise))
+
+
+@pytest.fixture
+def controls():
+    return jnp.array([[0.5], [-1.0], [2.0], [0.0], [1.0], [3.0]])
+
+
+def _positions(forces):
+    """Semi-implicit Euler in closed form: v_k = h Σ f/m, x_k = h Σ v."""
+    velocity = np.cumsum(H * GEAR * np.asarray(forces) / MASS)
+    return np.concatenate([[0], np.cumsum(H * velocity)])
+
+
+def test_states_before_each_step_and_after_the_last(roll, controls):
+    trajectory = roll(controls, jnp.zeros_like(controls))
+    np.testing.assert_allclose(trajectory.qpos[:, 0], _positions(controls[:, 0]), atol=1e-14)
+    np.testing.assert_allclose(trajectory.final.qpos, trajectory.qpos[-1])
+    assert trajectory.first_bad_step == -1
+
+
+def test_noise_is_added_to_the_controls(roll, controls):
+    noise = jnp.arange(6.0)[:, None]
+    trajectory = roll(controls, noise)
+    np.testing.assert_allclose(trajectory.ctrl, controls + noise)
+    np.testing.assert_allclose(trajectory.qpos[:, 0], _positions((controls + noise)[:, 0]), atol=1e-14)
+
+
+def test_a_policy_sees_the_present_state(scene):
+    """u = -k x: the position follows the recursion of the same feedback."""
+    start = mg.initial_state(scene, qpos=jnp.array([0.4, 0.0]))
+    trajectory = mg.rollout(scene, start, lambda k, state: -k * state.qpos[:1], 5.0, horizon=STEPS)
+    x, v = 0.4, 0.0
+    for k in range(STEPS):
+        np.testing.assert_allclose(trajectory.qpos[k, 0], x, atol=1e-14)
+        v += H * GEAR * (-5.0 * x) / MASS
+        x += H * v
+
+
+def test_observations_belong_to_their_state(scene, controls):
+    """The body's world position, which MuJoCo computes from qpos, is that of the state before each step."""
+    trajectory = mg.rollout(
+        scene, mg.initial_state(scene), controls, observe=lambda model, data: (data.xpos[1], data.qpos, data.time)
+    )
+    position, qpos, time = trajectory.observations
+    np.testing.assert_allclose(position[:, 0], trajectory.qpos[:, 0], atol=1e-14)
+    np.testing.assert_allclose(qpos, trajectory.qpos)
+    np.testing.assert_allclose(time, H * np.arange(STEPS + 1), atol=1e-14)
+
+
+@pytest.mark.parametrize("checkpoint", [True, False])
+def test_gradient_of_the_end_is_the_closed_form(scene, controls, checkpoint):
+    """dx_T/du_k = h² gear/m (T - k)."""
+
+    def end(u):
+        return mg.rollout(scene, mg.initial_state(scene), u, checkpoint=checkpoint).final.qpos[0]
+
+    expected = H**2 * GEAR / MASS * (STEPS - np.arange(STEPS))
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(controls)[:, 0], expected, rtol=1e-12)
+
+
+def test_checkpointing_keeps_a_fraction_of_the_memory():
+    """A hundred contact steps: without it every intermediate number of every step is kept."""
+    scene = mg.load_scene(PUSHED.replace('gravity="0 0 0"', ""))
+
+    def memory(checkpoint):
+        def end(u):
+            start = mg.initial_state(scene, qpos=jnp.array([0.0, -0.9]))
+            return mg.rollout(scene, start, u, checkpoint=checkpoint).final.qpos[0]
+
+        compiled = jax.jit(jax.grad(end)).lower(jnp.zeros((100, 1))).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert memory(True) * 5 < memory(False)
+
+
+def test_divergence_is_flagged_where_it_happens_and_does_not_spread(roll, controls):
+    """A control that is NaN in step 2 under jit: the state stays at that of step 2."""
+    trajectory = roll(controls.at[2, 0].set(jnp.nan), jnp.zeros_like(controls))
+    assert trajectory.diverged
+    assert trajectory.first_bad_step == 2
+    expected = _positions(controls[:, 0])
+    np.testing.assert_allclose(trajectory.qpos[:, 0], [*expected[:3], *[expected[2]] * 4], atol=1e-14)
+    with pytest.raises(mg.DivergedError, match="1 of 1 rollouts diverged, the earliest in step 2"):
+        mg.check_trajectory(trajectory)
+
+
+def test_a_runaway_velocity_is_a_divergence(roll, controls):
+    trajectory = roll(controls.at[3, 0].set(1e9), jnp.zeros_like(controls))
+    assert trajectory.first_bad_step == 3
+    assert jnp.isfinite(trajectory.qvel).all()
+
+
+def test_one_member_of_a_batch_may_diverge_alone(roll, controls):
+    batch = jnp.stack([controls, controls.at[0, 0].set(jnp.inf)])
+    trajectory = jax.vmap(roll)(batch, jnp.zeros_like(batch))
+    np.testing.assert_array_equal(trajectory.diverged, [False, True])
+    np.testing.assert_allclose(trajectory.qpos[0, :, 0], _positions(controls[:, 0]), atol=1e-14)
+
+
+def test_a_rollout_goes_on_where_another_ended(scene, roll, controls):
+    whole = roll(controls, jnp.zeros_like(controls))
+    half = mg.rollout(scene, mg.initial_state(scene), controls[:3])
+    rest = mg.rollout(scene, half.final, controls[3:])
+    np.testing.assert_allclose(rest.qpos, whole.qpos[3:], atol=1e-14)
+
+
+def test_a_contact_rollout_moves_as_in_c():
+    """A ball dropped on the floor, with default contact."""
+    text = PUSHED.replace('gravity="0 0 0"', 'tolerance="1e-12" iterations="100"')
+    scene = mg.load_scene(text)
+    start = mg.initial_state(scene, qpos=jnp.array([0.0, -0.85]))
+    trajectory = mg.rollout(scene, start, horizon=60)
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:] = [0, -0.85]
+    for qpos in trajectory.qpos:
+        np.testing.assert_allclose(qpos, data.qpos, atol=1e-11)
+        mujoco.mj_step(scene.mj_model, data)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"controls": np.zeros((4, 2))}, r"controls must have shape \(4, 1\).*got \(4, 2\)"),
+        ({"controls": np.array([[0.0], [np.nan]])}, "controls must be finite, got nan in step 1 for actuator 0"),
+        ({"controls": np.zeros((4, 1)), "noise": np.zeros((3, 1))}, "must agree on the number of steps, got controls 4"),
+        ({}, "horizon must be given"),
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+    ],
+)
+def test_mistakes_are_named(scene, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        mg.rollout(scene, mg.initial_state(scene), **arguments)
+
+
+def test_a_state_of_the_wrong_size_is_named(scene):
+    with pytest.raises(ValueError, match=r"qpos must have shape \(2,\) in this scene, got \(3,\)"):
+        mg.initial_state(scene, qpos=jnp.zeros(3))
