@@ -1,6 +1,6 @@
-"""The cost and noise of each scene in mjcf/."""
+"""The cost and the noise of each scene in mjcf/."""
 
 from mjxgrad.task import SceneTask, Task
-from mjxgrad.tasks.ball_wall import BallWall, ball_wall
+from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
 
-__all__ = ["BallWall", "SceneTask", "Task", "ball_wall"]
+__all__ = ["BallWall", "SceneTask", "Task", "ball_wall", "wall_softness"]
