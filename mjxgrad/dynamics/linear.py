@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 # Longer sums are left to a matrix product, and larger factorisations to LAPACK or cuSOLVER: written out they would take
 # longer to compile than they save.
-_LONGEST_SUM = 128
+_LONGEST_SUM = 64
 _LARGEST_FACTOR = 16
 
 
