@@ -173,7 +173,7 @@ def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], optio
     initial[:, 1 : 1 + state.shape[1]] = state
     seconds = []
     with mujoco.rollout.Rollout(nthread=threads) as pool:
-        for run in range(options.runs + 1):
+        for _ in range(options.runs + 1):
             begin = time.perf_counter()
             pool.rollout([mj_model] * options.batch, data, initial, nstep=options.steps)
             seconds.append(time.perf_counter() - begin)

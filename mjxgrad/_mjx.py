@@ -21,9 +21,7 @@ try:
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
         from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
 finally:
-    sys.stdout.writelines(
-        line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE)
-    )
+    sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 __all__ = [
     "counts",

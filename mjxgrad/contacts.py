@@ -25,9 +25,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import geom_pairs, mjx
 
-_DISABLES_CONTACT = (
-    mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
-)
+_DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
 @dataclass(frozen=True)
@@ -160,9 +158,7 @@ def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tupl
     return (pair.geom1,) if priority1 > priority2 else (pair.geom2,)
 
 
-def contact_parameters(
-    model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None
-) -> ContactParameters:
+def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
     """Compute what the dynamics makes of the contact parameters in a model.
 
     Differentiable with respect to the model's leaves, and traceable.
@@ -244,9 +240,7 @@ def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array
     smallest = mujoco.mjMINVAL
     neither = (solmix1 < smallest) & (solmix2 < smallest)
     total = jnp.where(neither, 1.0, solmix1 + solmix2)
-    return jnp.select(
-        [neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total
-    )
+    return jnp.select([neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total)
 
 
 def _resolve_solref(model: mjx.Model, solref: Array) -> tuple[Array, Array]:

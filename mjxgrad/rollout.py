@@ -235,8 +235,7 @@ def _check_state(scene: Scene, state: State) -> None:
         shape = jnp.shape(getattr(state, name))
         if shape != (size,):
             raise ValueError(
-                f"state.{name} must have shape ({size},) in this scene, got {shape}: "
-                "map over batches with jax.vmap"
+                f"state.{name} must have shape ({size},) in this scene, got {shape}: map over batches with jax.vmap"
             )
 
 
@@ -266,6 +265,4 @@ def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
     if np.isfinite(known).all():
         return
     row, column = np.argwhere(~np.isfinite(known))[0]
-    raise ValueError(
-        f"{name} must be finite, got {known[row, column]} in step {row} for actuator {column}"
-    )
+    raise ValueError(f"{name} must be finite, got {known[row, column]} in step {row} for actuator {column}")

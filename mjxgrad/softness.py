@@ -58,9 +58,7 @@ class Softness(eqx.Module):
     """
 
     stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    damping_ratio: Float[Array, "..."] | None = eqx.field(
-        converter=_as_optional_float, default=None
-    )
+    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
     impedance: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
     width: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
     geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
@@ -175,8 +173,7 @@ class Softness(eqx.Module):
             allowed = [(), (2,)] if name == "impedance" else [()]
             if value is not None and value.shape not in allowed:
                 raise ValueError(
-                    f"{name} must be one value to be applied, got shape {value.shape}; "
-                    f"apply a sweep under jax.vmap"
+                    f"{name} must be one value to be applied, got shape {value.shape}; apply a sweep under jax.vmap"
                 )
 
 
@@ -254,9 +251,7 @@ def _refuse_shared_geoms(model: mjx.Model, selected: tuple[ContactPair, ...]) ->
                 )
 
 
-def _refuse_disagreement(
-    model: mjx.Model, pairs: tuple[ContactPair, ...], present: Array, part: str
-) -> None:
+def _refuse_disagreement(model: mjx.Model, pairs: tuple[ContactPair, ...], present: Array, part: str) -> None:
     if isinstance(present, jax.core.Tracer):
         return
     values, first = np.asarray(present), {}

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 
-
 def test_the_example_runs_as_printed(capsys):
     """Six lines of numbers, finite, after the summary."""
     text = (Path(__file__).parents[1] / "README.md").read_text()

@@ -52,7 +52,7 @@ def test_noise_is_added_to_the_controls(roll, controls):
 
 
 def test_a_policy_sees_the_present_state(scene):
-    """u = -k x: the position follows the recursion of the same feedback."""
+    """U = -k x: the position follows the recursion of the same feedback."""
     start = mg.initial_state(scene, qpos=jnp.array([0.4, 0.0]))
     trajectory = mg.rollout(scene, start, lambda k, state: -k * state.qpos[:1], 5.0, horizon=STEPS)
     x, v = 0.4, 0.0
@@ -148,7 +148,10 @@ def test_a_contact_rollout_moves_as_in_c():
     [
         ({"controls": np.zeros((4, 2))}, r"controls must have shape \(4, 1\).*got \(4, 2\)"),
         ({"controls": np.array([[0.0], [np.nan]])}, "controls must be finite, got nan in step 1 for actuator 0"),
-        ({"controls": np.zeros((4, 1)), "noise": np.zeros((3, 1))}, "must agree on the number of steps, got controls 4"),
+        (
+            {"controls": np.zeros((4, 1)), "noise": np.zeros((3, 1))},
+            "must agree on the number of steps, got controls 4",
+        ),
         ({}, "horizon must be given"),
         ({"horizon": 0}, "horizon must be at least 1, got 0"),
     ],

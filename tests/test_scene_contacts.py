@@ -12,15 +12,13 @@ from mjxgrad.scene.contact_check import largest_stable_step
 # Every ball touches the floor: mixing, a share of solmix, none at all, priority of either side,
 # the direct format, both formats together, and an explicit pair.
 FLOOR = (
-    'type="plane" size="1 1 .1" solref="0.04 0.8" solimp="0.8 0.9 0.003 0.4 3" '
-    'friction="0.6 0.02 0.003" margin="0.001"'
+    'type="plane" size="1 1 .1" solref="0.04 0.8" solimp="0.8 0.9 0.003 0.4 3" friction="0.6 0.02 0.003" margin="0.001"'
 )
 GEOMS = {
     "plain": "",
     "mixed": 'solmix="3" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.4 0.03 0.001"',
     "weightless": 'solmix="0" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2"',
-    "winner": 'priority="2" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.1 0 0" '
-    'condim="6" margin="0.002"',
+    "winner": 'priority="2" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.1 0 0" condim="6" margin="0.002"',
     "loser": 'priority="-1" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="3 0 0"',
     "direct": 'solref="-3000 -70" solimp="0.5 0.7 0.01 0.5 2"',
     "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0 0.5 2"',
@@ -59,9 +57,7 @@ def touching(scene):
 def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, name):
     geom = scene.mj_model.geom(name).id
     contact = next(c for c in touching.contact if geom in c.geom)
-    row = next(
-        i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names
-    )
+    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
     ours = jax.tree.map(np.asarray, scene.contact_parameters())
     assert scene.pairs[row].condim == contact.dim
     np.testing.assert_allclose(ours.solref[row], contact.solref, rtol=1e-12)
@@ -74,9 +70,7 @@ def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, 
 def test_stiffness_and_damping_are_those_of_the_rows_of_c_mujoco(scene, touching, name):
     geom = scene.mj_model.geom(name).id
     contact = next(c for c in touching.contact if geom in c.geom)
-    row = next(
-        i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names
-    )
+    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
     ours = jax.tree.map(np.asarray, scene.contact_parameters())
     stiffness, damping, _, _ = touching.efc_KBIP[contact.efc_address]
     width = ours.impedance[row, 1]
@@ -86,9 +80,7 @@ def test_stiffness_and_damping_are_those_of_the_rows_of_c_mujoco(scene, touching
 
 
 def test_refsafe_can_be_off(touching):
-    free = load_scene(
-        _balls().replace("/><worldbody>", '><flag refsafe="disable"/></option><worldbody>', 1)
-    )
+    free = load_scene(_balls().replace("/><worldbody>", '><flag refsafe="disable"/></option><worldbody>', 1))
     row = next(i for i, pair in enumerate(free.pairs) if "clamped" in pair.names)
     # k = 1 / (tc ζ)² with tc = 0.001 and ζ = 1.
     np.testing.assert_allclose(free.contact_parameters().stiffness[row], 1e6, rtol=1e-12)
@@ -110,17 +102,13 @@ def test_an_unnamed_geom_is_called_by_its_body():
 
 def test_without_contact_there_are_no_pairs():
     for flag in ("contact", "constraint"):
-        source = _balls().replace(
-            "/><worldbody>", f'><flag {flag}="disable"/></option><worldbody>', 1
-        )
+        source = _balls().replace("/><worldbody>", f'><flag {flag}="disable"/></option><worldbody>', 1)
         assert contact_pairs(mujoco.MjModel.from_xml_string(source)) == ()
 
 
 def test_parameters_of_a_traced_model_are_those_of_the_model(scene):
     traced = jax.jit(lambda s: s.contact_parameters())(scene)
-    for ours, theirs in zip(
-        jax.tree.leaves(traced), jax.tree.leaves(scene.contact_parameters()), strict=True
-    ):
+    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(scene.contact_parameters()), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 

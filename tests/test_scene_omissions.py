@@ -121,9 +121,7 @@ def test_without_a_pair_that_can_touch_nothing_is_collided():
 def test_the_c_model_stays_complete_for_rendering():
     scene = load_scene(SCENE)
     for count in ("ncam", "nlight", "ntex", "nmat", "nmesh", "nsite", "ngeom"):
-        assert getattr(scene.mj_model, count) == getattr(
-            mujoco.MjModel.from_xml_string(SCENE), count
-        )
+        assert getattr(scene.mj_model, count) == getattr(mujoco.MjModel.from_xml_string(SCENE), count)
 
 
 def test_outputs_that_nobody_reads_cost_nothing_in_a_compiled_step():

@@ -147,9 +147,7 @@ def test_an_excluded_pair_is_no_obstacle():
 
 
 def test_with_contact_disabled_no_pair_is_an_obstacle():
-    source = REFUSED["cylinder with box"][0].replace(
-        "></option>", "><flag contact='disable'/></option>"
-    )
+    source = REFUSED["cylinder with box"][0].replace("></option>", "><flag contact='disable'/></option>")
     assert load_scene(source).pairs == ()
 
 

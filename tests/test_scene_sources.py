@@ -56,9 +56,7 @@ def test_the_template_stands_at_the_reference_pose():
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match=r"source must be .*got '.*nowhere\.xml'.*not exist"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"source must be .*got '.*nowhere\.xml'.*not exist"):
         load_scene(tmp_path / "nowhere.xml")
 
 

@@ -237,9 +237,7 @@ def test_contact_without_damping_or_stiffness_or_weights_has_finite_derivatives(
 
 
 def test_a_contact_too_stiff_for_the_time_step_is_warned_about(equal):
-    with pytest.warns(
-        SceneWarning, match=r"h²k \+ 2hb = .*stable below 4.*time step below"
-    ) as said:
+    with pytest.warns(SceneWarning, match=r"h²k \+ 2hb = .*stable below 4.*time step below") as said:
         equal.with_softness(Softness(stiffness=1e6, damping_ratio=1))
     assert len(said) == 1
 

@@ -69,7 +69,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     blocks = [block for block in _blocks(model, data) if block is not None]
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
-        fields = {name: empty for name in ("D", "aref", "frictionloss", "pos", "margin")}
+        fields = dict.fromkeys(("D", "aref", "frictionloss", "pos", "margin"), empty)
         fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)
     else:
         block = jax.tree.map(lambda *x: jnp.concatenate(x), *blocks)
@@ -77,9 +77,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         residual = jnp.where(block.is_active, block.residual, 0.0)
         stiffness, damping = _stiffness_damping(model, block)
         impedance = block.impedance[:, 0]
-        weight = 1 / jnp.maximum(
-            block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL
-        )
+        weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
         fields = {
             "J": jacobian,
             "D": weight,
@@ -120,9 +118,7 @@ def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     return blocks
 
 
-def _stiffness_damping(
-    model: mjx.Model, block: Block
-) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+def _stiffness_damping(model: mjx.Model, block: Block) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
     """Return K and B of each row.
 
     Each format is evaluated on numbers that are its own, so that no infinity of the other enters the derivative. Under
@@ -135,16 +131,12 @@ def _stiffness_damping(
         shortest = 2 * model.opt.timestep
         time_constant = jnp.where(time_constant >= shortest, time_constant, shortest)
     ratio = jnp.where(second > 0, second, 1.0)
-    stiffness = jnp.where(
-        first > 0, 1 / (largest * time_constant * ratio) ** 2, -first / largest**2
-    )
+    stiffness = jnp.where(first > 0, 1 / (largest * time_constant * ratio) ** 2, -first / largest**2)
     damping = jnp.where(second > 0, 2 / (largest * time_constant), -second / largest)
     return stiffness, damping
 
 
-def impedance(
-    solimp: Float[Array, "n 5"], violation: Float[Array, " n"]
-) -> Float[Array, "n 2"]:
+def impedance(solimp: Float[Array, "n 5"], violation: Float[Array, " n"]) -> Float[Array, "n 2"]:
     """Return d(r) and dw: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
     smallest = jnp.clip(solimp[:, 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     largest = jnp.clip(solimp[:, 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
@@ -375,16 +367,12 @@ def contact_jacobian(
         wrench = jnp.concatenate([torque, force], axis=-1)
         rows += signs[side][:, None] * _dot_axes(wrench, data.cdof)
     if dim > 3:
-        turning = (signs[0] + signs[1])[:, None] * _dot_axes(
-            frame[:, : dim - 3], data.cdof[:, :3]
-        )
+        turning = (signs[0] + signs[1])[:, None] * _dot_axes(frame[:, : dim - 3], data.cdof[:, :3])
         rows = jnp.concatenate([rows, turning], axis=1)
     return rows
 
 
-def _dot_axes(
-    wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]
-) -> Float[Array, "contacts k nv"]:
+def _dot_axes(wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]) -> Float[Array, "contacts k nv"]:
     return jnp.sum(wrench[:, :, None, :] * axes, axis=-1)
 
 

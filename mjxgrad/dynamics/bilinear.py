@@ -28,9 +28,7 @@ class Bilinear:
     def __init__(self, table: np.ndarray):
         """Keep the terms of T that are not zero."""
         self._size = len(table)
-        self._terms = _ordered(
-            [(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)]
-        )
+        self._terms = _ordered([(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)])
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
         """Return c; both factors have the same leading axes."""
@@ -79,9 +77,7 @@ def _batch(factors, axes, **parameters):
 
 _bilinear = Primitive("bilinear")
 _bilinear.def_impl(jax.jit(_evaluate, static_argnames=("terms", "size")))
-_bilinear.def_abstract_eval(
-    lambda a, b, *, terms, size: jax.core.ShapedArray((*a.shape[:-1], size), a.dtype)
-)
+_bilinear.def_abstract_eval(lambda a, b, *, terms, size: jax.core.ShapedArray((*a.shape[:-1], size), a.dtype))
 mlir.register_lowering(_bilinear, mlir.lower_fun(_evaluate, multiple_results=False))
 ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
 batching.primitive_batchers[_bilinear] = _batch

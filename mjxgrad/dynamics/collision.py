@@ -18,7 +18,9 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Fill in the contacts; a drop-in for `mjx.collision`."""
     data = mjx.collision(model, data)
     kinds = np.asarray(model.geom_type)
-    is_plane, is_cylinder = (kinds == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER))
+    is_plane, is_cylinder = (
+        kinds == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+    )
     contact = data._impl.contact
     if not (is_plane.any() and is_cylinder.any() and len(contact.dist)):
         return data

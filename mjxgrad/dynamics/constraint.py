@@ -99,15 +99,11 @@ def _cone(
     return _Cone(tangent, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom)
 
 
-def _blocks(
-    group: ConeGroup, x: Float[Array, "rows *rest"]
-) -> Float[Array, "contacts dim *rest"]:
+def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
     return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
 
 
-def force(
-    layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]
-) -> Float[Array, "rows *batch"]:
+def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
     """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
     stop, friction = layout.simple_stop, layout.friction
     linear = -rows.weight * x
@@ -152,9 +148,7 @@ def curvature_product(
         first = along[:, :, None] * jnp.sum(along[:, :, None] * scaled, axis=1, keepdims=True)
         slide = jnp.sum(cone.tangent[:, :, None] * scaled[:, 1:], axis=1, keepdims=True)
         across = scaled[:, 1:] - cone.tangent[:, :, None] * slide
-        second = jnp.concatenate(
-            [jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1
-        )
+        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
         middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)
         bottom = _blocks(group, rows.weight)[:, :, None] * block
         zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)

@@ -82,9 +82,9 @@ def _translation(
     """Return the Jacobian of the first end's position less the second's."""
     frame = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), (len(points), 3, 3))
     world = np.zeros_like(bodies[:, 0])
-    return contact_jacobian(
-        model, data, points[:, 0], frame, np.stack([world, bodies[:, 0]], 1), 3
-    ) - contact_jacobian(model, data, points[:, 1], frame, np.stack([world, bodies[:, 1]], 1), 3)
+    return contact_jacobian(model, data, points[:, 0], frame, np.stack([world, bodies[:, 0]], 1), 3) - contact_jacobian(
+        model, data, points[:, 1], frame, np.stack([world, bodies[:, 1]], 1), 3
+    )
 
 
 def _connect(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
@@ -133,9 +133,7 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     )
 
 
-def _turning(
-    model: mjx.Model, data: mjx.Data, bodies: np.ndarray
-) -> Float[Array, "constraints nv 3"]:
+def _turning(model: mjx.Model, data: mjx.Data, bodies: np.ndarray) -> Float[Array, "constraints nv 3"]:
     """Return each joint velocity's part in the first body's angular velocity less the second's."""
     from mjxgrad.dynamics.assembly import _ancestry
 
@@ -184,9 +182,7 @@ def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
     first, second = (data.qpos[a] - model.qpos0[a] for a in addresses)
     weights = tuple(model.dof_invweight0[dof] for dof in dofs)
-    return _coupling(
-        model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights
-    )
+    return _coupling(model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights)
 
 
 def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:

@@ -132,9 +132,7 @@ def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if limited.any():
         bounds = pick(model.dof_jntid, model.jnt_actfrcrange)
         total = _clamp(total, limited[model.dof_jntid], bounds)
-    return data.replace(
-        act_dot=jnp.zeros_like(data.act), actuator_force=force, qfrc_actuator=total
-    )
+    return data.replace(act_dot=jnp.zeros_like(data.act), actuator_force=force, qfrc_actuator=total)
 
 
 def _is_plain(model: mjx.Model) -> bool:
@@ -149,9 +147,7 @@ def _is_plain(model: mjx.Model) -> bool:
     )
 
 
-def _clamp(
-    x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "n 2"]
-) -> Float[Array, " n"]:
+def _clamp(x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "n 2"]) -> Float[Array, " n"]:
     if not is_limited.any():
         return x
     return jnp.where(is_limited, jnp.clip(x, bounds[:, 0], bounds[:, 1]), x)

@@ -1,6 +1,5 @@
 """Positions moved along velocities, joint by joint."""
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float

@@ -43,9 +43,7 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     return _add(a * b for a, b in zip(x, y, strict=True))
 
 
-def gram(
-    left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]
-) -> Float[Array, "n n *batch"]:
+def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
     """Return leftᵀ right for a product known to be symmetric."""
     if left.ndim > 2 and len(left) <= _LONGEST_SUM:
         return _add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
@@ -53,9 +51,7 @@ def gram(
     return 0.5 * (product + jnp.swapaxes(product, 0, 1))
 
 
-def cholesky_solve(
-    matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]
-) -> Float[Array, "n *batch"]:
+def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
     """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite."""
     size = len(vector)
     if matrix.ndim == 2:
@@ -83,9 +79,7 @@ def cholesky_solve(
     return jnp.stack(solution[::-1])
 
 
-def solve_positive_definite(
-    matrix: Float[Array, "n n"], vector: Float[Array, " n"]
-) -> Float[Array, " n"]:
+def solve_positive_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
     Under `jax.vmap` the batch is moved to the trailing axis for the factorisation.

@@ -163,9 +163,7 @@ def _minimise(
     return jnp.where(is_sound, last.point.acceleration, jnp.nan), last.num_iterations
 
 
-def _descent(
-    hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]
-) -> Float[Array, "nv *batch"]:
+def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:
     """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
     newton = -linear.cholesky_solve(hessian, gradient)
     diagonal = jnp.stack([hessian[i, i] for i in range(len(gradient))])

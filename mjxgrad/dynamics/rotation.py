@@ -19,9 +19,7 @@ def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def multiply(
-    p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]
-) -> Float[Array, "*#batch 4"]:
+def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z)."""
     real = p[..., :1] * q[..., :1] - jnp.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
     imaginary = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + jnp.cross(p[..., 1:], q[..., 1:])
@@ -38,9 +36,7 @@ def exponential(rotation: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
     square = jnp.sum(rotation * rotation, axis=-1, keepdims=True)
     small = square < _SERIES
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
-    half_sinc = jnp.where(
-        small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(0.5 * angle) / angle
-    )
+    half_sinc = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(0.5 * angle) / angle)
     cosine = jnp.where(small, 1 - square / 8 + square**2 / 384, jnp.cos(0.5 * angle))
     return jnp.concatenate([cosine, half_sinc * rotation], axis=-1)
 
@@ -57,9 +53,7 @@ def logarithm(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3"]:
     return scale * q[..., 1:]
 
 
-def integrate(
-    q: Float[Array, "*batch 4"], rotation: Float[Array, "*batch 3"]
-) -> Float[Array, "*batch 4"]:
+def integrate(q: Float[Array, "*batch 4"], rotation: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
     """Return q turned by a rotation vector in its own frame (rad), normalised."""
     turned = multiply(q, exponential(rotation))
     return turned / jnp.sqrt(jnp.sum(turned * turned, axis=-1, keepdims=True))

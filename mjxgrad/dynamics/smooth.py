@@ -41,9 +41,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     frames = tree.frames(model)
     qpos, turn, way, origin = _joint_motion(model, data.qpos)
     quat, mat = _orientations(model, data, frames, turn)
-    fixed = spatial.rotation_matrix(
-        pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY)
-    )
+    fixed = spatial.rotation_matrix(pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY))
     is_free = (model.jnt_type == _Joint.mjJNT_FREE)[:, None]
     axis = jnp.where(is_free, jnp.asarray(_UP, qpos.dtype), spatial.rotate(fixed, model.jnt_axis))
     before = np.concatenate([frames.before_body, frames.before_joint, frames.before_joint])
@@ -75,9 +73,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def _joint_motion(
     model: mjx.Model, qpos: Float[Array, " nq"]
-) -> tuple[
-    Float[Array, " nq"], Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]
-]:
+) -> tuple[Float[Array, " nq"], Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
     """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
     dtype = qpos.dtype
     kept, turns, ways, origins = [], [], [], []
@@ -90,9 +86,7 @@ def _joint_motion(
         elif run.kind == _Joint.mjJNT_HINGE:
             half = 0.5 * (q - model.qpos0[run.qpos])
             axes = model.jnt_axis[run.joints]
-            turn = jnp.concatenate(
-                [jnp.cos(half)[:, None], spatial.scale(jnp.sin(half), axes)], axis=1
-            )
+            turn = jnp.concatenate([jnp.cos(half)[:, None], spatial.scale(jnp.sin(half), axes)], axis=1)
         else:
             q = q.reshape(count, run.width)
             turn = spatial.normalise(q[:, -4:])
@@ -160,18 +154,12 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     centre = sums[:, :3] / jnp.where(is_massless, 1.0, sums[:, 3:])
     centre = jnp.where(is_massless, data.xipos, centre)
     offset = data.xipos - pick(model.body_rootid, centre)
-    central = spatial.compose(
-        data.ximat * model.body_inertia[:, None], data.ximat.transpose(0, 2, 1)
-    )
+    central = spatial.compose(data.ximat * model.body_inertia[:, None], data.ximat.transpose(0, 2, 1))
     inertia = spatial.inertia_about(offset, mass, central)
-    return data.tree_replace(
-        {"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)}
-    )
+    return data.tree_replace({"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)})
 
 
-def _joint_axes(
-    model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]
-) -> Float[Array, "nv 6"]:
+def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]) -> Float[Array, "nv 6"]:
     """Return the motion of unit joint velocities about the centre of mass of their tree."""
     angular, linear = [], []
     for run in tree.joint_runs(model):
@@ -195,9 +183,7 @@ def _joint_axes(
     turning = jnp.concatenate(angular)
     root = pick(model.body_rootid[model.dof_bodyid], centre)
     lever = root - pick(model.dof_jntid, data.xanchor)
-    return jnp.concatenate(
-        [turning, jnp.concatenate(linear) + spatial.cross(turning, lever)], axis=1
-    )
+    return jnp.concatenate([turning, jnp.concatenate(linear) + spatial.cross(turning, lever)], axis=1)
 
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -240,9 +226,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     lower = products * jnp.asarray(is_pair, products.dtype)
     mirrored = products.T * jnp.asarray(np.triu(is_pair.T, 1), products.dtype)
     diagonal = model.dof_armature[:, None] * jnp.eye(model.nv, dtype=products.dtype)
-    return data.tree_replace(
-        {"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal}
-    )
+    return data.tree_replace({"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal})
 
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -265,9 +249,7 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qfrc_bias=generalised_force(model, data, force))
 
 
-def generalised_force(
-    model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]
-) -> Float[Array, " nv"]:
+def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> Float[Array, " nv"]:
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
     return spatial.dot(data.cdof, carried)

@@ -92,9 +92,7 @@ def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *
     return jnp.tensordot(jnp.asarray(matrix, x.dtype), x, axes=1, precision="highest")
 
 
-def pick(
-    index: np.ndarray, x: Float[Array, "n *item"], default: np.ndarray | float = 0.0
-) -> Float[Array, "m *item"]:
+def pick(index: np.ndarray, x: Float[Array, "n *item"], default: np.ndarray | float = 0.0) -> Float[Array, "m *item"]:
     """Return the items of a constant index, and a default where it is negative.
 
     A product with a 0/1 matrix, not a gather: its transpose is no scatter, which XLA's CPU back end does one by one.

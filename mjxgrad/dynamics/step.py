@@ -65,9 +65,7 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         return _advance(model, data, _euler_acceleration(model, data), None)
     if integrator == _Integrator.mjINT_IMPLICITFAST:
         return _advance(model, data, _implicit_acceleration(model, data), None)
-    raise NotImplementedError(
-        f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>"
-    )
+    raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>")
 
 
 @_at_full_precision
@@ -209,9 +207,7 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data) -> mjx.Data:
 
     tableau = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6)
     tableau = jax.tree.map(lambda x: x.astype(start.qvel.dtype), tableau)
-    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(
-        stage, (rest, rest, start.qacc_warmstart), tableau
-    )
+    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )

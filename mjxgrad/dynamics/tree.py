@@ -71,9 +71,7 @@ def joint_runs(model: mjx.Model) -> tuple[Run, ...]:
         kind = mujoco.mjtJoint(int(model.jnt_type[start]))
         width = {_FREE: 7, _BALL: 4}.get(kind, 1)
         first = int(model.jnt_qposadr[start])
-        runs.append(
-            Run(kind, slice(start, end), slice(first, first + width * (end - start)), width)
-        )
+        runs.append(Run(kind, slice(start, end), slice(first, first + width * (end - start)), width))
         start = end
     return tuple(runs)
 

@@ -55,8 +55,7 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
         return []
     parameters = contact_parameters(model, pairs)
     solref, stiffness, damping = (
-        np.asarray(x, dtype=float)
-        for x in (parameters.solref, parameters.stiffness, parameters.damping)
+        np.asarray(x, dtype=float) for x in (parameters.solref, parameters.stiffness, parameters.damping)
     )
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
@@ -86,9 +85,7 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
     flat = {frozenset((geom.mjGEOM_PLANE, t)) for t in (geom.mjGEOM_BOX, geom.mjGEOM_MESH)}
     messages = []
     if kinds & flat:
-        messages.append(
-            "box or mesh on plane: MJX keeps only corners within 1 mm of the deepest one"
-        )
+        messages.append("box or mesh on plane: MJX keeps only corners within 1 mm of the deepest one")
     if frozenset((geom.mjGEOM_CAPSULE,)) in kinds:
         messages.append("parallel capsules: MJX makes one contact, C MuJoCo two")
     return messages
@@ -110,9 +107,7 @@ def format_number(x: float) -> str:
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
 
 
-def _altered_by_refsafe(
-    time_constant: float, damping_ratio: float, damping: float, timestep: float
-) -> str | None:
+def _altered_by_refsafe(time_constant: float, damping_ratio: float, damping: float, timestep: float) -> str | None:
     # A relative margin, because float32 rounds a time constant of exactly two steps.
     if time_constant <= 0 or 2.0 / damping <= time_constant * (1 + 1e-5):
         return None

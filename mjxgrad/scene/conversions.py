@@ -177,12 +177,8 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
         reason = "MJX leaves out the gyroscopic derivative of free bodies; same order of accuracy"
         yield Conversion("integrator", "implicitfast", "MJX's implicitfast", reason, exact=False)
-    affine_gain = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (
-        model.actuator_gainprm[:, 2] != 0
-    )
-    affine_bias = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (
-        model.actuator_biasprm[:, 2] != 0
-    )
+    affine_gain = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (model.actuator_gainprm[:, 2] != 0)
+    affine_bias = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 2] != 0)
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
     limited = model.actuator_forcelimited.astype(bool)
     # One control per actuator: others are refused.

@@ -116,9 +116,7 @@ def _parse(read, argument: str, name: str) -> tuple[mujoco.MjModel, str]:
         return read(argument), name
     except ValueError as error:
         message = " ".join(str(error).split())
-        raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (
-            error
-        )
+        raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (error)
 
 
 def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:
@@ -177,8 +175,7 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
     rows = {
         f"_impl.{field.name}": jnp.zeros((num_rows, *value.shape[1:]), value.dtype)
         for field in data._impl.fields()
-        if field.name.startswith("efc_")
-        and isinstance(value := getattr(data._impl, field.name), jax.Array)
+        if field.name.startswith("efc_") and isinstance(value := getattr(data._impl, field.name), jax.Array)
     }
     sizes = {
         "_impl.ne": num_equality,

@@ -118,8 +118,7 @@ def _geom_type(model: mujoco.MjModel, geom: int) -> str:
 def describe_pair(model: mujoco.MjModel, pair) -> str:
     """Two geoms by name and type."""
     return " with ".join(
-        f"{name!r} ({_geom_type(model, geom)})"
-        for name, geom in zip(pair.names, (pair.geom1, pair.geom2), strict=True)
+        f"{name!r} ({_geom_type(model, geom)})" for name, geom in zip(pair.names, (pair.geom1, pair.geom2), strict=True)
     )
 
 
@@ -133,10 +132,11 @@ def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
 def _margins_of_meshes(model: mujoco.MjModel) -> Iterator[str]:
     without = {mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value}
     for pair in contact_pairs(model):
-        if pair.explicit >= 0:
-            margin = model.pair_margin[pair.explicit]
-        else:
-            margin = model.geom_margin[[pair.geom1, pair.geom2]].sum()
+        margin = (
+            model.pair_margin[pair.explicit]
+            if pair.explicit >= 0
+            else model.geom_margin[[pair.geom1, pair.geom2]].sum()
+        )
         if margin and without & set(model.geom_type[[pair.geom1, pair.geom2]].tolist()):
             yield describe_pair(model, pair)
 

@@ -125,10 +125,7 @@ def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.nd
     if not np.issubdtype(given.dtype, np.floating):
         return
     if given.size != value.size:
-        raise ValueError(
-            f"to_mujoco needs one scene, got {name} of shape {value.shape}; "
-            f"take one element of the batch"
-        )
+        raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
     value = value.reshape(given.shape)
     # What float32 alone has rounded keeps the digits of the file.
     changed = value != given.astype(value.dtype)

@@ -145,9 +145,7 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
         line = "  " + "  ".join([first.ljust(widths[0]), *cells]).rstrip()
         if not is_numeric and len(line) > _WIDTH:
             # Only sentences wrap: a broken row of numbers could not be read.
-            line = textwrap.fill(
-                line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      "
-            )
+            line = textwrap.fill(line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      ")
         lines.append(line)
     return "\n".join([title, *lines])
 
@@ -155,8 +153,5 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
 def _bullets(title: str, sentences: Sequence[str]) -> str:
     if not sentences:
         return ""
-    wrapped = (
-        textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ")
-        for sentence in sentences
-    )
+    wrapped = (textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ") for sentence in sentences)
     return "\n".join([title, *wrapped])

@@ -50,7 +50,8 @@ ZOO = """
 # MuJoCo in C adds the centripetal term of connect and weld to their rows, MJX does not: these are compared with MJX.
 _WELDED = """
     <body name="p" pos="1 2 1"><freejoint/><geom size=".05" conaffinity="0"/></body>
-    <body name="q" pos="1.2 2 1"><freejoint/><geom type="box" size=".05 .04 .03" conaffinity="0"/><site name="x" pos=".1 0 0"/></body>
+    <body name="q" pos="1.2 2 1"><freejoint/><geom type="box" size=".05 .04 .03" conaffinity="0"/>
+      <site name="x" pos=".1 0 0"/></body>
     <site name="y" pos="1.3 2 1"/>
 """
 _EQUALITY = """<connect body1="p" anchor="0 0 .1"/><weld body1="q" body2="p" torquescale="1.5"/>

@@ -98,7 +98,9 @@ def _directional(model, data, steps):
 
         def body(carry, controls):
             qpos, qvel, act, warm = carry
-            now = mjx_data.replace(qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warm, ctrl=mjx_data.ctrl + s * controls)
+            now = mjx_data.replace(
+                qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warm, ctrl=mjx_data.ctrl + s * controls
+            )
             moved = mg.step(mjx_model, now)
             return (moved.qpos, moved.qvel, moved.act, moved.qacc_warmstart), None
 
