@@ -46,7 +46,7 @@ setup: .venv/.installed  ## install the tested versions into .venv
 demo: ball_wall  ## set all up, run the main job, write runs/ball_wall/report.html
 
 test: .venv/.installed  ## set all up and run the tests
-	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -n 2 --dist worksteal $(PYTEST_ARGS)
 
 test-slow: .venv/.installed  ## the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
