@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import rotation
-from mjxgrad.dynamics.assembly import Block, contact_jacobian, impedance
+from mjxgrad.dynamics import rotation, tree
+from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad.dynamics.contact import contact_jacobian
 
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
@@ -135,9 +136,7 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
 
 def _turning(model: mjx.Model, data: mjx.Data, bodies: np.ndarray) -> Float[Array, "constraints nv 3"]:
     """Return each joint velocity's part in the first body's angular velocity less the second's."""
-    from mjxgrad.dynamics.assembly import _ancestry
-
-    moves = _ancestry(model)
+    moves = tree.moving_dofs(model)
     sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
     return sign[:, :, None] * data.cdof[:, :3]
 

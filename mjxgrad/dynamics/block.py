@@ -1,0 +1,47 @@
+"""Constraint rows of one kind, and the impedance that they share."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Bool, Float
+
+
+class Block(eqx.Module):
+    """Constraint rows of one kind, before gating and scaling. All fields have the rows as leading axis.
+
+    Attributes:
+        jacobian: from joint velocities to the rows, also where the row is inactive.
+        residual: r in a_ref (m or rad).
+        impedance: d(r), and dw, its value from the width on.
+        inverse_weight: Â, inverse inertia (1/kg).
+        solref: stiffness and damping in MuJoCo's formats.
+        margin: distance at which the row begins (m or rad).
+        friction_loss: largest force of a friction loss row.
+        is_active: whether the row takes part.
+    """
+
+    jacobian: Float[Array, "rows nv"]
+    residual: Float[Array, " rows"]
+    impedance: Float[Array, "rows 2"]
+    inverse_weight: Float[Array, " rows"]
+    solref: Float[Array, "rows 2"]
+    margin: Float[Array, " rows"]
+    friction_loss: Float[Array, " rows"]
+    is_active: Bool[Array, " rows"]
+
+
+def impedance(solimp: Float[Array, "n 5"], violation: Float[Array, " n"]) -> Float[Array, "n 2"]:
+    """Return d(r) and dw: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
+    smallest = jnp.clip(solimp[:, 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    largest = jnp.clip(solimp[:, 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    width = jnp.maximum(solimp[:, 2], mujoco.mjMINVAL)
+    middle = jnp.clip(solimp[:, 3], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    power = jnp.maximum(solimp[:, 4], 1.0)
+    # Beyond the width the powers are evaluated where they are finite and thrown away.
+    is_inside = jnp.abs(violation) < width
+    x = jnp.where(is_inside, jnp.abs(violation) / width, 0.5)
+    is_lower = x < middle
+    part = jnp.where(is_lower, middle, 1 - middle)
+    climb = part * (jnp.where(is_lower, x, 1 - x) / part) ** power
+    inside = smallest + (largest - smallest) * jnp.where(is_lower, climb, 1 - climb)
+    return jnp.stack([jnp.where(is_inside, inside, largest), largest], axis=1)
