@@ -127,10 +127,7 @@ def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int
 def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
     """Measure MJX's own gradient with `while_loop` replaced by a scan that stops counting once it is done."""
     model = scene.model.tree_replace({"opt.iterations": _PATCHED_ITERATIONS})
-    patched_scene = mg.Scene.__new__(type(scene))
-    for field in dataclasses.fields(scene):
-        object.__setattr__(patched_scene, field.name, getattr(scene, field.name))
-    object.__setattr__(patched_scene, "model", model)
+    patched_scene = dataclasses.replace(scene, model=model)
 
     def scan_loop(goes_on: Callable, body: Callable, start: Any) -> Any:
         def turn(value: Any, _: None) -> tuple[Any, None]:

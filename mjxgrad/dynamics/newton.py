@@ -6,8 +6,8 @@ Minimise over a
 
 with the laws s_i of `constraint`. The problem is strictly convex, so the starting point affects the time taken and not the
 answer. Along a search line the derivative of the cost is monotone and, but for elliptic rows, piecewise linear: Newton's
-method on it, kept inside a bracket, ends at the exact minimiser after as many steps as it crosses pieces. A fixed number
-of steps is unrolled, since under `vmap` a loop runs as long as its slowest member, and tests for it all the while. (The
+method on it, kept inside a bracket, ends at the exact minimiser after as many steps as it crosses pieces. It takes a
+fixed number of steps, since under `vmap` a loop until convergence runs as long as its slowest member. (The
 minimiser can also be read off the values at all breakpoints at once, without iterating; that takes rows² work and was
 three times slower at 24 rows.)
 
