@@ -1,6 +1,6 @@
 """Estimates of the gradient of a smoothed objective, all with the same call."""
 
-from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate
+from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason
 from mjxgrad.estimators.first import first_order
 from mjxgrad.estimators.shared import first_and_zeroth_order
 from mjxgrad.estimators.zeroth import zeroth_order
@@ -8,6 +8,7 @@ from mjxgrad.estimators.zeroth import zeroth_order
 __all__ = [
     "Diagnosis",
     "GradientEstimate",
+    "Reason",
     "first_and_zeroth_order",
     "first_order",
     "zeroth_order",

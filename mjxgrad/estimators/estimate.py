@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.estimators.moments import Moments
@@ -14,6 +15,17 @@ class Diagnosis(eqx.Enumeration):
     some_not_finite = "samples that were not finite were left out, so the mean is over the rest"
     baseline_not_finite = "the zero-noise rollout was not finite, so there is no baseline"
     too_few_finite = "fewer than two independent samples were finite, so there is no estimate"
+
+
+class Reason(eqx.Enumeration):
+    """Why α, the weight of the first-order part, is what it is; `Reason[estimate.reason]` is the sentence."""
+
+    fixed = "the estimator leaves no choice, or α was given"
+    inverse_variance = "the weights are those of least variance: no bias was found, or none was looked for"
+    bias_limit = "α is as large as the bound on the bias allows, and smaller than the variances ask for"
+    uncertain = "the zeroth-order part is too noisy to bound the bias, so it stands alone"
+    inconsistent = "values and derivatives of the samples contradict each other, so the zeroth-order part stands alone"
+    not_finite = "too few derivatives were finite, so the zeroth-order part stands alone"
 
 
 class GradientEstimate(eqx.Module):
@@ -34,6 +46,10 @@ class GradientEstimate(eqx.Module):
         num_rollouts: rollouts spent, a zero-noise baseline included.
         num_gradient_rollouts: of those, the ones that were differentiated.
         diagnosis: an item of `Diagnosis`.
+        alpha: weight of the first-order part; one number, or one per block of coordinates.
+        reason: an item of `Reason` for each `alpha`.
+        bias_bound: an upper bound on the norm of the bias of `value`, as far as the rule that chose `alpha` knows one:
+            zero for what is unbiased, NaN where nothing is known.
     """
 
     value: Float[Array, " dim"]
@@ -46,6 +62,9 @@ class GradientEstimate(eqx.Module):
     num_rollouts: Int[Array, ""]
     num_gradient_rollouts: Int[Array, ""]
     diagnosis: Diagnosis
+    alpha: Float[Array, "*blocks"]
+    reason: Reason
+    bias_bound: Float[Array, ""]
 
     @property
     def variance(self) -> Float[Array, "*batch"]:
@@ -69,6 +88,9 @@ def assemble(
     num_rollouts: int,
     num_gradient_rollouts: int,
     has_baseline: Bool[Array, ""] | bool = True,
+    alpha: ArrayLike = 0.0,
+    reason: Reason = Reason.fixed,
+    bias_bound: ArrayLike = 0.0,
 ) -> GradientEstimate:
     """Put an estimate together, refusing to give a number where there is none.
 
@@ -82,6 +104,9 @@ def assemble(
         num_rollouts: rollouts spent.
         num_gradient_rollouts: rollouts differentiated.
         has_baseline: whether a baseline that had to be finite was so.
+        alpha: weight of the first-order part.
+        reason: why.
+        bias_bound: on the norm of the bias; NaN where nothing is known.
 
     Returns:
         The estimate, all NaN where there is none.
@@ -104,4 +129,7 @@ def assemble(
         num_rollouts=jnp.asarray(num_rollouts),
         num_gradient_rollouts=jnp.asarray(num_gradient_rollouts),
         diagnosis=diagnosis,
+        alpha=jnp.asarray(alpha, value.dtype),
+        reason=reason,
+        bias_bound=jnp.asarray(bias_bound, value.dtype),
     )

@@ -68,4 +68,6 @@ def first_order_result(summary: tuple[Any, ...], plan: Plan) -> GradientEstimate
         num_samples=plan.num_samples,
         num_rollouts=plan.num_rollouts,
         num_gradient_rollouts=plan.num_rollouts,
+        alpha=1.0,
+        bias_bound=jnp.nan,
     )
