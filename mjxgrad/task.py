@@ -1,4 +1,4 @@
-"""What an objective needs of a thing to be controlled: how long, how many controls, a cost."""
+"""What an objective needs of a thing to be controlled: how long, how many controls, where it starts, a cost."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad.rollout import State, Trajectory, rollout
@@ -16,8 +16,28 @@ from mjxgrad.scene import Scene
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 
 
+class Outcome(eqx.Module):
+    """What came of one rollout; under `jax.vmap` every field gains leading axes.
+
+    Attributes:
+        cost: of the whole rollout, NaN if it diverged.
+        states: in which the controls were chosen, with a leading axis of `horizon`.
+        step_costs: what was charged at steps 0 to `horizon`, with the sum `cost`. Entry t depends only on states and
+            controls up to t, so a control at t answers for the entries from t on and for no others. None where only
+            the total is known.
+    """
+
+    cost: Float[Array, ""]
+    states: PyTree
+    step_costs: Float[Array, " steps"] | None = None
+
+
 class Task(eqx.Module):
-    """Anything that turns controls into a cost; its dynamics need not be MuJoCo's."""
+    """Anything that turns controls into a cost; its dynamics need not be MuJoCo's.
+
+    A subclass gives `horizon`, `num_controls` and `run`. One whose rollouts may start in different states gives
+    `nominal_start` too, and one whose start is random `sample_start`.
+    """
 
     horizon: eqx.AbstractVar[int]
     num_controls: eqx.AbstractVar[int]
@@ -28,7 +48,8 @@ class Task(eqx.Module):
         controls: Float[Array, "horizon nu"] | Policy,
         params: PyTree = None,
         noise: Float[Array, "horizon nu"] | None = None,
-    ) -> tuple[Float[Array, ""], PyTree]:
+        start: PyTree = None,
+    ) -> Outcome:
         """Roll out once.
 
         Args:
@@ -36,11 +57,30 @@ class Task(eqx.Module):
                 what to apply.
             params: the policy's parameters.
             noise: added to the controls.
+            start: where to begin; None is the nominal start.
 
         Returns:
-            The cost, NaN if the rollout diverged, and the states that the controls were chosen
-            in, with a leading axis of `horizon`.
+            The cost, and the states that the controls were chosen in.
         """
+
+    def nominal_start(self) -> PyTree:
+        """Give where a rollout begins if nothing else is said; None if that has no name outside the task."""
+        return None
+
+    def sample_start(self, key: PRNGKeyArray) -> PyTree:
+        """Draw where a rollout begins, shaped as `nominal_start`; None if it always begins at the same place."""
+        return None
+
+
+def as_pytree(function: Callable) -> Callable:
+    """Wrap a plain function so that what holds it is a pytree of arrays, fit for jit and vmap."""
+    if isinstance(function, eqx.Module | jax.tree_util.Partial):
+        return function  # pyright: ignore[reportReturnType]
+    return jax.tree_util.Partial(function)
+
+
+def _optional_pytree(function: Callable | None) -> Callable | None:
+    return None if function is None else as_pytree(function)
 
 
 class SceneTask(Task):
@@ -48,32 +88,49 @@ class SceneTask(Task):
 
     Attributes:
         scene: from `load_scene`.
-        state: where every rollout begins.
-        cost: from a trajectory to a number; traceable.
+        state: the nominal start.
+        cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
+            and controls up to t, whose sum is the cost; traceable.
         horizon: number of steps.
+        start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
     """
 
     scene: Scene
     state: State
-    cost: Callable[[Trajectory], Float[Array, ""]]
+    cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
+    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Give the number of actuators."""
         return self.scene.model.nu
 
+    def nominal_start(self) -> State:
+        """Give `state`."""
+        return self.state
+
+    def sample_start(self, key: PRNGKeyArray) -> State | None:
+        """Draw from `start_distribution`, if there is one."""
+        return None if self.start_distribution is None else self.start_distribution(key)
+
     def run(
         self,
         controls: Float[Array, "horizon nu"] | Policy,
         params: PyTree = None,
         noise: Float[Array, "horizon nu"] | None = None,
-    ) -> tuple[Float[Array, ""], State]:
-        """Roll out once; see `Task.run`. The states have no warm start: a policy must not depend on it."""
+        start: State | None = None,
+    ) -> Outcome:
+        """Roll out once; see `Task.run`. The states have no warm start: a policy must not depend on it.
+
+        Raises:
+            ValueError: if the cost is neither a number nor one number per state.
+        """
+        start = self.state if start is None else start
         has_activations = self.scene.model.na > 0
         trajectory = rollout(
             self.scene,
-            self.state,
+            start,
             controls,
             params,
             noise,
@@ -83,11 +140,17 @@ class SceneTask(Task):
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
         activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))
         qpos, qvel = trajectory.qpos[:-1], trajectory.qvel[:-1]
-        states = jax.vmap(State)(qpos, qvel, activations, self.state.time + elapsed, jnp.zeros_like(qvel))
-        return finite_cost(self.cost(trajectory), trajectory), states
+        states = jax.vmap(State)(qpos, qvel, activations, start.time + elapsed, jnp.zeros_like(qvel))
+        charged = finite_cost(jnp.asarray(self.cost(trajectory)), trajectory)
+        if charged.shape not in ((), (self.horizon + 1,)):
+            raise ValueError(
+                "the task's cost must return a scalar of shape () or one number per state, "
+                f"shape ({self.horizon + 1},), got shape {charged.shape}"
+            )
+        return Outcome(charged.sum(), states, charged if charged.ndim else None)
 
 
-def finite_cost(cost: Float[Array, ""], trajectory: Trajectory) -> Float[Array, ""]:
+def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
     """Give the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
     return jnp.where(trajectory.diverged, jnp.nan, cost)
 

@@ -37,7 +37,7 @@ def test_the_score_of_a_policy_is_the_gradient_of_the_log_density_of_its_actions
     """With the visited states and the actions taken held fixed."""
     task, params = textbook.LinearSystem(), objective.ravel(policy_params)
     noise = objective.sample_noise(jax.random.key(0))
-    _, states = task.run(textbook.linear_policy, policy_params, noise)
+    states = task.run(textbook.linear_policy, policy_params, noise).states
     actions = jnp.stack([textbook.linear_policy(policy_params, x) for x in states]) + noise
 
     def actions_log_density(flat):
@@ -80,7 +80,7 @@ def test_open_loop_noise_is_added_to_the_controls():
     objective = open_loop(task, STDDEV)
     noise = objective.sample_noise(jax.random.key(1))
     np.testing.assert_allclose(
-        objective.value(objective.ravel(controls), noise), task.run(controls + noise)[0], rtol=1e-6
+        objective.value(objective.ravel(controls), noise), task.run(controls + noise).cost, rtol=1e-6
     )
     np.testing.assert_allclose(objective.score(objective.ravel(controls), noise), noise[:, 0] / STDDEV**2, rtol=1e-6)
 

@@ -110,11 +110,11 @@ POLICY_PARAMS = {"gain": jnp.array([[-1.5, -0.4, 3.0]])}
 def test_a_scene_task_shows_the_states_that_its_policy_saw(cart):
     """The same actions, chosen again from these states, give the same rollout."""
     noise = jnp.array([[0.3], [-0.2], [0.1], [0.4], [-0.6]])
-    cost, states = jax.jit(lambda noise: cart.run(policy, POLICY_PARAMS, noise))(noise)
-    controls = jax.vmap(lambda state: policy(POLICY_PARAMS, state))(states) + noise
+    outcome = jax.jit(lambda noise: cart.run(policy, POLICY_PARAMS, noise))(noise)
+    controls = jax.vmap(lambda state: policy(POLICY_PARAMS, state))(outcome.states) + noise
     trajectory = rollout(cart.scene, cart.state, controls)
-    np.testing.assert_allclose(cost, cart.cost(trajectory), rtol=1e-6)
-    np.testing.assert_allclose(states.qpos, trajectory.qpos[:-1], rtol=1e-6)
+    np.testing.assert_allclose(outcome.cost, cart.cost(trajectory), rtol=1e-6)
+    np.testing.assert_allclose(outcome.states.qpos, trajectory.qpos[:-1], rtol=1e-6)
 
 
 def test_a_rollout_that_diverges_is_left_out_and_counted(cart):

@@ -96,7 +96,7 @@ def test_open_loop_controls_have_the_gradient_of_a_quadratic(key, estimator):
     task = textbook.LinearSystem()
     controls = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
     objective = open_loop(task, jnp.array([0.3]))
-    exact = jax.grad(lambda u: task.run(u)[0])(controls)
+    exact = jax.grad(lambda u: task.run(u).cost)(controls)
     estimate = estimator(objective, objective.ravel(controls), key, num_samples=N)
     np.testing.assert_array_equal(objective.unravel(objective.ravel(controls)), controls)
     assert_within_error(estimate, exact.ravel())

@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 from mjxgrad import estimators
 from mjxgrad.estimators import GradientEstimate
+from mjxgrad.task import Outcome
 from mjxgrad.tasks import Task
 
 STDDEV = 0.1
@@ -103,7 +104,10 @@ class LinearSystem(Task):
     input_matrix: Float[Array, "2 1"] = eqx.field(default_factory=lambda: jnp.array([[0.5], [1.1]]))
     start: Float[Array, " 2"] = eqx.field(default_factory=lambda: jnp.array([0.7, -0.4]))
 
-    def run(self, controls, params: PyTree = None, noise=None):
+    def nominal_start(self):
+        return self.start
+
+    def run(self, controls, params: PyTree = None, noise=None, start=None) -> Outcome:
         is_policy = callable(controls)
         noise = jnp.zeros((self.horizon, self.num_controls)) if noise is None else noise
 
@@ -112,8 +116,10 @@ class LinearSystem(Task):
             cost = state @ state + 0.3 * control @ control
             return self.transition @ state + self.input_matrix @ control, (cost, state)
 
-        final, (costs, states) = jax.lax.scan(advance, self.start, jnp.arange(self.horizon))
-        return costs.sum() + 2 * ((final - 1) ** 2).sum(), states
+        start = self.start if start is None else start
+        final, (costs, states) = jax.lax.scan(advance, start, jnp.arange(self.horizon))
+        step_costs = jnp.append(costs, 2 * ((final - 1) ** 2).sum())
+        return Outcome(step_costs.sum(), states, step_costs)
 
     def expected_cost(self, policy_params: dict, stddev: float) -> Float[Array, ""]:
         """Under u = K x + k + w: mean and covariance of a linear system follow by recursion."""

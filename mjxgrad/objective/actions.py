@@ -1,0 +1,288 @@
+"""The cost of a task, with noise on its controls: open loop and closed loop."""
+
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from mjxgrad.objective.base import Differentiated, Objective, as_scalar, unchanged
+from mjxgrad.objective.derivative import value_and_gradient
+from mjxgrad.objective.gaussian import gaussian, positive
+from mjxgrad.task import Outcome, Task, as_pytree
+
+
+class ActionNoise(Objective):
+    """What open and closed loop share.
+
+    The noise of a rollout is that of its actions; where the task has a distribution of starts, it is the pair of that
+    and the start. The start does not depend on the parameters, so it adds nothing to the score.
+    """
+
+    task: eqx.AbstractVar[Task]
+    stddev: eqx.AbstractVar[Float[Array, "..."]]
+
+    @abstractmethod
+    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
+        """Roll out once: the cost, the states, and the costs by step where the task gives them."""
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Give (horizon, nu)."""
+        return (self.task.horizon, self.task.num_controls)
+
+    def sample_noise(self, key: PRNGKeyArray) -> PyTree:
+        """Draw noise for every action, and a start where the task has a distribution of them."""
+        if self._start_shape() is None:
+            return gaussian(key, self.stddev, self.noise_shape)
+        start_key, action_key = jax.random.split(key)
+        return gaussian(action_key, self.stddev, self.noise_shape), self.task.sample_start(start_key)
+
+    def mirror(self, noise: PyTree) -> PyTree:
+        """Mirror the action noise and keep the start: both rollouts of a pair begin at the same place."""
+        actions, start = self.split(noise)
+        return -actions if start is None else (-actions, start)
+
+    def zero_noise(self) -> PyTree:
+        """Give no action noise, and the nominal start.
+
+        Raises:
+            ValueError: if the task's nominal start is not built as its random ones.
+        """
+        actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
+        if drawn is None:
+            return actions
+        nominal = self.task.nominal_start()
+        if jax.tree.structure(nominal) != jax.tree.structure(drawn):
+            raise ValueError(
+                f"nominal_start must have the structure of sample_start, {jax.tree.structure(drawn)}, "
+                f"got {jax.tree.structure(nominal)}"
+            )
+        return actions, jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), nominal, drawn)
+
+    def split(self, noise: PyTree) -> tuple[Float[Array, "horizon nu"], PyTree]:
+        """Give the action noise and the start, which is None where it is not random."""
+        return noise if isinstance(noise, tuple) else (noise, None)
+
+    def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
+        """Give the cost under the noisy actions."""
+        return self.outcome(params, noise).cost
+
+    def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ActionNoise":
+        """Give the same objective with other noise on the actions; see `Objective.with_stddev`."""
+        return dataclasses.replace(self, stddev=_action_stddev(self.task, stddev))
+
+    def _start_shape(self) -> PyTree:
+        return jax.eval_shape(self.task.sample_start, jax.random.key(0))
+
+    def _noise_score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " m"]:
+        actions, _ = self.split(noise)
+        return jnp.ravel(actions / self.stddev**2).astype(params.dtype)
+
+    def _differentiated(
+        self, params: Float[Array, " dim"], noise: PyTree, pull_back_at: Callable[[PyTree], Partial]
+    ) -> Differentiated:
+        """Differentiate by the action noise; the pull-back may depend on the states visited."""
+        actions, start = self.split(noise)
+
+        def cost_and_states(flat: Float[Array, " m"]) -> tuple[Float[Array, ""], PyTree]:
+            shaped = flat.reshape(self.noise_shape)
+            outcome = self.outcome(params, shaped if start is None else (shaped, start))
+            return outcome.cost, outcome.states
+
+        cost, states, gradient = value_and_gradient(cost_and_states, jnp.ravel(actions).astype(params.dtype))
+        stddev = jnp.ravel(jnp.broadcast_to(self.stddev, self.noise_shape)).astype(params.dtype)
+        return Differentiated(cost, gradient, self._noise_score(params, noise), stddev, pull_back_at(states))
+
+
+class OpenLoop(ActionNoise):
+    """The cost of a task under controls with noise on them; see `open_loop`."""
+
+    task: Task
+    stddev: Float[Array, "..."]
+    dim: int | None = eqx.field(static=True)
+
+    def ravel(self, controls: Float[Array, "horizon nu"]) -> Float[Array, " dim"]:
+        """Flatten controls to parameters."""
+        return jnp.ravel(controls)
+
+    def unravel(self, params: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
+        """Give parameters the shape of controls."""
+        return params.reshape(self.noise_shape)
+
+    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
+        """Roll out the noisy controls."""
+        actions, start = self.split(noise)
+        return _checked(self.task.run(self.unravel(params), noise=actions.astype(params.dtype), start=start))
+
+    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+        """Give w/σ², flattened."""
+        return self._noise_score(params, noise)
+
+    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+        """Differentiate by the controls, which is by their noise: the pull-back is the identity."""
+        return self._differentiated(params, noise, lambda _: Partial(unchanged))
+
+
+class ClosedLoop(ActionNoise):
+    """The cost of a task under a policy with noise on its actions; see `closed_loop`."""
+
+    task: Task
+    policy: Callable[[PyTree, Any], Float[Array, " nu"]]
+    stddev: Float[Array, "..."]
+    unravel: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
+    dim: int | None = eqx.field(static=True)
+
+    def ravel(self, policy_params: PyTree) -> Float[Array, " dim"]:
+        """Flatten the policy's parameters."""
+        return ravel_pytree(policy_params)[0]
+
+    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
+        """Roll out the noisy policy."""
+        actions, start = self.split(noise)
+        return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
+
+    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+        """Give Σ_t (∂π(x_t)/∂θ)ᵀ w_t/σ²; it takes a rollout."""
+        return self.value_and_score(params, noise)[1]
+
+    def value_and_score(
+        self, params: Float[Array, " dim"], noise: PyTree
+    ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
+        """Give both from one rollout."""
+        outcome = self.outcome(params, noise)
+        return outcome.cost, self._pull_back(params, outcome.states)(self._noise_score(params, noise))
+
+    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+        """Differentiate by the action noise through the whole closed loop, in one reverse pass.
+
+        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on
+        the cost through the actions alone, so pulling it back through the policy at the visited states gives the whole
+        gradient by the parameters.
+        """
+        return self._differentiated(params, noise, lambda states: self._pull_back(params, states))
+
+    def _pull_back(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+        # Given the state, the action is Gaussian about the policy; the chance of the next state
+        # given state and action does not depend on the parameters. So the states are data here.
+        states = jax.lax.stop_gradient(states)
+        # What the pull-back holds is copied per sample when a vmapped function returns it: the policy, not the task.
+        return Partial(_ActionsTranspose(self.unravel), self.policy, params, states)
+
+
+def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
+    r"""Give the cost of a task as a function of its controls, with noise on each.
+
+    The parameters are the controls, flattened by `objective.ravel`; the score is $w/\sigma^2$. Where the task has a
+    distribution of starts, every rollout draws its own.
+
+    Args:
+        task: what is controlled, and what it costs.
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
+            (horizon, nu).
+
+    Returns:
+        The objective, with `dim` = horizon * nu.
+
+    Raises:
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
+            controls.
+    """
+    stddev = _action_stddev(task, stddev)
+    return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
+
+
+def closed_loop(
+    task: Task,
+    policy: Callable[[PyTree, Any], Float[Array, " nu"]],
+    stddev: float | Float[Array, "..."],
+    *,
+    params: PyTree = None,
+) -> ClosedLoop:
+    r"""Give the cost of a task as a function of a policy's parameters, with noise on its actions.
+
+    The action is $u_t = \pi_\theta(x_t) + w_t$; the score of a rollout is
+    $\sum_t (\partial\pi_\theta(x_t)/\partial\theta)^\top w_t/\sigma^2$, the states taken as data.
+    Value and score come from one rollout. Where the task has a distribution of starts, every rollout draws its own.
+
+    Args:
+        task: what is controlled, and what it costs.
+        policy: takes its parameters and a state, gives controls of shape (nu,).
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
+            (horizon, nu).
+        params: an example of the policy's parameters; only its structure and shapes count.
+            Without it the policy is handed the flat vector itself.
+
+    Returns:
+        The objective; `objective.ravel` and `objective.unravel` go between the policy's
+        parameters and the flat vector.
+
+    Raises:
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
+            controls.
+
+    References:
+        Williams. Simple statistical gradient-following algorithms for connectionist
+        reinforcement learning. Machine Learning 8, 1992, theorem 1.
+    """
+    stddev = _action_stddev(task, stddev)
+    flat, unravel = (None, unchanged) if params is None else ravel_pytree(params)
+    return ClosedLoop(
+        task=task,
+        policy=as_pytree(policy),
+        stddev=stddev,
+        unravel=unravel,
+        dim=None if flat is None else flat.size,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _ActionsTranspose:
+    """The transpose of the derivative of the mean actions by the parameters, at given states.
+
+    A class, because equal settings must give equal pytrees (a closure never equals another), and a function that
+    evaluates the policy again, because what `jax.vjp` keeps would be another pytree in each trace.
+    """
+
+    unravel: Callable[[Float[Array, " dim"]], PyTree]
+
+    def __call__(
+        self,
+        policy: Callable[[PyTree, Any], Float[Array, " nu"]],
+        params: Float[Array, " dim"],
+        states: PyTree,
+        by_actions: Float[Array, " m"],
+    ) -> Float[Array, " dim"]:
+        def actions(flat: Float[Array, " dim"]) -> Float[Array, " m"]:
+            return jnp.ravel(jax.vmap(lambda state: policy(self.unravel(flat), state))(states))
+
+        _, transpose = jax.vjp(actions, params)
+        return transpose(by_actions)[0]
+
+
+def _checked(outcome: Outcome) -> Outcome:
+    as_scalar(outcome.cost, "the task's cost")
+    return outcome
+
+
+def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
+    shape = (task.horizon, task.num_controls)
+    if task.horizon * task.num_controls == 0:
+        raise ValueError(
+            f"action noise needs controls, got a task of (horizon, nu) = {shape}; "
+            "for noise on other parameters use parameter_noise"
+        )
+    stddev = positive(stddev)
+    try:
+        fits = jnp.broadcast_shapes(stddev.shape, shape) == shape
+    except ValueError:
+        fits = False
+    if not fits:
+        raise ValueError(f"stddev must broadcast to (horizon, nu) = {shape}, got {stddev.shape}")
+    return stddev

@@ -1,0 +1,164 @@
+r"""What an estimator sees: a value under noise, and the score of that noise.
+
+Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. An estimator of $\nabla F$ needs
+three things of a problem and nothing else: a draw of the noise, the value under it, and the
+score $s$, the gradient of the log density of the noisy quantity with respect to $\theta$, for
+which $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
+"""
+
+import dataclasses
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from mjxgrad.objective.derivative import value_and_gradient
+
+
+class Differentiated(eqx.Module):
+    r"""One rollout, differentiated by the noisy quantity $a = \mu_\theta + w$ in place of the parameters.
+
+    `pull_back` is linear, the transpose of $\partial\mu_\theta/\partial\theta$ at the states of this rollout, so what is
+    weighted, mixed or given baselines by noise component (by step and action) is pulled back once, afterwards:
+
+        pull_back(gradient_by_noise) = ∇_θ f(θ, w)    the first-order gradient of this sample
+        pull_back(noise_score) = s(θ, w)              the score of this sample
+
+    It is a pytree: a vmapped function may return it, and `jax.vmap(lambda pull, x: pull(x))` applies it to a batch.
+
+    Attributes:
+        cost: of the rollout, NaN if it diverged.
+        gradient_by_noise: total derivative of the cost by each component of the noise, flattened.
+        noise_score: $w/\sigma^2$, flattened likewise.
+        noise_stddev: $\sigma$, likewise; NaN where the objective does not say.
+        pull_back: from (m,) to (dim,).
+    """
+
+    cost: Float[Array, ""]
+    gradient_by_noise: Float[Array, " m"]
+    noise_score: Float[Array, " m"]
+    noise_stddev: Float[Array, " m"]
+    pull_back: Partial
+
+
+class Objective(eqx.Module):
+    """A cost under noise, as estimators see it.
+
+    A subclass gives `dim`, `sample_noise`, `value` and `score`. It overrides `value_and_score`
+    if both come from one rollout, `mirror` and `zero_noise` if its noise is not symmetric
+    about zero, and `differentiate`, `noise_shape` and `with_stddev` if its noise is Gaussian
+    or not on the parameters.
+    """
+
+    dim: eqx.AbstractVar[int | None]
+
+    @abstractmethod
+    def sample_noise(self, key: PRNGKeyArray) -> PyTree:
+        """Draw the noise of one rollout; the key is consumed."""
+
+    @abstractmethod
+    def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
+        """Give the cost of one rollout, NaN if the rollout diverged."""
+
+    @abstractmethod
+    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+        """Give the gradient of the log density of the noisy quantity."""
+
+    def value_and_score(
+        self, params: Float[Array, " dim"], noise: PyTree
+    ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
+        """Give the cost and the score; one rollout where the score depends on the states."""
+        return self.value(params, noise), self.score(params, noise)
+
+    def mirror(self, noise: PyTree) -> PyTree:
+        """Give the equally likely noise on the other side, for antithetic pairs."""
+        return jax.tree.map(jnp.negative, noise)
+
+    def zero_noise(self) -> PyTree:
+        """Give the noise that changes nothing."""
+        shapes = jax.eval_shape(self.sample_noise, jax.random.key(0))
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Give the shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu).
+
+        Raises:
+            ValueError: if it is the parameters', whose number is not known.
+        """
+        if self.dim is None:
+            raise ValueError("dim is not known: call objective.sized_for(params) first")
+        return (self.dim,)
+
+    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+        """Roll out once and differentiate by the noisy quantity.
+
+        Unless a subclass knows better, the noisy quantity is the parameters themselves: the derivative is by them, the
+        pull-back is the identity, and both identities of `Differentiated` hold whatever the noise is. Its standard
+        deviation is then not known, and NaN.
+
+        Args:
+            params: the point.
+            noise: of one rollout, from `sample_noise`.
+
+        Returns:
+            The cost, its derivative, the score, and the way from both to the parameters.
+        """
+        cost, score, gradient = value_and_gradient(lambda at: self.value_and_score(at, noise), params)
+        return Differentiated(cost, gradient, score, jnp.full_like(gradient, jnp.nan), Partial(unchanged))
+
+    def with_stddev(self, stddev: Float[Array, "..."] | float) -> "Objective":
+        """Give the same objective with other noise; traceable, for schedules and sweeps.
+
+        Args:
+            stddev: in the units and of the shape that the objective was made with.
+
+        Raises:
+            ValueError: if the objective's noise has no standard deviation, or `stddev` is not positive or of the wrong
+                shape.
+        """
+        raise ValueError(
+            f"{type(self).__name__} must have a stddev to change, got one without; override with_stddev in it"
+        )
+
+    def sized_for(self, params: Float[Array, " dim"]) -> "Objective":
+        """Give the objective with its `dim` settled by the parameters.
+
+        Args:
+            params: the point at which it is about to be evaluated.
+
+        Returns:
+            The objective itself, or one that has taken its `dim` from `params`.
+
+        Raises:
+            ValueError: if `params` is not a vector of floating-point numbers, or not of
+                length `dim`.
+        """
+        shape = jnp.shape(params)
+        if len(shape) != 1:
+            raise ValueError(
+                f"params must be a vector of shape (dim,), got shape {shape}; "
+                "use jnp.atleast_1d for one number, objective.ravel for a pytree"
+            )
+        if not jnp.issubdtype(jnp.result_type(params), jnp.floating):
+            raise ValueError(f"params must be floating-point, got {jnp.result_type(params)}; write 1.0 in place of 1")
+        if self.dim is None:
+            return dataclasses.replace(self, dim=shape[0])
+        if shape[0] != self.dim:
+            raise ValueError(f"params must have shape ({self.dim},), got {shape}")
+        return self
+
+
+def unchanged(vector: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    """Give it back: the pull-back where the noise is on the parameters."""
+    return vector
+
+
+def as_scalar(value: Array, name: str) -> Float[Array, ""]:
+    """Give the cost, refusing anything that is not one number."""
+    if jnp.shape(value) != ():
+        raise ValueError(f"{name} must return a scalar of shape (), got shape {jnp.shape(value)}")
+    return value
