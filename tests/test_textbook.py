@@ -1,0 +1,162 @@
+"""What the textbook problems say of themselves, against SciPy's quadrature of the definitions."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from mjxgrad.estimators import zeroth_order
+from mjxgrad.tasks import textbook
+
+STDDEV, POINT, BASELINE = 0.1, 0.03, 0.2
+# By themselves, without kinks and jumps taken from the code on trial: those of the throw are in facts that were known.
+PROBLEMS = {
+    "heaviside": (textbook.heaviside(), lambda x: float(x >= 0), [0.0], POINT),
+    "soft_heaviside": (textbook.soft_heaviside(0.06), lambda x: np.clip(2 * x / 0.06, -1, 1), [-0.03, 0.03], POINT),
+    "quadratic_sine": (textbook.quadratic_sine(0.1, 20.0), lambda x: x * x + 0.1 * np.sin(20 * x), [], 0.3),
+    "ball_over_wall": (
+        textbook.ball_over_wall(),
+        lambda x: _throw(x),
+        [0.31466299, 0.69320384, 1.19934304, 1.25613334],
+        0.8,
+    ),
+}
+
+
+def _throw(angle: float) -> float:
+    reach = np.sin(2 * angle) / 9.81
+    height = 0.06 * np.tan(angle) - 9.81 * 0.06**2 / (2 * np.cos(angle) ** 2)
+    return -(0.06**2) if reach > 0.06 and height < 0.02 else -(reach**2)
+
+
+def integral(function, breaks: list[float], point: float) -> float:
+    """E function(x, z) over pieces on which it is smooth."""
+    inside = [b for b in breaks if abs(b - point) < 8 * STDDEV]
+    edges = sorted([*inside, *(point + STDDEV * k for k in range(-8, 9))])
+
+    def weighted(x):
+        return function(x, (x - point) / STDDEV) * norm.pdf(x, point, STDDEV)
+
+    return sum(quad(weighted, a, b, epsabs=1e-13)[0] for a, b in itertools.pairwise(edges))
+
+
+@pytest.fixture(scope="module", params=PROBLEMS)
+def case(request):
+    """What the problem says, and its function, breaks and point."""
+    problem, function, breaks, point = PROBLEMS[request.param]
+
+    @eqx.filter_jit
+    def said(problem, point):
+        return {
+            "cost": problem(jnp.array([point])),
+            "smoothed": problem.smoothed(point, STDDEV),
+            "gradient": problem.gradient(point, STDDEV),
+            "first_mean": problem.first_order_mean(point, STDDEV),
+            "first_variance": problem.first_order_variance(point, STDDEV),
+            "mean_square": problem.mean_square(point, STDDEV, BASELINE),
+            "zeroth_variance": problem.zeroth_order_variance(point, STDDEV, BASELINE),
+        }
+
+    return said(problem, point), function, breaks, point
+
+
+def slope(function, x: float) -> float:
+    return (function(x + 1e-7) - function(x - 1e-7)) / 2e-7
+
+
+def test_the_smoothed_cost_is_the_mean_under_noise(case):
+    said, function, breaks, point = case
+    assert said["smoothed"] == pytest.approx(integral(lambda x, _: function(x), breaks, point), rel=1e-7)
+    assert said["cost"] == pytest.approx(function(point), rel=1e-12)
+
+
+def test_the_gradient_is_the_mean_of_cost_times_score(case):
+    said, function, breaks, point = case
+    expected = integral(lambda x, z: function(x) * z / STDDEV, breaks, point)
+    # The breaks of the throw are known to eight digits.
+    assert said["gradient"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_first_order_moments_are_those_of_the_derivative_between_the_breaks(case):
+    said, function, breaks, point = case
+    mean = integral(lambda x, _: slope(function, x), breaks, point)
+    square = integral(lambda x, _: slope(function, x) ** 2, breaks, point)
+    # No node of the quadrature is so near a break that the central difference would see it.
+    assert said["first_mean"] == pytest.approx(mean, rel=1e-5, abs=1e-9)
+    assert said["first_variance"] == pytest.approx(square - mean**2, rel=1e-5, abs=1e-9)
+
+
+def test_the_zeroth_order_variance_is_that_of_cost_less_baseline_times_score(case):
+    said, function, breaks, point = case
+    mean = integral(lambda x, z: function(x) * z / STDDEV, breaks, point)
+    square = integral(lambda x, z: ((function(x) - BASELINE) * z / STDDEV) ** 2, breaks, point)
+    assert said["zeroth_variance"] == pytest.approx(square - mean**2, rel=1e-6)
+    assert said["mean_square"] == pytest.approx(
+        integral(lambda x, _: (function(x) - BASELINE) ** 2, breaks, point), rel=1e-7
+    )
+
+
+def test_the_known_numbers_come_out():
+    """The ground truth of the literature, worked out by hand and by quadrature before this code was."""
+    step, ramp = textbook.heaviside(), textbook.soft_heaviside(0.01)
+    np.testing.assert_allclose(step.gradient(0.0, 0.1), 3.98942280, rtol=1e-8)
+    np.testing.assert_allclose(step.gradient(0.1, 0.1), 2.41970725, rtol=1e-8)
+    np.testing.assert_allclose(ramp.gradient(0.0, 0.1), 7.975522, rtol=1e-6)
+    np.testing.assert_allclose(ramp.first_order_variance(0.0, 0.1), 1531.5, rtol=1e-5)
+    np.testing.assert_allclose(textbook.quadratic_sine(0.1, 20.0).gradient(0.3, 0.1), 0.85988984, rtol=1e-7)
+    throw = textbook.ball_over_wall()
+    np.testing.assert_allclose(throw.kinks, [0.31466299, 1.25613334], rtol=1e-7)
+    np.testing.assert_allclose(throw.jumps, [0.69320384, 1.19934304], rtol=1e-7)
+    np.testing.assert_allclose(throw.jump_sizes, [-0.0064418076, 0.0011545520], rtol=1e-7)
+    np.testing.assert_allclose(throw.gradient(0.8, 0.1), -0.01182605, rtol=1e-6)
+    np.testing.assert_allclose(throw.first_order_mean(0.8, 0.1), 0.00270192, rtol=1e-5)
+    assert throw.gradient(0.8614648, 0.1) < 0 < throw.gradient(0.8614668, 0.1)
+
+
+def test_a_sweep_of_widths_is_one_vmap_and_keeps_its_digits_at_any_width():
+    """A ramp of width ν is a step of height 2 but for terms of order (ν/σ)²/24 · |z² − 1|."""
+    widths = jnp.array([1e-3, 1e-6, 1e-9, 1e-12])
+    sweep = jax.vmap(lambda width: textbook.soft_heaviside(width).gradient(POINT, STDDEV))(widths)
+    np.testing.assert_allclose(sweep, 2 * norm.pdf(POINT / STDDEV) / STDDEV, rtol=5e-6)
+    np.testing.assert_allclose(sweep[1:], 2 * norm.pdf(POINT / STDDEV) / STDDEV, rtol=1e-11)
+
+
+def test_the_chance_of_the_slope_is_as_exact_far_away_as_near():
+    far = textbook.soft_heaviside(0.05).slope_probability(-0.7, STDDEV)
+    exact = quad(lambda x: norm.pdf(x, -0.7, STDDEV), -0.025, 0.025, epsabs=0, epsrel=1e-12)[0]
+    np.testing.assert_allclose(far, exact, rtol=1e-9)
+
+
+def test_the_leave_one_out_variance_is_that_of_many_short_estimates():
+    """N = 3, where the terms in 1/(N(N − 1)) are a third of the whole."""
+    problem, repeats = textbook.soft_heaviside(0.06), 40_000
+    keys = jax.random.split(jax.random.key(0), repeats)
+
+    @eqx.filter_jit
+    def estimates(keys):
+        return jax.vmap(
+            lambda key: zeroth_order(problem.objective(STDDEV), jnp.array([POINT]), key, num_samples=3).value[0]
+        )(keys)
+
+    values = np.asarray(estimates(keys))
+    squares = (values - float(problem.gradient(POINT, STDDEV))) ** 2
+    exact = float(problem.leave_one_out_variance(POINT, STDDEV, 3))
+    assert abs(squares.mean() - exact) < 4 * squares.std() / np.sqrt(repeats)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: textbook.soft_heaviside(0.0), "width must be positive, got 0.0"),
+        (lambda: textbook.ball_over_wall(speed=-1.0), "speed must be positive, got -1.0"),
+        (lambda: textbook.ball_over_wall(height=0.2), "height must be below 0.03.*, got 0.2"),
+    ],
+)
+def test_a_problem_that_cannot_be_is_refused(make, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make()
