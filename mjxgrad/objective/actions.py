@@ -49,6 +49,17 @@ class ActionNoise(Objective):
         actions, start = self.split(noise)
         return -actions if start is None else (-actions, start)
 
+    def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
+        """Draw other action noise and keep the start."""
+        _, start = self.split(noise)
+        actions = gaussian(key, self.stddev, self.noise_shape)
+        return actions if start is None else (actions, start)
+
+    @property
+    def has_circumstances(self) -> bool:
+        """Say whether starts are random."""
+        return self._start_shape() is not None
+
     def zero_noise(self) -> PyTree:
         """Give no action noise, and the nominal start.
 

@@ -77,6 +77,15 @@ class Objective(eqx.Module):
         """Give the equally likely noise on the other side, for antithetic pairs."""
         return jax.tree.map(jnp.negative, noise)
 
+    def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
+        """Draw other noise under the same circumstances: what is random beside the noise, such as the start, stays."""
+        return self.sample_noise(key)
+
+    @property
+    def has_circumstances(self) -> bool:
+        """Say whether anything is random beside the noise, so that costs differ for reasons no derivative explains."""
+        return False
+
     def zero_noise(self) -> PyTree:
         """Give the noise that changes nothing."""
         shapes = jax.eval_shape(self.sample_noise, jax.random.key(0))
