@@ -1,8 +1,19 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import diagnostics, estimators, tasks
+from mjxgrad import baselines, diagnostics, estimators, tasks
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
+from mjxgrad.optimiser import (
+    Convergence,
+    History,
+    Optimisation,
+    Plateau,
+    Progress,
+    Stopped,
+    TrustRegion,
+    estimated_gradient,
+    optimise,
+)
 from mjxgrad.rollout import (
     DivergedError,
     State,
@@ -15,20 +26,30 @@ from mjxgrad.scene import Scene, load_scene
 from mjxgrad.softness import Softness
 
 __all__ = [
+    "Convergence",
     "DivergedError",
+    "History",
     "Objective",
+    "Optimisation",
+    "Plateau",
+    "Progress",
     "Scene",
     "Softness",
     "State",
+    "Stopped",
     "Trajectory",
+    "TrustRegion",
+    "baselines",
     "check_trajectory",
     "closed_loop",
     "diagnostics",
+    "estimated_gradient",
     "estimators",
     "forward",
     "initial_state",
     "load_scene",
     "open_loop",
+    "optimise",
     "parameter_noise",
     "rollout",
     "solve",

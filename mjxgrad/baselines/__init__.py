@@ -1,0 +1,10 @@
+"""What one would otherwise use, in the same loop, with rollouts counted alike.
+
+They are written here, for each is short, and a library of them would bring in a neural-network framework.
+"""
+
+from mjxgrad.baselines.cross_entropy import cross_entropy
+from mjxgrad.baselines.path_integral import mppi, predictive_sampling
+from mjxgrad.baselines.reinforce import reinforce
+
+__all__ = ["cross_entropy", "mppi", "predictive_sampling", "reinforce"]

@@ -1,0 +1,126 @@
+r"""REINFORCE with reward-to-go: an action answers only for what comes after it."""
+
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.estimators import GradientEstimate
+from mjxgrad.estimators.estimate import assemble
+from mjxgrad.estimators.moments import Moments, as_real
+from mjxgrad.objective import ActionNoise, ClosedLoop, Objective
+
+ReinforceBaseline = Literal["leave_one_out", "none"]
+
+
+def reinforce(
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    num_samples: int,
+    baseline: ReinforceBaseline = "leave_one_out",
+) -> GradientEstimate:
+    r"""Estimate the gradient by the policy gradient theorem, an estimator for `optimise`.
+
+    With $c_{it}$ the cost charged at step $t$ of rollout $i$ and $w_{it}$ the noise of its action,
+
+    $$\hat g = \mathrm{mean}_i \sum_t \Big(\frac{\partial \pi_\theta(x_{it})}{\partial\theta}\Big)^{\!\top}
+      \frac{w_{it}}{\sigma^2} \Big(\sum_{t' \ge t} c_{it'} - b_{it}\Big).$$
+
+    What was charged before step $t$ does not depend on $w_{it}$ and so adds nothing but variance: `zeroth_order` keeps
+    it, this leaves it out. The leave-one-out baseline $b_{it}$ is the mean cost to go of the other rollouts at the same
+    step, independent of rollout $i$: the estimate is unbiased with it and without. All rollouts are held in memory at
+    once, for the baseline of every step needs them all.
+
+    The standard error is from the spread of the samples. The baseline makes them dependent, which it does not see; that
+    is a share of order 1 / `num_samples` of the variance.
+
+    Args:
+        objective: from `open_loop` or `closed_loop`, on a task that gives `step_costs`.
+        params: the point $\theta$.
+        key: consumed here.
+        num_samples: rollouts to spend. At least 2.
+        baseline: "leave_one_out" or "none".
+
+    Returns:
+        The estimate of $\nabla F(\theta)$, in objective units per parameter unit. A sample counts as finite if its
+        costs and its score are.
+
+    Raises:
+        ValueError: if the objective's noise is not on actions, the task gives no `step_costs`, `num_samples` is below
+            2 or `baseline` unknown.
+
+    References:
+        Williams. Simple statistical gradient-following algorithms for connectionist reinforcement learning. Machine
+        Learning 8, 1992, theorem 1. Sutton, McAllester, Singh, Mansour. Policy gradient methods for reinforcement
+        learning with function approximation. NIPS 1999, theorem 1 (cost to go). Kool, van Hoof, Welling. Buy 4
+        REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
+    """
+    params = jnp.asarray(params)
+    objective = _checked(objective.sized_for(params), num_samples, baseline)
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_samples))
+    noises = jax.vmap(objective.sample_noise)(keys)
+    outcomes = jax.vmap(lambda noise: objective.outcome(params, noise))(noises)
+    if outcomes.step_costs is None:
+        raise ValueError(
+            f"reinforce must be given a task with step_costs, got {type(objective.task).__name__}, which knows only "
+            "the total; use estimators.zeroth_order, or let its cost be one number per step"
+        )
+    to_go = _costs_to_go(outcomes.step_costs, objective.task.horizon)
+    actions = jax.vmap(lambda noise: objective.split(noise)[0])(noises)
+    is_used = jnp.isfinite(outcomes.cost) & jnp.isfinite(to_go).all(axis=1)
+    count = is_used.sum()
+    if baseline == "leave_one_out":
+        # n/(n-1) (C - mean of all) is C less the mean of the others.
+        mean = jnp.where(is_used[:, None], to_go, 0).sum(axis=0) / jnp.maximum(count, 1)
+        to_go = (to_go - mean) * (as_real(count, to_go) / as_real(jnp.maximum(count - 1, 1), to_go))
+    weighted = actions / objective.stddev**2 * to_go[:, :, None]
+    samples = jax.vmap(lambda states, weights: _pull_back(objective, params, states, weights))(
+        outcomes.states, jnp.where(is_used[:, None, None], weighted, 0).astype(params.dtype)
+    )
+    is_used &= jnp.isfinite(samples).all(axis=1)
+    gradients = Moments.of(samples, is_used)
+    return assemble(
+        gradients.mean,
+        gradients.squared_error(),
+        Moments.of(outcomes.cost, is_used),
+        count=gradients.count,
+        rollouts_per_unit=1,
+        num_samples=num_samples,
+        num_rollouts=num_samples,
+        num_gradient_rollouts=0,
+    )
+
+
+def _costs_to_go(step_costs: Float[Array, "num_samples steps"], horizon: int) -> Float[Array, "num_samples horizon"]:
+    """Sum what is charged from each step on; what comes after the last action is in all of them."""
+    return jnp.cumsum(step_costs[:, ::-1], axis=1)[:, ::-1][:, :horizon]
+
+
+def _pull_back(
+    objective: ActionNoise, params: Float[Array, " dim"], states: Array, weights: Float[Array, "horizon nu"]
+) -> Float[Array, " dim"]:
+    """Take weights on the actions of a rollout to the parameters, the states being data."""
+    if not isinstance(objective, ClosedLoop):
+        return jnp.ravel(weights)
+
+    def actions(flat: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
+        return jax.vmap(lambda state: objective.policy(objective.unravel(flat), state))(states)
+
+    return jax.vjp(actions, params)[1](weights)[0]
+
+
+def _checked(objective: Objective, num_samples: int, baseline: str) -> ActionNoise:
+    if not isinstance(objective, ActionNoise):
+        raise ValueError(
+            f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
+            "use estimators.zeroth_order where there are no steps"
+        )
+    if num_samples < 2:
+        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    choices = get_args(ReinforceBaseline)
+    if baseline not in choices:
+        raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")
+    return objective

@@ -1,0 +1,110 @@
+"""A run on disk, complete or not at all."""
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+FORMAT = 1
+
+
+def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
+    """Write a pytree of arrays so that an interruption leaves the former file as it was.
+
+    Args:
+        path: of the file; its folder must exist.
+        tree: what to keep.
+        fingerprint: what a reader must agree with.
+    """
+    buffer = io.BytesIO()
+    leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+    header = json.dumps({"format": FORMAT, **fingerprint}).encode()
+    np.savez(buffer, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
+    # In the same folder: a rename is atomic within one file system only.
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(buffer.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
+    """Read what `save` wrote.
+
+    Args:
+        path: of the file.
+        like: a pytree of the same structure; only the types of its leaves count, not their shapes.
+        fingerprint: must be the one that was saved.
+
+    Returns:
+        The pytree.
+
+    Raises:
+        ValueError: if the file is damaged, or its fingerprint is another; the message says in what.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+            leaves = [archive[f"leaf{i}"] for i in range(len(archive.files) - 1)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"checkpoint must be a file that a run has saved, got {path}, which cannot be read ({error}); "
+            "delete it to begin anew"
+        ) from error
+    expected = {"format": FORMAT, **fingerprint}
+    differing = [name for name in expected if header.get(name) != expected[name]]
+    if differing:
+        changes = ", ".join(_difference(name, header.get(name), expected[name]) for name in differing)
+        raise ValueError(
+            f"checkpoint must be of the same run, got {path} of one with other settings: {changes}; "
+            "give it the settings it had, or another path"
+        )
+    wanted = jax.tree.leaves(like)
+    return jax.tree.unflatten(jax.tree.structure(like), [_restored(x, y) for x, y in zip(leaves, wanted, strict=True)])
+
+
+def digest(tree: PyTree) -> str:
+    """Give a short name for the content of arrays."""
+    sha = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = _as_numpy(leaf)
+        sha.update(f"{array.dtype}{array.shape}".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()[:16]
+
+
+def _difference(name: str, there: Any, here: Any) -> str:
+    explanations = {
+        "program": "objective, estimator, optimiser, method or versions of the libraries",
+        "arrays": "arrays in objective or method",
+        "start": "params or key",
+    }
+    return explanations.get(name, f"{name} was {there} and is {here}")
+
+
+def _as_numpy(leaf: Any) -> np.ndarray:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf)
+
+
+def _restored(saved: np.ndarray, like: Any) -> Any:
+    if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(like))
+    if saved.dtype.kind == "V":  # NumPy's format has no name for bfloat16 and its like
+        saved = saved.view(np.asarray(like).dtype)
+    return saved if isinstance(like, np.ndarray) else jnp.asarray(saved)

@@ -1,0 +1,146 @@
+"""What a run gives: where it ended, what it saw on the way, and why it stopped."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mjxgrad.estimators import Reason
+from mjxgrad.optimiser.method import Record
+
+
+class Stopped(eqx.Enumeration):
+    """Why a run stopped; `Stopped[optimisation.stopped]` is the sentence, for one run."""
+
+    running = "it has not stopped"
+    finished = "all steps were done"
+    converged = "the gradient or the cost met its tolerance"
+    not_finite = "too many estimates in a row were not finite"
+    max_rollouts = "another step would have exceeded the budget of rollouts"
+    max_seconds = "the budget of seconds was spent"
+    interrupted = "the callback asked for it"
+
+
+class History(eqx.Module):
+    """A run step by step; leaves have the seeds on their first axis if there are many, and steps on their last.
+
+    A run that stopped before the others goes on as NaN, its counts as they were.
+
+    Attributes:
+        cost: mean cost under noise at the parameters before the step.
+        cost_error: its standard error.
+        noise_free_cost: what `evaluate` gave for the parameters before the step, NaN where it was not due.
+        gradient_norm: norm of the estimate; NaN where a method has none.
+        gradient_error: norm of its standard error.
+        alpha: weight of the first-order part, the mean over blocks.
+        reason: why, for the block with the least weight.
+        bias_bound: on the norm of the bias; NaN where nothing is known.
+        scale: of the smoothing; 1 without any.
+        step_norm: norm of the change of the parameters.
+        finite_fraction: share of the samples that were finite.
+        num_rollouts: spent up to and including the step.
+        num_gradient_rollouts: of those, the ones differentiated.
+        is_taken: False for a step whose estimate was not finite.
+        seconds: wall-clock time up to the end of the step, without compilation, the same for all seeds. It is measured
+            per segment and divided evenly among the steps of it.
+    """
+
+    cost: Float[np.ndarray, "..."]
+    cost_error: Float[np.ndarray, "..."]
+    noise_free_cost: Float[np.ndarray, "..."]
+    gradient_norm: Float[np.ndarray, "..."]
+    gradient_error: Float[np.ndarray, "..."]
+    alpha: Float[np.ndarray, "..."]
+    reason: Reason
+    bias_bound: Float[np.ndarray, "..."]
+    scale: Float[np.ndarray, "..."]
+    step_norm: Float[np.ndarray, "..."]
+    finite_fraction: Float[np.ndarray, "..."]
+    num_rollouts: Int[np.ndarray, "..."]
+    num_gradient_rollouts: Int[np.ndarray, "..."]
+    is_taken: np.ndarray
+    seconds: Float[np.ndarray, " steps"]
+
+    @classmethod
+    def of(
+        cls, records: Record, noise_free_cost: Float[np.ndarray, "..."], seconds: Float[np.ndarray, " steps"]
+    ) -> "History":
+        """Put records of steps together.
+
+        Args:
+            records: stacked, as arrays on the host.
+            noise_free_cost: stacked likewise.
+            seconds: that each step took.
+
+        Returns:
+            The history, its counts and seconds summed up.
+        """
+        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
+        for name in ("num_rollouts", "num_gradient_rollouts"):
+            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
+            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
+        return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(seconds))
+
+    def __getitem__(self, steps: slice) -> "History":
+        """Give some of the steps."""
+        return jax.tree.map(lambda leaf: leaf[..., steps], self)
+
+
+class Optimisation(eqx.Module):
+    """The result of a run, or of one per seed: all but the seconds then have a leading axis.
+
+    Attributes:
+        params: after the last step.
+        best_params: with the lowest cost seen. With `evaluate` that is the noise-free cost at the steps where it was
+            due, or at the end; without, the mean cost under noise, where less smoothing comes before lower cost and a
+            larger share of finite rollouts before both. The lowest of many noisy means is lower than it should be: prefer
+            `evaluate`.
+        best_cost: that cost; NaN if there is none.
+        final_cost: of `params`, from `evaluate`; NaN without.
+        history: step by step.
+        stopped: an item of `Stopped`.
+        num_steps: steps done, those not taken included.
+        num_skipped: steps not taken because the estimate was not finite.
+        num_rollouts: spent by the method. What `evaluate` rolls out is measurement and not counted.
+        num_gradient_rollouts: of those, the ones differentiated.
+        seconds: wall-clock time of the run without compilation, over all sessions if it was resumed.
+        compile_seconds: of tracing and compilation in this session.
+    """
+
+    params: Float[Array, "..."]
+    best_params: Float[Array, "..."]
+    best_cost: Float[Array, "..."]
+    final_cost: Float[Array, "..."]
+    history: History
+    stopped: Stopped
+    num_steps: Int[np.ndarray, "..."]
+    num_skipped: Int[np.ndarray, "..."]
+    num_rollouts: Int[np.ndarray, "..."]
+    num_gradient_rollouts: Int[np.ndarray, "..."]
+    seconds: float
+    compile_seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """What a callback is told after every segment; with many seeds its arrays have them on their first axis.
+
+    Attributes:
+        step: steps done by the run that has done the most.
+        num_steps: asked for.
+        params: now.
+        best_cost: so far; see `Optimisation`.
+        history: so far.
+        seconds: so far, without compilation.
+        num_running: runs that have not stopped.
+    """
+
+    step: int
+    num_steps: int
+    params: Float[Array, "..."]
+    best_cost: Float[Array, "..."]
+    history: History
+    seconds: float
+    num_running: int
