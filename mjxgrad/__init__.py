@@ -14,6 +14,7 @@ from mjxgrad.optimiser import (
     estimated_gradient,
     optimise,
 )
+from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.rollout import (
     DivergedError,
     State,
@@ -47,7 +48,9 @@ __all__ = [
     "estimators",
     "forward",
     "initial_state",
+    "linear_policy",
     "load_scene",
+    "mlp_policy",
     "open_loop",
     "optimise",
     "parameter_noise",

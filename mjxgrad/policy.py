@@ -1,0 +1,154 @@
+"""Policies from states to controls, with their parameters apart: linear, and a multilayer perceptron."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.rollout import State
+from mjxgrad.task import as_pytree
+
+# The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend
+# little on the state; the choice that mattered most among initialisations in Andrychowicz et al. (below).
+FINAL_SCALE = 0.01
+
+
+class Affine(eqx.Module):
+    """A linear map with an optional offset.
+
+    Attributes:
+        gain: the matrix.
+        offset: added; None for a linear map without.
+    """
+
+    gain: Float[Array, "outputs inputs"]
+    offset: Float[Array, " outputs"] | None
+
+    def __call__(self, inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        """Apply it."""
+        if inputs.shape != self.gain.shape[1:]:
+            raise ValueError(
+                f"the policy must observe {self.gain.shape[1]} numbers, got shape {inputs.shape}; "
+                "set num_states, or observe"
+            )
+        return self.gain @ inputs if self.offset is None else self.gain @ inputs + self.offset
+
+
+class LinearPolicy(eqx.Module):
+    """See `linear_policy`."""
+
+    observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
+
+    def __call__(self, params: Affine, state: Any) -> Float[Array, " nu"]:
+        """Give the controls in a state."""
+        return params(self.observe(state))
+
+
+class MLPPolicy(eqx.Module):
+    """See `mlp_policy`."""
+
+    observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
+
+    def __call__(self, params: tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
+        """Give the controls in a state."""
+        hidden = self.observe(state)
+        for layer in params[:-1]:
+            hidden = jnp.tanh(layer(hidden))
+        return params[-1](hidden)
+
+
+def whole_state(state: State | Float[Array, " states"]) -> Float[Array, " observed"]:
+    """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order.
+
+    Args:
+        state: what a task hands to its policy.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    if isinstance(state, State):
+        return jnp.concatenate([state.qpos, state.qvel, state.act])
+    if not isinstance(state, jax.Array) or state.ndim != 1:
+        raise ValueError(f"state must be a vector or a State, got {type(state).__name__}; pass observe=")
+    return state
+
+
+def linear_policy(
+    num_states: int,
+    num_controls: int,
+    *,
+    bias: bool = True,
+    observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
+) -> tuple[LinearPolicy, Affine]:
+    """Make the policy u = K x + k, all zero at the start.
+
+        policy, params = linear_policy(4, 1)
+        objective = closed_loop(task, policy, stddev=0.1, params=params)
+
+    Args:
+        num_states: how many numbers are observed.
+        num_controls: how many controls are given.
+        bias: whether there is the constant k.
+        observe: from the task's state to a vector; positions of a free body hold a quaternion, and angles do not wrap,
+            so choose what you need.
+
+    Returns:
+        The policy, called as `policy(params, state)`, and its parameters.
+
+    Raises:
+        ValueError: if a number is below 1.
+    """
+    _check_positive(num_states=num_states, num_controls=num_controls)
+    offset = jnp.zeros(num_controls) if bias else None
+    return LinearPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
+
+
+def mlp_policy(
+    num_states: int,
+    num_controls: int,
+    *,
+    width: int,
+    depth: int,
+    key: PRNGKeyArray,
+    observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
+) -> tuple[MLPPolicy, tuple[Affine, ...]]:
+    r"""Make a multilayer perceptron with tanh between its layers and none after the last.
+
+    Gains start as $N(0, 1/\text{inputs})$, those of the last layer 100 times smaller; offsets as zero.
+
+    Args:
+        num_states: how many numbers are observed.
+        num_controls: how many controls are given.
+        width: of every hidden layer.
+        depth: number of hidden layers.
+        key: for the gains; consumed here.
+        observe: from the task's state to a vector; see `linear_policy`.
+
+    Returns:
+        The policy, called as `policy(params, state)`, and its parameters, layer by layer.
+
+    Raises:
+        ValueError: if a number is below 1.
+
+    References:
+        Andrychowicz et al. What Matters for On-Policy Deep Actor-Critic Methods? A Large-Scale Study. ICLR 2021,
+        arXiv:2006.05990, section 3.2.
+    """
+    _check_positive(num_states=num_states, num_controls=num_controls, width=width, depth=depth)
+    sizes = [num_states, *[width] * depth, num_controls]
+    keys = jax.random.split(key, depth + 1)
+    scales = [1.0] * depth + [FINAL_SCALE]
+    layers = [
+        Affine(scale * jax.random.normal(k, (outputs, inputs)) / inputs**0.5, jnp.zeros(outputs))
+        for k, scale, inputs, outputs in zip(keys, scales, sizes[:-1], sizes[1:], strict=True)
+    ]
+    return MLPPolicy(observe), tuple(layers)
+
+
+def _check_positive(**numbers: int) -> None:
+    for name, number in numbers.items():
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
