@@ -1,5 +1,7 @@
 """Estimates of the gradient of a smoothed objective, all with the same call."""
 
+from mjxgrad.estimators import rules
+from mjxgrad.estimators.alpha import alpha_order, control_variate
 from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason
 from mjxgrad.estimators.first import first_order
 from mjxgrad.estimators.shared import first_and_zeroth_order
@@ -9,7 +11,10 @@ __all__ = [
     "Diagnosis",
     "GradientEstimate",
     "Reason",
+    "alpha_order",
+    "control_variate",
     "first_and_zeroth_order",
     "first_order",
+    "rules",
     "zeroth_order",
 ]

@@ -13,8 +13,9 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 class Summary(eqx.Module):
@@ -77,14 +78,18 @@ class Moments(Summary):
         return jnp.where(count > 1, self.squares / jnp.maximum(count * (count - 1), 1), jnp.nan)
 
 
-class Value(Summary):
-    """One value that one of the chunks carries."""
+class Total(Summary):
+    """A sum over all samples.
 
-    value: Float[Array, ""]
+    Attributes:
+        value: the sum; any pytree of arrays.
+    """
 
-    def merge(self, other: "Value") -> "Value":
+    value: PyTree
+
+    def merge(self, other: "Total") -> "Total":
         """Give the summary of both sets of samples."""
-        return Value(self.value + other.value)
+        return Total(jax.tree.map(jnp.add, self.value, other.value))
 
 
 class ScoreMoments(Summary):

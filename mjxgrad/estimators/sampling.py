@@ -11,16 +11,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.moments import Summary
 from mjxgrad.objective import Objective
+from mjxgrad.objective.derivative import value_and_gradient
 
 Baseline = Literal["leave_one_out", "zero_noise", "none"]
 
 # Wide enough to fill a CPU's vector units and hide loop overhead, narrow enough that a chunk of
 # checkpointed rollouts of a small scene stays within tens of megabytes.
 DEFAULT_CHUNK_SIZE = 512
-
-# Up to here forward mode wins: on the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took 0.53 s
-# and 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
-MOST_FORWARD_DIMENSIONS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +33,7 @@ class Plan:
         with_gradient: whether the cost is differentiated.
         with_score: whether the score is wanted.
         with_zero_noise: whether one more rollout goes without noise.
+        shares_start: whether samples come in pairs that differ in their noise alone, not in a random start.
     """
 
     num_samples: int
@@ -44,21 +42,22 @@ class Plan:
     with_gradient: bool = False
     with_score: bool = False
     with_zero_noise: bool = False
+    shares_start: bool = False
 
     def __post_init__(self):
-        smallest = 4 if self.antithetic else 2
+        pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
+        smallest, pairs = (4, pairs) if self.rollouts_per_unit == 2 else (2, "")
         if self.num_samples < smallest:
-            pairs = " with antithetic pairs" if self.antithetic else ""
             raise ValueError(f"num_samples must be at least {smallest}{pairs}, got {self.num_samples}")
-        if self.antithetic and self.num_samples % 2:
-            raise ValueError(f"num_samples must be even with antithetic pairs, got {self.num_samples}")
+        if self.num_samples % self.rollouts_per_unit:
+            raise ValueError(f"num_samples must be even{pairs}, got {self.num_samples}")
         if self.chunk_size is not None and self.chunk_size < self.rollouts_per_unit:
             raise ValueError(f"chunk_size must be at least {self.rollouts_per_unit}, got {self.chunk_size}")
 
     @property
     def rollouts_per_unit(self) -> int:
         """Give 2 for pairs, else 1."""
-        return 2 if self.antithetic else 1
+        return 2 if self.antithetic or self.shares_start else 1
 
     @property
     def num_units(self) -> int:
@@ -164,19 +163,30 @@ def stream(
     Returns:
         The merged summaries.
     """
-    num_chunks, size = plan.chunks()
+    return accumulate(plan, lambda units: summarise(sample(objective, params, key, units, plan)))
 
-    def one_chunk(start: Int[Array, ""]) -> tuple[Summary, ...]:
-        return summarise(sample(objective, params, key, start + jnp.arange(size), plan))
+
+def accumulate(plan: Plan, one_chunk: Callable[[Int[Array, " units"]], tuple[Summary, ...]]) -> tuple[Any, ...]:
+    """Go through the units of a plan chunk by chunk, merging what is kept of each.
+
+    Args:
+        plan: what is asked for.
+        one_chunk: from the numbers of some units to what is kept of them; those beyond `plan.num_units` fill up.
+
+    Returns:
+        The merged summaries.
+    """
+    num_chunks, size = plan.chunks()
 
     # The start of a chunk is in the carry: an array of all starts would grow with the number of samples.
     def step(carry: tuple[Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
         start, kept = carry
-        merged = tuple(old.merge(new) for old, new in zip(kept, one_chunk(start), strict=True))
+        new_ones = one_chunk(start + jnp.arange(size))
+        merged = tuple(old.merge(new) for old, new in zip(kept, new_ones, strict=True))
         return (start + size, merged), None
 
     start = jnp.zeros((), int)
-    shapes = jax.eval_shape(one_chunk, start)
+    shapes = jax.eval_shape(lambda: one_chunk(start + jnp.arange(size)))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return jax.lax.scan(step, (start, empty), None, length=num_chunks)[0][1]
 
@@ -210,25 +220,8 @@ def _evaluate(
     if not plan.with_gradient:
         cost, score = cost_and_score(params)
         return cost, nothing, score
-    if params.size <= MOST_FORWARD_DIMENSIONS:
-        try:
-            return _forward(cost_and_score, params)
-        except TypeError:  # a rule of jax.custom_vjp has no forward mode; any other mistake comes again below
-            pass
-    (cost, score), gradient = jax.value_and_grad(cost_and_score, has_aux=True)(params)
+    cost, score, gradient = value_and_gradient(cost_and_score, params)
     return cost, gradient, score
-
-
-def _forward(
-    cost_and_score: Callable[[Array], tuple[Array, Array]], params: Float[Array, " dim"]
-) -> tuple[Float[Array, ""], Float[Array, " dim"], Float[Array, " score_dim"]]:
-    """Differentiate in forward mode, one tangent per parameter."""
-
-    def along(tangent: Float[Array, " dim"]) -> tuple[Array, Array, Array]:
-        return jax.jvp(cost_and_score, (params,), (tangent,), has_aux=True)
-
-    tangents = jnp.eye(params.size, dtype=params.dtype)
-    return jax.vmap(along, out_axes=(None, 0, None))(tangents)
 
 
 def _all_finite(array: Float[Array, "units ..."]) -> Bool[Array, " units"]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
-from mjxgrad.estimators.moments import ScoreMoments, Value, as_real
+from mjxgrad.estimators.moments import ScoreMoments, Total, as_real
 from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
 from mjxgrad.objective import Objective
 
@@ -67,10 +67,10 @@ def zeroth_order(
     return zeroth_order_result(summary, plan, baseline)
 
 
-def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Value]:
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Total]:
     """Keep of samples what the estimate needs: joint moments, and the cost without noise."""
     moments = ScoreMoments.of(samples.costs, samples.scores, samples.zeroth_order_mask())
-    return moments, Value(samples.noise_free_cost())
+    return moments, Total(samples.noise_free_cost())
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> GradientEstimate:

@@ -1,0 +1,259 @@
+r"""How to weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
+
+A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in
+`alpha_order(..., rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to
+*fail* everywhere.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+from scipy import stats
+
+from mjxgrad.estimators.estimate import Reason
+
+
+class Evidence(eqx.Module):
+    """What a rule may look at: norms and variances of one block of coordinates, and what concerns all of them.
+
+    Attributes:
+        count: samples (pairs of them where starts are random) behind the means.
+        dim: coordinates in the block.
+        first_norm: of the mean derivative.
+        zeroth_norm: of the unbiased mean.
+        difference_norm: of the difference of both.
+        first_variance: trace of the covariance of one sample's derivative.
+        zeroth_variance: of one sample's unbiased term.
+        difference_variance: of one sample's difference; both parts come from the same rollouts.
+        inconsistency: share of the squared secants of the cost that derivatives do not explain, from zero.
+        relative_bias_bound: standard deviation of the cost that derivatives miss over that of the cost that their mean
+            explains; a bound on the bias of the first order relative to its norm (see `consistency`).
+        cost_variance: of the cost.
+        scaled_first_variance: trace of the covariance of derivatives by noise in standard deviations.
+        scaled_first_norm: of their mean.
+    """
+
+    count: Int[Array, ""]
+    dim: Float[Array, ""]
+    first_norm: Float[Array, ""]
+    zeroth_norm: Float[Array, ""]
+    difference_norm: Float[Array, ""]
+    first_variance: Float[Array, ""]
+    zeroth_variance: Float[Array, ""]
+    difference_variance: Float[Array, ""]
+    inconsistency: Float[Array, ""]
+    relative_bias_bound: Float[Array, ""]
+    cost_variance: Float[Array, ""]
+    scaled_first_variance: Float[Array, ""]
+    scaled_first_norm: Float[Array, ""]
+
+    @property
+    def real_count(self) -> Float[Array, ""]:
+        """Give the count as a real number."""
+        return self.count.astype(self.first_norm.dtype)
+
+    def least_variance(self) -> Float[Array, ""]:
+        """Give the weights of inverse variance, V⁰/(V⁰ + V¹); 1 where both are zero."""
+        total = self.first_variance + self.zeroth_variance
+        return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
+
+
+class Weights(eqx.Module):
+    """What a rule decides.
+
+    Attributes:
+        alpha: weight of the first-order part, from 0 to 1.
+        reason: why.
+        bias_bound: on the norm of the bias; NaN where the rule knows none.
+    """
+
+    alpha: Float[Array, ""]
+    reason: Reason
+    bias_bound: Float[Array, ""]
+
+
+Rule = Callable[[Evidence], Weights]
+
+
+class FixedAlpha(eqx.Module):
+    """The same weight always.
+
+    Attributes:
+        alpha: from 0 to 1.
+    """
+
+    alpha: ArrayLike
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        """Apply the rule."""
+        alpha = jnp.asarray(self.alpha, evidence.first_norm.dtype)
+        return Weights(alpha, Reason.fixed, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class InverseVariance(eqx.Module):
+    r"""$\alpha = V^0/(V^0 + V^1)$, which has the least variance if both parts are independent, and no eye for bias."""
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        """Apply the rule."""
+        alpha = evidence.least_variance()
+        return Weights(alpha, Reason.inverse_variance, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class BiasConstrained(eqx.Module):
+    r"""Least variance as far as a bound on the bias allows.
+
+    $B = \|g^1 - g^0\|$ is the bias up to the error of $g^0$, which is at most $\varepsilon$ but for a chance of
+    $\delta$. Then $\alpha = 0$ if $\varepsilon > \gamma$; inverse variance if that keeps $\alpha B \le \gamma -
+    \varepsilon$; else $\alpha = (\gamma - \varepsilon)/B$.
+
+    Attributes:
+        gamma: the bias that is allowed: a norm, or with `is_relative` a share of the gradient's norm (that of the
+            unbiased part, with what its noise adds to it taken off).
+        bound: $L$, a bound on the norm of one zeroth-order term, for Bernstein's inequality as in the paper. None takes
+            an empirical bound that needs none: Student's quantile times the standard error of the whole vector. For a
+            mean near a normal distribution that is on the safe side whatever the covariance is, since among Gaussian
+            quadratic forms of equal mean the one of a single coordinate has the heaviest tail.
+        failure_probability: $\delta$, at most 0.2 for the empirical bound.
+        is_relative: whether `gamma` is a share.
+
+    References:
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+        arXiv:2202.00817, section 4. Székely, Bakirov. Extremal probabilities for Gaussian quadratic forms. Probability
+        Theory and Related Fields 126, 2003 (the empirical bound).
+    """
+
+    gamma: ArrayLike
+    bound: ArrayLike | None = None
+    failure_probability: float = eqx.field(static=True, default=0.05)
+    is_relative: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        _check_failure_probability(self.failure_probability, 1.0 if self.bound is not None else _MOST_FAILURES)
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        """Apply the rule."""
+        error = self.zeroth_error(evidence)
+        gamma = jnp.asarray(self.gamma, error.dtype)
+        if self.is_relative:
+            noise = evidence.zeroth_variance / evidence.real_count
+            gamma = gamma * jnp.sqrt(jnp.maximum(evidence.zeroth_norm**2 - noise, 0))
+        room, best, found = gamma - error, evidence.least_variance(), evidence.difference_norm
+        allowed = jnp.maximum(room, 0) / jnp.where(found > 0, found, 1)
+        is_free = best * found <= room
+        alpha = jnp.where(room < 0, 0, jnp.where(is_free, best, allowed))
+        reason = Reason.where(is_free, Reason.inverse_variance, Reason.bias_limit)
+        reason = Reason.where(room < 0, Reason.uncertain, reason)
+        return Weights(alpha, reason, alpha * (found + error))
+
+    def zeroth_error(self, evidence: Evidence) -> Float[Array, ""]:
+        """Give ε, which the error of the unbiased part exceeds with chance δ at most."""
+        if self.bound is None:
+            return confidence_radius(evidence.zeroth_variance, evidence.count, self.failure_probability)
+        logarithm = jnp.log((evidence.dim + 1) / self.failure_probability)
+        count = evidence.real_count
+        return jnp.sqrt(2 * evidence.zeroth_variance * logarithm / count) + 2 * jnp.asarray(self.bound) * logarithm / (
+            3 * count
+        )
+
+
+class Concavity(eqx.Module):
+    r"""Inverse variance if $V^1 + \varepsilon \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
+
+    A smooth cost satisfies it with $c = 0$ on average (a Poincaré inequality one order up); one that jumps has too much
+    variance for its derivatives.
+
+    Attributes:
+        slack: $c$.
+        tolerance: $\varepsilon$, in squared cost.
+
+    References:
+        Onoda et al., arXiv:2604.18161 (DDCG), here with the noise of each coordinate in its own standard deviations.
+    """
+
+    slack: float = 0.3
+    tolerance: float = 0.0
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        """Apply the rule."""
+        needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
+        is_smooth = evidence.scaled_first_variance + self.tolerance >= needed
+        alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
+        reason = Reason.where(is_smooth, Reason.inverse_variance, Reason.inconsistent)
+        return Weights(alpha, reason, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class Consistent(eqx.Module):
+    r"""First order where the derivatives explain the costs, weighed by least error; the default.
+
+    Two questions, the sharper first. Do the derivatives of the samples explain the differences of their costs (see
+    `consistency`)? If a share of more than `threshold` remains, $\alpha = 0$. If so, is the difference of both parts
+    larger than its own noise, $\|g^1 - g^0\| > \varepsilon$ with chance of failure $\delta$? The excess
+    $\|g^1 - g^0\|^2 - \varepsilon^2$ joins the variance of the first order,
+    $\alpha = V^0/(V^0 + V^1 + n\,\text{excess})$, the weight of least mean squared error.
+
+    The first sees jumps with few samples and in many dimensions, where the second knows nothing; the second sees small
+    biases with many. Neither has a constant with a unit.
+
+    Attributes:
+        threshold: share of the squared secants that may remain unexplained. A bias is then at most its root times
+            $\mathrm{sd}(f)/\sigma$.
+        failure_probability: $\delta$, at most 0.2.
+
+    References:
+        Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal
+        of the American Statistical Association 86, 1991 (weights from the squared difference).
+    """
+
+    threshold: float = eqx.field(static=True, default=0.1)
+    failure_probability: float = eqx.field(static=True, default=0.05)
+
+    def __check_init__(self):
+        _check_failure_probability(self.failure_probability, _MOST_FAILURES)
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        """Apply the rule."""
+        error = confidence_radius(evidence.difference_variance, evidence.count, self.failure_probability)
+        excess = jnp.maximum(evidence.difference_norm**2 - error**2, 0)
+        rest = evidence.first_variance + evidence.real_count * excess
+        total = evidence.zeroth_variance + rest
+        best = jnp.where(total > 0, evidence.zeroth_variance / jnp.where(total > 0, total, 1), 1)
+        is_consistent = evidence.inconsistency <= self.threshold
+        alpha = jnp.where(is_consistent, best, 0)
+        reason = Reason.where(excess > 0, Reason.bias_limit, Reason.inverse_variance)
+        reason = Reason.where(is_consistent, reason, Reason.inconsistent)
+        return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
+
+
+# Beyond, a single coordinate is not the worst case among Gaussian quadratic forms.
+_MOST_FAILURES = 0.2
+_LONGEST_TABLE = 1000
+
+
+def confidence_radius(
+    variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
+) -> Float[Array, ""]:
+    """Give what the norm of a mean's error exceeds with at most some chance; see `BiasConstrained.bound`.
+
+    Args:
+        variance: trace of the covariance of one sample.
+        count: samples, at least 2; fewer give infinity.
+        failure_probability: at most 0.2.
+
+    Returns:
+        The radius, in the units of the mean.
+    """
+    # JAX has no quantile of Student's t; a table on the host has, and beyond it is constant to three digits.
+    freedom = np.arange(1, _LONGEST_TABLE)
+    quantiles = np.concatenate([[np.inf, np.inf], stats.t.isf(failure_probability / 2, freedom)])
+    quantile = jnp.asarray(quantiles, variance.dtype)[jnp.clip(count, 0, _LONGEST_TABLE)]
+    spread = jnp.sqrt(variance / jnp.maximum(count, 1).astype(variance.dtype))
+    return jnp.where(count >= 2, quantile * spread, jnp.inf)
+
+
+def _check_failure_probability(value: float, most: float) -> None:
+    if not 0 < value <= most or value >= 1:
+        raise ValueError(f"failure_probability must be above 0 and at most {most}, got {value}; 0.05 means 95 % sure")

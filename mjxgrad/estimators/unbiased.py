@@ -1,0 +1,100 @@
+r"""Unbiased terms that use derivatives only as far as they explain the costs.
+
+With noise $w_j$, score $s_j$, cost $f_j$ and a vector $a$ that does not depend on $w_j$,
+
+$$\mathbb{E}[(f_j - \beta\, a\cdot w_j - b)\, s_j + \beta\, P_j^\top a] = \nabla F$$
+
+for every $\beta$ and $b$ that do not depend on $w_j$ either, whatever $a$ is: $(a\cdot w_j)s_j$ has the mean of
+$P_j^\top a$, where $P_j^\top$ is the pull-back from the noise to the parameters. With $a$ the mean derivative of the other
+samples the linear part of the cost, which makes most of the noise of a zeroth-order estimate, is gone; where derivatives
+are wrong $\beta$ is near zero and what remains is the zeroth-order estimate itself. All of $a$, $\beta$ and $b$ leave
+sample j out, so nothing is lost to splitting.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjxgrad.estimators.by_noise import SamplesByNoise
+
+
+class UnbiasedTerms(eqx.Module):
+    """One term per sample, whose mean is the estimate.
+
+    Attributes:
+        by_noise: before the pull-back.
+        beta: share of the linear part that was taken off; zero is zeroth order.
+        linear_variance: variance of the linear part $a\\cdot w$ over the samples.
+    """
+
+    by_noise: Float[Array, "samples m"]
+    beta: Float[Array, " samples"]
+    linear_variance: Float[Array, ""]
+
+
+def gram(samples: SamplesByNoise) -> Float[Array, "samples samples"]:
+    """Give the slope of sample i along the noise of sample k, from which all comparisons follow."""
+    return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def unbiased_terms(
+    samples: SamplesByNoise, slopes: Float[Array, "samples samples"], *, with_derivatives: bool
+) -> UnbiasedTerms:
+    """Give the terms of a chunk.
+
+    Args:
+        samples: of the chunk.
+        slopes: their `gram`.
+        with_derivatives: whether they are used; without, the terms are those of the zeroth-order estimate.
+
+    Returns:
+        The terms; those of samples without a cost are zero or meaningless, and masked by their pull-back.
+    """
+    costs, has_cost = samples.costs, samples.has_cost.astype(samples.costs.dtype)
+    has_slope = samples.has_derivative.astype(costs.dtype)
+    num_slopes = has_slope.sum()
+    # Row j leaves sample j out.
+    others = has_cost[None, :] * (1 - jnp.eye(len(costs), dtype=costs.dtype))
+    num_others = jnp.maximum(others.sum(axis=1), 1)
+    # (mean derivative without j) · w_k
+    along = (slopes.sum(axis=0)[None, :] - slopes) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
+    if with_derivatives:
+        beta, linear_variance = _fitted_share(samples, slopes, others, num_others)
+    else:
+        beta, linear_variance = jnp.zeros_like(costs), jnp.zeros_like(num_slopes)
+    rest = costs[None, :] - beta[:, None] * along
+    baseline = (others * rest).sum(axis=1) / num_others
+    residual = jnp.diagonal(rest) - baseline
+    total = samples.derivatives.sum(axis=0)[None, :]
+    without = (total - samples.derivatives) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
+    by_noise = residual[:, None] * samples.scores + beta[:, None] * without
+    return UnbiasedTerms(by_noise, beta, linear_variance)
+
+
+def _fitted_share(
+    samples: SamplesByNoise,
+    slopes: Float[Array, "samples samples"],
+    others: Float[Array, "samples samples"],
+    num_others: Float[Array, " samples"],
+) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
+    """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
+
+    The share that minimises the variance of the remaining costs also minimises, up to their fourth moments, that of the
+    estimate: its variance is that of the costs times that of the score.
+    """
+    has_slope = samples.has_derivative.astype(slopes.dtype)
+    count = has_slope.sum() - has_slope[:, None] - has_slope[None, :]
+    along = (slopes.sum(axis=0)[None, :] - slopes - jnp.diagonal(slopes)[None, :]) / jnp.maximum(count, 1)
+    weights = others * (count >= 1)
+
+    def centred(values: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+        mean = (weights * values).sum(axis=1) / jnp.maximum(weights.sum(axis=1), 1)
+        return weights * (values - mean[:, None])
+
+    explaining, explained = centred(along), centred(jnp.broadcast_to(samples.costs, along.shape))
+    squares = (explaining**2).sum(axis=1)
+    has_any = squares > 0
+    share = (explaining * explained).sum(axis=1) / jnp.where(has_any, squares, 1)
+    variance = squares.sum() / jnp.maximum((num_others * samples.has_cost).sum(), 1)
+    return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
