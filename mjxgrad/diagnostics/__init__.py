@@ -1,18 +1,39 @@
 """How far gradients can be trusted, measured."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
+from mjxgrad.diagnostics.budget import Rollouts, Seconds
+from mjxgrad.diagnostics.comparison import Comparison, compare
+from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.statistics import (
+    bias_interval,
+    binomial_bound,
+    binomial_interval,
     bootstrap_variance_interval,
     chi_square_variance_interval,
     mean_interval,
+    root_mean_square_interval,
 )
+from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
 
 __all__ = [
     "BiasVariance",
+    "Comparison",
+    "EmpiricalBias",
     "Landscape",
+    "Rollouts",
+    "Seconds",
+    "VarianceInterval",
+    "bias_interval",
     "bias_variance",
+    "binomial_bound",
+    "binomial_interval",
     "bootstrap_variance_interval",
     "chi_square_variance_interval",
+    "compare",
+    "empirical_bias",
+    "first_order_samples",
     "mean_interval",
+    "root_mean_square_interval",
+    "variance_interval",
 ]

@@ -1,4 +1,4 @@
-"""Intervals for means and variances; on the host, in NumPy."""
+"""Intervals for means, biases, variances, errors and probabilities; on the host, in NumPy."""
 
 from collections.abc import Iterator
 
@@ -33,8 +33,140 @@ def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, 
     """
     mean, standard_error = np.asarray(mean, float), np.asarray(standard_error, float)
     freedom = np.maximum(np.asarray(count, float) - 1, 1)
-    half = stats.t.ppf(0.5 + _checked(confidence) / 2, freedom) * standard_error
+    half = stats.t.ppf(0.5 + checked(confidence) / 2, freedom) * standard_error
     return np.stack([mean - half, mean + half])
+
+
+def bias_interval(
+    mean: ArrayLike,
+    standard_error: ArrayLike,
+    count: ArrayLike,
+    reference: ArrayLike,
+    reference_error: ArrayLike = 0.0,
+    reference_count: ArrayLike = np.inf,
+    confidence: float = 0.95,
+) -> Interval:
+    """Give Welch's interval of a bias, the difference of a mean to a reference that has an error of its own.
+
+    Args:
+        mean: of the samples.
+        standard_error: of the mean.
+        count: number of independent samples behind it, at least 2.
+        reference: what the mean should be; independent of the samples.
+        reference_error: its standard error, zero for a closed form.
+        reference_count: number of independent samples behind that error; infinite if it is known.
+        confidence: chance to cover the bias.
+
+    Returns:
+        Lower and upper ends, with the Welch-Satterthwaite degrees of freedom; NaN where there is no standard error.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1.
+
+    References:
+        Welch. The generalization of 'Student's' problem when several different population variances are involved.
+        Biometrika 34, 1947, equation 28.
+    """
+    own, other = np.square(np.asarray(standard_error, float)), np.square(np.asarray(reference_error, float))
+    freedom = np.maximum(np.asarray(count, float) - 1, 1)
+    reference_freedom = np.maximum(np.asarray(reference_count, float) - 1, 1)
+    both = own + other
+    scale = np.where(both > 0, both, 1)
+    # As shares of the whole, so that errors of 1e-200 do not underflow when squared.
+    inverse = (own / scale) ** 2 / freedom + (other / scale) ** 2 / reference_freedom
+    with np.errstate(divide="ignore"):
+        freedom = 1 / inverse
+    half = stats.t.ppf(0.5 + checked(confidence) / 2, freedom) * np.sqrt(both)
+    bias = np.asarray(mean, float) - np.asarray(reference, float)
+    return np.stack([bias - half, bias + half])
+
+
+def root_mean_square_interval(
+    squared_errors: Float[np.ndarray, "*batch repeats"],
+    confidence: float = 0.95,
+    *,
+    reference_variance: ArrayLike = 0.0,
+    cross_variance: ArrayLike = 0.0,
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "2 *batch"]]:
+    r"""Give the root-mean-square error of an estimate from its repetitions, with an interval.
+
+    The mean of squared errors is never negative and skewed, so its interval is that of a gamma distribution with the
+    same mean and variance (a chi-square with Satterthwaite's degrees of freedom): exact for one unbiased normal
+    coordinate if its kurtosis were known, the usual normal interval where a bias dominates.
+
+    A reference with a variance $v$ of its own adds $v$ to the mean, which is taken off again, and its error is common
+    to all repetitions, so it widens the interval.
+
+    Args:
+        squared_errors: squared distance of each repetition to the reference.
+        confidence: chance to cover the truth.
+        reference_variance: $v$, the sum over coordinates of the reference's squared standard errors.
+        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, what the error $e$ of the reference adds to the variance of the
+            mean, $b$ being the bias.
+
+    Returns:
+        The root-mean-square error, zero where the reference is too uncertain to see one, and the ends of its interval.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1.
+
+    References:
+        Satterthwaite. An approximate distribution of estimates of variance components. Biometrics Bulletin 2, 1946.
+    """
+    tail = (1 - checked(confidence)) / 2
+    squared_errors = np.asarray(squared_errors, float)
+    repeats = squared_errors.shape[-1]
+    mean = squared_errors.mean(axis=-1)
+    variance = squared_errors.var(axis=-1, ddof=1) / repeats + np.asarray(cross_variance, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = 2 * mean**2 / variance
+        ends = [mean * freedom / stats.chi2.isf(tail, freedom), mean * freedom / stats.chi2.ppf(tail, freedom)]
+    # All errors alike, by rounding or in truth: the error is known.
+    ends = np.where(freedom < 1e12, ends, mean)
+    taken_off = np.asarray(reference_variance, float)
+    return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
+
+
+def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float[np.ndarray, " 2"]:
+    """Give the Clopper-Pearson interval of a probability, which covers at least as often as it says.
+
+    Args:
+        count: how often it happened.
+        total: how often it might have.
+        confidence: chance to cover the probability.
+
+    Returns:
+        Lower and upper end.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1, or `count` not between 0 and `total`.
+
+    References:
+        Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
+        26, 1934.
+    """
+    tail = (1 - checked(confidence)) / 2
+    low = 0.0 if count == 0 else stats.beta.ppf(tail, count, total - count + 1)
+    return np.array([low, binomial_bound(count, total, 1 - tail)])
+
+
+def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
+    """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %.
+
+    Args:
+        count: how often it happened.
+        total: how often it might have.
+        confidence: chance that the probability is below the bound.
+
+    Returns:
+        The bound.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1, or `count` not between 0 and `total`.
+    """
+    if not 0 <= count <= total or total < 1:
+        raise ValueError(f"count must be between 0 and total, which is at least 1, got {count} of {total}")
+    return 1.0 if count == total else float(stats.beta.ppf(checked(confidence), count + 1, total - count))
 
 
 def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
@@ -52,7 +184,7 @@ def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confiden
         ValueError: if `confidence` is not between 0 and 1.
     """
     freedom = np.asarray(count, float) - 1
-    tail = (1 - _checked(confidence)) / 2
+    tail = (1 - checked(confidence)) / 2
     sum_of_squares = np.asarray(variance, float) * freedom
     return np.stack([sum_of_squares / stats.chi2.isf(tail, freedom), sum_of_squares / stats.chi2.ppf(tail, freedom)])
 
@@ -83,7 +215,7 @@ def bootstrap_variance_interval(
     References:
         Efron, Tibshirani. An Introduction to the Bootstrap. Chapman & Hall 1993, section 13.3.
     """
-    tail = (1 - _checked(confidence)) / 2
+    tail = (1 - checked(confidence)) / 2
     if num_resamples < 1:
         raise ValueError(f"num_resamples must be at least 1, got {num_resamples}")
     samples = np.asarray(samples, float)
@@ -108,7 +240,18 @@ def _resampling_counts(count: int, num_resamples: int, seed: int) -> Iterator[In
         yield rng.multinomial(count, np.full(count, 1 / count), size)
 
 
-def _checked(confidence: float) -> float:
+def checked(confidence: float) -> float:
+    """Give the confidence back, refusing what is no chance.
+
+    Args:
+        confidence: of an interval.
+
+    Returns:
+        The same.
+
+    Raises:
+        ValueError: if it is not between 0 and 1.
+    """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
     return confidence

@@ -8,7 +8,7 @@ All methods are for one point and are traceable: a sweep of points, noise or wid
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-    arXiv:2202.00817, examples 3.2 and 3.4, figure 2.
+    arXiv:2202.00817, section 3 and figure 2.
 """
 
 from mjxgrad.tasks.textbook.problem import Textbook

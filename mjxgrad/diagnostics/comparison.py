@@ -1,0 +1,234 @@
+"""Estimators side by side, at equal rollouts or at equal time."""
+
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+
+from mjxgrad.diagnostics.budget import Affordable, Estimator, Rollouts, Seconds, affordable
+from mjxgrad.diagnostics.reference import map_in_chunks
+from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval
+from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
+from mjxgrad.estimators.estimate import GradientEstimate
+from mjxgrad.objective import Objective
+
+# Rollouts at a time over all repetitions that run together: enough to fill a CPU's vector units.
+_ROLLOUTS_AT_A_TIME = 4096
+
+
+class Comparison(eqx.Module):
+    r"""What `compare` measured, one row per estimator in the order of `names`.
+
+    Everything is about the estimate as a whole, not about one sample of it. Intervals have their lower and upper ends
+    on the first axis.
+
+    Attributes:
+        names: of the estimators.
+        num_samples: that each was asked for.
+        num_rollouts: that one estimate reports to have spent, at most the budget.
+        num_gradient_rollouts: of those, the ones that were differentiated.
+        seconds: median time of one estimate, compiled and warm; NaN for a budget of rollouts.
+        num_repeats: estimates of each.
+        num_finite: of those, the finite ones, which all that follows is taken from.
+        finite_fraction: mean share of finite samples within those.
+        mean: of the estimates.
+        bias: mean less reference.
+        bias_interval: Welch's, with the reference's own error.
+        rmse: root-mean-square distance to the truth, the reference's variance taken off.
+        rmse_interval: see `root_mean_square_interval`.
+        variance: trace of the covariance of the estimates.
+        variance_interval: of it.
+        variance_methods: how each of those intervals was found, "chi_square" or "bootstrap".
+        claimed_variance: mean of what the estimates say of themselves, the sum of their squared standard errors; for an
+            honest estimator the same as `variance`.
+        reference: what was compared with.
+        reference_error: its standard error.
+        confidence: of every interval.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    num_samples: Int[np.ndarray, " estimators"]
+    num_rollouts: Int[np.ndarray, " estimators"]
+    num_gradient_rollouts: Int[np.ndarray, " estimators"]
+    seconds: Float[np.ndarray, " estimators"]
+    num_repeats: int = eqx.field(static=True)
+    num_finite: Int[np.ndarray, " estimators"]
+    finite_fraction: Float[np.ndarray, " estimators"]
+    mean: Float[np.ndarray, "estimators dim"]
+    bias: Float[np.ndarray, "estimators dim"]
+    bias_interval: Float[np.ndarray, "2 estimators dim"]
+    rmse: Float[np.ndarray, " estimators"]
+    rmse_interval: Float[np.ndarray, "2 estimators"]
+    variance: Float[np.ndarray, " estimators"]
+    variance_interval: Float[np.ndarray, "2 estimators"]
+    variance_methods: tuple[str, ...] = eqx.field(static=True)
+    claimed_variance: Float[np.ndarray, " estimators"]
+    reference: Float[np.ndarray, " dim"]
+    reference_error: Float[np.ndarray, " dim"]
+    confidence: float = eqx.field(static=True)
+
+    @property
+    def is_biased(self) -> Bool[np.ndarray, " estimators"]:
+        """Whether some coordinate's interval of the bias leaves zero out; with many coordinates some do by chance."""
+        low, high = self.bias_interval
+        return ((low > 0) | (high < 0)).any(axis=-1)
+
+
+def compare(
+    estimators: Mapping[str, Estimator],
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    budget: Rollouts | Seconds,
+    reference: tuple[ArrayLike, ArrayLike] | ArrayLike,
+    num_repeats: int = 200,
+    confidence: float = 0.95,
+    progress: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Measure root-mean-square error, bias and variance of estimators that may spend the same.
+
+    Each estimator gets the largest `num_samples` for which the rollouts that it reports, or the time that it takes,
+    stay within the budget. Its repetitions are independent and run in one compiled program, which serves the next call
+    with the same estimator and shapes, too. All estimators have the same keys, so that differences are less luck.
+
+    Args:
+        estimators: by name; each is called as `mjxgrad.estimators.zeroth_order` is. Settings are bound by
+            `functools.partial`.
+        objective: to estimate the gradient of.
+        params: where.
+        key: consumed here.
+        budget: `Rollouts(count)` or `Seconds(seconds)` for one estimate.
+        reference: the true gradient, and its standard error; or the gradient alone if it is exact (a closed form). The
+            error is taken as known well: it comes from many more samples than an estimate has.
+        num_repeats: estimates of each. At least 2.
+        confidence: of the intervals.
+        progress: called after every estimator with how many are done and how many there are.
+
+    Returns:
+        The comparison. Estimates that are not finite are counted, and left out.
+
+    Raises:
+        ValueError: if there is no estimator, the budget buys no estimate of one, fewer than two of its estimates are
+            finite, shapes do not fit, or a number is out of range.
+
+    Example:
+        >>> compare(
+        ...     {"first": first_order, "pairs": functools.partial(zeroth_order, antithetic=True)},
+        ...     objective, params, key, budget=Rollouts(100), reference=(truth, standard_error),
+        ... )
+    """
+    checked(confidence)
+    if not estimators:
+        raise ValueError("estimators must have at least one entry, got none")
+    if num_repeats < 2:
+        raise ValueError(f"num_repeats must be at least 2, got {num_repeats}")
+    params = jnp.asarray(params)
+    objective = objective.sized_for(params)
+    truth, error = _reference(reference, params.shape)
+    timing_key, repeats_key = jax.random.split(key)
+    rows = []
+    for name, estimator in estimators.items():
+        try:
+            bought = affordable(estimator, objective, params, timing_key, budget)
+        except ValueError as refusal:
+            raise ValueError(f"{name}: {refusal}") from refusal
+        at_a_time = max(1, min(num_repeats, _ROLLOUTS_AT_A_TIME // bought.num_samples))
+        estimates = _repeat(
+            estimator, objective, params, jax.random.split(repeats_key, num_repeats), bought.num_samples, at_a_time
+        )
+        rows.append(_row(name, jax.tree.map(np.asarray, estimates), bought, truth, error, confidence))
+        if progress is not None:
+            progress(len(rows), len(estimators))
+    columns = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    intervals = {name: np.moveaxis(columns.pop(name), 1, 0) for name in list(columns) if name.endswith("interval")}
+    methods = tuple(str(method) for method in columns.pop("variance_methods"))
+    return Comparison(
+        names=tuple(estimators),
+        num_repeats=num_repeats,
+        variance_methods=methods,
+        reference=truth,
+        reference_error=error,
+        confidence=confidence,
+        **columns,
+        **intervals,
+    )
+
+
+@eqx.filter_jit
+def _repeat(
+    estimator: Estimator,
+    objective: Objective,
+    params: Float[Array, " dim"],
+    keys: Key[Array, " repeats"],
+    num_samples: int,
+    at_a_time: int,
+) -> GradientEstimate:
+    return map_in_chunks(lambda key: estimator(objective, params, key, num_samples=num_samples), keys, at_a_time)
+
+
+def _row(
+    name: str,
+    estimates: GradientEstimate,
+    bought: Affordable,
+    truth: Float[np.ndarray, " dim"],
+    error: Float[np.ndarray, " dim"],
+    confidence: float,
+) -> dict[str, object]:
+    """Work out all columns of one estimator."""
+    is_finite = np.isfinite(estimates.value).all(axis=-1)
+    count = int(is_finite.sum())
+    if count < 2:
+        raise ValueError(
+            f"{name} must give at least 2 finite estimates, got {count} of {is_finite.size}: its rollouts, or their "
+            "derivatives, are not finite; more samples or another estimator may help"
+        )
+    values = np.asarray(estimates.value, float)[is_finite]
+    mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
+    bias = mean - truth
+    rmse, rmse_ends = root_mean_square_interval(
+        ((values - truth) ** 2).sum(axis=1),
+        confidence,
+        reference_variance=(error**2).sum(),
+        cross_variance=(4 * (bias * error) ** 2 + 2 * error**4).sum(),
+    )
+    spread_interval: VarianceInterval = variance_interval(values, confidence)
+    return {
+        "num_samples": bought.num_samples,
+        "num_rollouts": estimates.num_rollouts.flat[0],
+        "num_gradient_rollouts": estimates.num_gradient_rollouts.flat[0],
+        "seconds": bought.seconds,
+        "num_finite": count,
+        "finite_fraction": float((estimates.num_finite / estimates.num_samples)[is_finite].mean()),
+        "mean": mean,
+        "bias": bias,
+        "bias_interval": bias_interval(mean, spread / np.sqrt(count), count, truth, error, confidence=confidence),
+        "rmse": rmse,
+        "rmse_interval": rmse_ends,
+        "variance": spread_interval.value,
+        "variance_interval": spread_interval.ends,
+        "variance_methods": spread_interval.method,
+        "claimed_variance": float((np.asarray(estimates.standard_error, float)[is_finite] ** 2).sum(axis=1).mean()),
+    }
+
+
+def _reference(
+    reference: tuple[ArrayLike, ArrayLike] | ArrayLike, shape: tuple[int, ...]
+) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
+    value, error = reference if isinstance(reference, tuple) else (reference, 0.0)
+    value, error = np.asarray(value, float), np.asarray(error, float)
+    # One number is enough for one parameter.
+    value = value.reshape(shape) if value.shape == () and shape == (1,) else value
+    if value.shape != shape or error.shape not in ((), shape):
+        raise ValueError(
+            f"reference must have the shape {shape} of params, got {value.shape} with an error of shape {error.shape}; "
+            "pass (value, standard_error), or the value alone if it is exact"
+        )
+    error = np.broadcast_to(error, shape)
+    if not np.isfinite(value).all() or not (error >= 0).all():
+        raise ValueError(f"reference must be finite with errors of at least 0, got {value} ± {error}")
+    return value, error

@@ -1,0 +1,272 @@
+"""Intervals cover as often as they say, and estimators are compared at what they really spend."""
+
+import functools
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.diagnostics import (
+    Rollouts,
+    Seconds,
+    bias_interval,
+    binomial_bound,
+    binomial_interval,
+    compare,
+    root_mean_square_interval,
+    variance_interval,
+)
+from mjxgrad.diagnostics.budget import affordable
+from mjxgrad.estimators import first_order, zeroth_order
+from mjxgrad.objective import parameter_noise
+from mjxgrad.tasks import textbook
+
+STDDEV, POINT, REPEATS = 0.1, 0.03, 4000
+RAMP = textbook.soft_heaviside(0.1)
+TRUTH = float(RAMP.gradient(POINT, STDDEV))
+PAIRS = functools.partial(zeroth_order, antithetic=True)
+ZERO_NOISE = functools.partial(zeroth_order, baseline="zero_noise")
+
+
+def share(low, high, truth) -> float:
+    return float(((low <= truth) & (truth <= high)).mean())
+
+
+def near(confidence: float, slack: float = 0.0):
+    """Four standard errors of a frequency over the repeats, and what an approximation may be off."""
+    return pytest.approx(confidence, abs=4 * np.sqrt(confidence * (1 - confidence) / REPEATS) + slack)
+
+
+def test_an_interval_of_a_bias_covers_with_a_reference_as_uncertain_as_the_mean():
+    """Mean of 5 samples of deviation 2, reference of 8 of deviation 3, bias 0.7; unequal variances are Welch's case."""
+    rng = np.random.default_rng(0)
+    samples, others = rng.normal(1.7, 2.0, (REPEATS, 5)), rng.normal(1.0, 3.0, (REPEATS, 8))
+    low, high = bias_interval(
+        samples.mean(1),
+        samples.std(1, ddof=1) / np.sqrt(5),
+        5,
+        others.mean(1),
+        others.std(1, ddof=1) / np.sqrt(8),
+        8,
+        0.9,
+    )
+    assert share(low, high, 0.7) == near(0.9, 0.005)
+
+
+def test_an_interval_of_a_bias_to_a_closed_form_is_student_s():
+    rng = np.random.default_rng(1)
+    samples = rng.normal(1.7, 2.0, (REPEATS, 4))
+    low, high = bias_interval(samples.mean(1), samples.std(1, ddof=1) / 2, 4, 1.0, confidence=0.9)
+    assert share(low, high, 0.7) == near(0.9)
+    np.testing.assert_array_equal(bias_interval(2.0, 0.0, 9, 1.5), [0.5, 0.5])
+
+
+@pytest.mark.parametrize("bias", [0.0, 1.0, 5.0])
+def test_an_interval_of_a_root_mean_square_covers_whether_bias_or_variance_makes_it(bias):
+    errors = np.random.default_rng(2).normal(bias, 1.0, (REPEATS, 100)) ** 2
+    rmse, (low, high) = root_mean_square_interval(errors, 0.9)
+    assert share(low, high, np.sqrt(bias**2 + 1)) == near(0.9, 0.01)
+    assert np.mean(rmse**2) == pytest.approx(bias**2 + 1, rel=0.01)
+
+
+def test_the_error_of_the_reference_is_taken_off_and_widens_the_interval():
+    """Bias 1, deviation 1; the reference is off by 0.5, which is common to all repetitions."""
+    rng = np.random.default_rng(3)
+    distances = rng.normal(1.0, 1.0, (REPEATS, 100)) - rng.normal(0.0, 0.5, (REPEATS, 1))
+    cross = 4 * (distances.mean(1) * 0.5) ** 2 + 2 * 0.5**4
+    rmse, (low, high) = root_mean_square_interval(distances**2, 0.9, reference_variance=0.25, cross_variance=cross)
+    assert np.mean(rmse**2) == pytest.approx(2.0, rel=0.03)
+    assert share(low, high, np.sqrt(2)) == near(0.9, 0.02)
+    _, (low, high) = root_mean_square_interval(distances**2, 0.9)
+    assert share(low, high, np.sqrt(2)) < 0.5
+
+
+@pytest.mark.parametrize("probability", [0.002, 0.03, 0.4])
+def test_an_interval_of_a_probability_covers_at_least_as_often_as_it_says(probability):
+    counts = np.random.default_rng(4).binomial(200, probability, REPEATS)
+    intervals = np.array([binomial_interval(count, 200, 0.9) for count in range(201)])[counts]
+    bounds = np.array([binomial_bound(count, 200, 0.9) for count in range(201)])[counts]
+    assert share(*intervals.T, probability) >= 0.9 - 4 * np.sqrt(0.09 / REPEATS)
+    assert (bounds >= probability).mean() >= 0.9 - 4 * np.sqrt(0.09 / REPEATS)
+
+
+def test_the_bound_of_what_was_never_seen_is_the_rule_of_three():
+    """(1 − p)^n = 0.05 at p = 1 − 0.05^(1/n), which is ln 20 / n to first order."""
+    assert binomial_bound(0, 1000) == pytest.approx(1 - 0.05 ** (1 / 1000), rel=1e-9)
+    assert binomial_bound(0, 1000) == pytest.approx(3 / 1000, rel=4e-3)
+    assert binomial_bound(7, 7) == 1
+
+
+def test_variances_of_normal_samples_get_chi_square_and_cover_in_several_coordinates():
+    """Coordinates of unequal size: total variance 1 + 9, where 3 (n − 1) degrees of freedom would be far too many."""
+    rng, covers, methods = np.random.default_rng(5), [], []
+    for _ in range(600):
+        found = variance_interval(rng.normal(0, [1.0, 3.0], (25, 2)), 0.9, num_resamples=100)
+        covers.append(found.ends[0] < 10 < found.ends[1])
+        methods.append(found.method)
+    assert np.mean(covers) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 600))
+    assert methods.count("chi_square") > 500
+
+
+def test_variances_of_other_samples_get_the_bootstrap():
+    """Exponential: chi-square covers 68 % here; a percentile bootstrap a little less than it says."""
+    rng, covers, methods = np.random.default_rng(6), [], []
+    for _ in range(300):
+        found = variance_interval(rng.exponential(1.0, (300, 1)), 0.9, num_resamples=200)
+        covers.append(found.ends[0] < 1 < found.ends[1])
+        methods.append(found.method)
+    assert np.mean(covers) == pytest.approx(0.87, abs=4 * np.sqrt(0.1 / 300))
+    assert set(methods) == {"bootstrap"}
+
+
+def test_a_variance_without_spread_is_zero_and_without_samples_is_none():
+    assert variance_interval(np.ones((30, 1))).value == 0
+    np.testing.assert_array_equal(variance_interval(np.ones((30, 1))).ends, [0, 0])
+    assert np.isnan(variance_interval(np.array([[1.0], [np.nan]])).value)
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Four estimators on the ramp, against its closed form."""
+    estimators = {"first": first_order, "zeroth": zeroth_order, "pairs": PAIRS, "zero noise": ZERO_NOISE}
+    return compare(
+        estimators,
+        RAMP.objective(STDDEV),
+        jnp.array([POINT]),
+        jax.random.key(0),
+        budget=Rollouts(51),
+        reference=TRUTH,
+        num_repeats=1000,
+    )
+
+
+def test_the_budget_is_of_rollouts_that_are_reported(table):
+    """Pairs need an even number, and a baseline without noise costs one more."""
+    assert table.names == ("first", "zeroth", "pairs", "zero noise")
+    np.testing.assert_array_equal(table.num_samples, [51, 51, 50, 50])
+    np.testing.assert_array_equal(table.num_rollouts, [51, 51, 50, 51])
+    np.testing.assert_array_equal(table.num_gradient_rollouts, [51, 0, 0, 0])
+
+
+def test_an_estimator_that_rolls_out_thrice_per_sample_gets_a_third_of_the_samples():
+    def thrice(objective, params, key, *, num_samples):
+        estimate = zeroth_order(objective, params, key, num_samples=num_samples)
+        return eqx.tree_at(lambda e: e.num_rollouts, estimate, jnp.asarray(3 * num_samples + 1))
+
+    bought = affordable(thrice, RAMP.objective(STDDEV), jnp.array([POINT]), jax.random.key(0), Rollouts(100))
+    assert bought.num_samples == 33
+
+
+def test_errors_are_those_of_the_closed_forms(table):
+    exact = np.array(
+        [
+            RAMP.first_order_variance(POINT, STDDEV) / 51,
+            RAMP.leave_one_out_variance(POINT, STDDEV, 51),
+            np.nan,
+            RAMP.zeroth_order_variance(POINT, STDDEV, 0.6) / 50,  # the ramp is at 2 · 0.03/0.1 there
+        ]
+    )
+    known = ~np.isnan(exact)
+    low, high = table.variance_interval
+    # 3 intervals of 95 %: wider by half they hold all but once in 300.
+    assert (low - 0.5 * (high - low) < exact)[known].all()
+    assert (exact < high + 0.5 * (high - low))[known].all()
+    np.testing.assert_allclose(table.rmse[known], np.sqrt(exact[known]), rtol=0.1)
+    np.testing.assert_allclose(table.claimed_variance, table.variance, rtol=0.15)
+    assert (np.abs(table.bias[:, 0]) < 4 * np.sqrt(table.variance / 1000)).all()
+
+
+def test_a_bias_shows_in_the_error_and_not_in_the_variance():
+    """A step on a parabola: first order converges to 2θ and misses the density of the noise at the step."""
+    step = textbook.heaviside()
+    objective = parameter_noise(lambda x: step(x) + x[0] ** 2, STDDEV, dim=1)
+    missed = float(step.gradient(POINT, STDDEV))
+    table = compare(
+        {"first": first_order},
+        objective,
+        jnp.array([POINT]),
+        jax.random.key(1),
+        budget=Rollouts(40),
+        reference=(np.array([missed + 2 * POINT]), 0.01),
+        num_repeats=300,
+    )
+    # Var 2w = 4σ².
+    assert table.variance[0] == pytest.approx(4 * STDDEV**2 / 40, rel=0.3)
+    low, high = table.bias_interval[:, 0, 0]
+    assert low < -missed < high
+    assert high - low > 2 * 1.9 * 0.01  # no narrower than the reference knows
+    assert table.is_biased[0]
+    assert table.rmse[0] == pytest.approx(missed, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
+    """Two samples, each infinite beyond one deviation (16 %): a few estimates have fewer than two and are NaN."""
+    objective = parameter_noise(lambda x: jnp.where(x[0] > STDDEV, jnp.inf, x[0] ** 2), STDDEV, dim=1)
+    table = compare(
+        {"first": first_order},
+        objective,
+        jnp.zeros(1),
+        jax.random.key(seed),
+        budget=Rollouts(2),
+        reference=0.0,
+        num_repeats=400,
+    )
+    expected = 400 * 0.8413447**2
+    assert abs(table.num_finite[0] - expected) < 4 * np.sqrt(expected * 0.3)
+    assert np.isfinite([table.rmse[0], table.variance[0], table.mean[0, 0]]).all()
+
+
+def test_a_budget_of_seconds_buys_the_samples_that_it_lasts_for():
+    """An estimator whose time is known: 20 µs per sample, and more on a busy machine but never less."""
+
+    def wait(num_samples, value):
+        time.sleep(2e-5 * num_samples)
+        return value
+
+    def slow(objective, params, key, *, num_samples):
+        estimate = first_order(objective, params, key, num_samples=num_samples)
+        shape = jax.ShapeDtypeStruct(estimate.value.shape, estimate.value.dtype)
+        value = jax.pure_callback(functools.partial(wait, num_samples), shape, estimate.value)
+        return eqx.tree_at(lambda e: e.value, estimate, value)
+
+    budget = Seconds(0.02, num_runs=3)
+    bought = affordable(slow, RAMP.objective(STDDEV), jnp.array([POINT]), jax.random.key(0), budget)
+    assert 0 < bought.seconds <= 0.02
+    assert 300 < bought.num_samples <= 1000
+    assert bought.seconds > 2e-5 * bought.num_samples
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"estimators": {}}, "estimators must have at least one entry, got none"),
+        ({"num_repeats": 1}, "num_repeats must be at least 2, got 1"),
+        ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
+        ({"reference": np.zeros(2)}, r"reference must have the shape \(1,\) of params, got \(2,\)"),
+        ({"reference": (0.0, -1.0)}, "reference must be finite with errors of at least 0"),
+        (
+            {"estimators": {"pairs": PAIRS}, "budget": Rollouts(3)},
+            "pairs: .*num_samples must be at least 4 with antithetic pairs",
+        ),
+        ({"budget": Seconds(1e-9, num_runs=1)}, "first: budget of 1e-09 s buys no estimate: 4 samples take"),
+        (
+            {"objective": parameter_noise(lambda x: x[0] * jnp.nan, 0.1, dim=1), "num_repeats": 3},
+            "first must give at least 2 finite estimates, got 0 of 3",
+        ),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(arguments, sentence):
+    good = {"objective": RAMP.objective(STDDEV), "estimators": {"first": first_order}, "reference": TRUTH}
+    good |= {"budget": Rollouts(4), "params": jnp.array([POINT]), "key": jax.random.key(0)}
+    with pytest.raises(ValueError, match=sentence):
+        compare(**(good | arguments))
+
+
+@pytest.mark.parametrize("make", [lambda: Rollouts(1), lambda: Seconds(0.0), lambda: Seconds(1.0, num_runs=0)])
+def test_a_budget_of_nothing_is_refused(make):
+    with pytest.raises(ValueError, match="must be"):
+        make()
