@@ -1,0 +1,147 @@
+"""An interrupted run loses nothing, and a file that is not its own is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import mjxgrad as mg
+from tests.optimiser import problems
+
+START = jnp.array([0.0, 0.5])
+KEY = jax.random.key(2)
+
+
+class Killed(Exception):
+    pass
+
+
+def run(path=None, *, rate=0.05, num_steps=40, **settings):
+    settings = {"optimiser": optax.adam(rate), "num_steps": num_steps, "segment": 7, **settings}
+    return mg.optimise(
+        lambda scale: problems.objective.with_stddev(0.1 * scale),
+        START,
+        settings.pop("key", KEY),
+        estimator=problems.first_order,
+        smoothing=mg.Plateau(patience=3),
+        convergence=mg.Convergence(cost=0.0, window=15),
+        evaluate=problems.bowl,
+        checkpoint=path,
+        **settings,
+    )
+
+
+def kill_at(step, error):
+    def callback(progress):
+        if progress.step >= step:
+            raise error
+
+    return callback
+
+
+def assert_same(one, other):
+    """Bit for bit, the clocks apart."""
+    ignored = {"seconds", "compile_seconds"}
+    flat = [jax.tree_util.tree_flatten_with_path(result)[0] for result in (one, other)]
+    assert len(flat[0]) == len(flat[1]) > 15
+    for (path, x), (_, y) in zip(*flat, strict=True):
+        if not any(getattr(entry, "name", None) in ignored for entry in path):
+            np.testing.assert_array_equal(x, y, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted():
+    return run()
+
+
+@pytest.mark.parametrize("error", [Killed, KeyboardInterrupt])
+def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uninterrupted, error):
+    path = tmp_path / "run.npz"
+    for step in (7, 21):
+        with pytest.raises(error):
+            run(path, callback=kill_at(step, error))
+    steps = []
+    resumed = run(path, callback=lambda progress: steps.append(progress.step))
+    assert steps == [28, 35, 40]
+    assert_same(resumed, uninterrupted)
+
+
+def test_an_interruption_between_two_saves_loses_nothing(tmp_path, uninterrupted):
+    path = tmp_path / "run.npz"
+    with pytest.raises(Killed):
+        run(path, checkpoint_every=100, callback=kill_at(14, Killed))
+    steps = []
+    assert_same(run(path, callback=lambda progress: steps.append(progress.step)), uninterrupted)
+    assert steps[0] == 21
+
+
+def test_a_run_stopped_by_its_callback_can_go_on(tmp_path, uninterrupted):
+    path = tmp_path / "run.npz"
+    assert run(path, callback=lambda progress: True).stopped == mg.Stopped.interrupted
+    assert_same(run(path), uninterrupted)
+
+
+def test_a_finished_run_is_read_without_running(tmp_path, uninterrupted):
+    path = tmp_path / "run.npz"
+    run(path)
+    assert_same(run(path, callback=kill_at(0, Killed)), uninterrupted)
+
+
+def test_many_seeds_are_resumed(tmp_path):
+    path, keys = tmp_path / "run.npz", jax.random.split(KEY, 3)
+    with pytest.raises(Killed):
+        run(path, key=keys, callback=kill_at(7, Killed))
+    assert_same(run(path, key=keys), run(key=keys))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "run.npz"
+    run(path, callback=lambda progress: True)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"num_steps": 41}, "num_steps was 40 and is 41"),
+        ({"segment": 8}, "segment was 7 and is 8"),
+        ({"rate": 0.06}, "objective, estimator, optimiser, method or versions of the libraries"),
+        ({"key": jax.random.key(3)}, "params or key"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(written, settings, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        run(written, **settings)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "not_an_archive"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, written, damage):
+    content = bytearray(written.read_bytes())
+    if damage == "cut":
+        content = content[: len(content) // 2]
+    elif damage == "flipped":
+        content[len(content) // 3] ^= 0xFF
+    else:
+        content = b"something else"
+    path = tmp_path / "run.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"checkpoint must be a file that a run has saved, got .*delete it to begin anew"):
+        run(path)
+
+
+def test_a_save_that_fails_leaves_the_former_file(tmp_path, monkeypatch):
+    path = tmp_path / "run.npz"
+    with pytest.raises(Killed):
+        run(path, callback=kill_at(7, Killed))
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        run(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]

@@ -1,0 +1,79 @@
+"""The same steps in a loop of one's own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import mjxgrad as mg
+from tests.optimiser import problems
+from tests.optimiser.problems import CENTRE, CURVATURE, made_up
+
+START = jnp.array([0.0, 0.5])
+
+
+def loop(transformation, num_steps, **extra):
+    def step(carry, _):
+        params, state = carry
+        change, state = transformation.update(None, state, params, **extra)
+        return (optax.apply_updates(params, change), state), params
+
+    return jax.jit(lambda p: jax.lax.scan(step, (p, transformation.init(p)), length=num_steps)[0])(START)
+
+
+def test_the_trajectory_is_that_of_optimise(key):
+    settings = {
+        "optimiser": optax.adam(0.05),
+        "smoothing": mg.Plateau(patience=3),
+        "trust_region": mg.TrustRegion(0.7),
+        "clip_norm": 0.9,
+    }
+
+    def smoothed(scale):
+        return problems.objective.with_stddev(0.1 * scale)
+
+    result = mg.optimise(smoothed, START, key, estimator=problems.first_order, num_steps=25, **settings)
+    params, state = loop(mg.estimated_gradient(smoothed, problems.first_order, key=key, **settings), 25)
+    # Two programs may be compiled to different rounding.
+    np.testing.assert_allclose(params, result.params, rtol=1e-12)
+    np.testing.assert_allclose(jnp.linalg.norm(state.estimate.value), result.history.gradient_norm[-1], rtol=1e-9)
+    assert state.step == 25
+    np.testing.assert_allclose(state.scale, result.history.scale[-1])
+
+
+def test_without_an_optimiser_it_is_the_gradient_for_a_chain(key):
+    transformation = optax.chain(mg.estimated_gradient(problems.objective, problems.exact, key=key), optax.sgd(0.1))
+    params, _ = loop(transformation, 30)
+    np.testing.assert_allclose(params, CENTRE + (START - CENTRE) * (1 - 0.1 * CURVATURE) ** 30, rtol=1e-12)
+
+
+def test_another_objective_and_key_can_be_given_for_an_update(key):
+    other_key, shifted = jax.random.key(1), mg.parameter_noise(lambda x: problems.bowl(x - 1), 0.3, dim=2)
+    transformation = mg.estimated_gradient(problems.objective, problems.first_order, key=key)
+    state = transformation.init(START)
+    change, _ = transformation.update(None, state, START, key=other_key, objective=shifted)
+    expected = problems.first_order(shifted, START, jax.random.fold_in(other_key, 0)).value
+    np.testing.assert_allclose(change, expected, rtol=1e-12)
+
+
+def test_the_gradient_of_anything_else_is_added(key):
+    transformation = mg.estimated_gradient(problems.objective, problems.exact, key=key)
+    change, _ = transformation.update(jnp.array([0.25, 0.5]), transformation.init(START), START)
+    np.testing.assert_allclose(change, CURVATURE * (START - CENTRE) + jnp.array([0.25, 0.5]), rtol=1e-12)
+
+
+def test_an_estimate_that_is_not_finite_is_a_zero_update_and_counted(key):
+    transformation = mg.estimated_gradient(problems.objective, lambda *_: made_up([jnp.nan, 1.0]), key=key)
+    change, state = transformation.update(None, transformation.init(START), START)
+    np.testing.assert_array_equal(change, 0)
+    assert state.num_skipped == 1
+    assert np.isnan(state.estimate.value[0])
+
+
+def test_what_cannot_be_is_refused(key):
+    with pytest.raises(ValueError, match="trust_region must come with an optimiser"):
+        mg.estimated_gradient(problems.objective, problems.exact, key=key, trust_region=mg.TrustRegion(1.0))
+    transformation = mg.estimated_gradient(problems.objective, problems.exact, key=key)
+    with pytest.raises(ValueError, match="params must be given to update"):
+        transformation.update(None, transformation.init(START))

@@ -1,0 +1,215 @@
+"""What a run does step by step, against closed forms and against the same steps taken by hand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.estimators import Reason
+from tests.optimiser import problems
+from tests.optimiser.problems import CENTRE, CURVATURE, STDDEV, made_up
+
+START = jnp.array([0.0, 0.5])
+SGD = optax.sgd(0.1)
+
+
+def run(key, estimator=problems.exact, **settings):
+    settings = {"optimiser": SGD, "num_steps": 30, **settings}
+    return mg.optimise(problems.objective, START, key, estimator=estimator, **settings)
+
+
+@pytest.fixture(scope="module")
+def zeroth_order_run():
+    return run(
+        jax.random.key(3),
+        problems.zeroth_order,
+        optimiser=optax.adam(0.1),
+        num_steps=250,
+        segment=100,
+        evaluate=problems.bowl,
+        evaluate_every=7,
+    )
+
+
+def test_a_run_ends_at_the_minimum(zeroth_order_run):
+    # A step of Adam is about its learning rate, so it ends within a few of them.
+    np.testing.assert_allclose(zeroth_order_run.params, CENTRE, atol=0.1)
+    assert zeroth_order_run.final_cost < 0.01 < problems.bowl(START)
+    assert zeroth_order_run.stopped == mg.Stopped.finished
+
+
+def test_every_rollout_of_the_method_is_counted_and_none_of_the_measurement(zeroth_order_run):
+    history = zeroth_order_run.history
+    np.testing.assert_array_equal(history.num_rollouts, 16 * np.arange(1, 251))
+    assert zeroth_order_run.num_rollouts == 16 * 250
+    assert zeroth_order_run.num_gradient_rollouts == 0
+    assert run(jax.random.key(0), problems.first_order).num_gradient_rollouts == 4 * 30
+
+
+def test_steps_that_fill_up_the_last_segment_do_nothing(zeroth_order_run):
+    assert zeroth_order_run.num_steps == 250
+    assert zeroth_order_run.history.cost.shape == (250,)
+
+
+def test_the_noise_free_cost_is_measured_when_it_is_due(zeroth_order_run):
+    is_measured = np.isfinite(zeroth_order_run.history.noise_free_cost)
+    np.testing.assert_array_equal(np.flatnonzero(is_measured), np.arange(0, 250, 7))
+
+
+def test_the_best_parameters_are_those_of_the_lowest_measured_cost(zeroth_order_run):
+    measured = np.append(zeroth_order_run.history.noise_free_cost, zeroth_order_run.final_cost)
+    assert zeroth_order_run.best_cost == np.nanmin(measured)
+    assert problems.bowl(zeroth_order_run.best_params) == pytest.approx(float(zeroth_order_run.best_cost), rel=1e-12)
+
+
+def test_seconds_grow_and_leave_out_compilation(zeroth_order_run):
+    assert np.all(np.diff(zeroth_order_run.history.seconds) > 0)
+    assert zeroth_order_run.seconds == pytest.approx(zeroth_order_run.history.seconds[-1])
+    # 250 steps of 16 tiny rollouts take milliseconds, tracing and compiling them much longer.
+    assert zeroth_order_run.seconds < zeroth_order_run.compile_seconds
+
+
+def test_the_mean_cost_under_noise_has_its_error_bar(zeroth_order_run):
+    """Under noise the bowl is higher by σ²/2 of the trace of its curvature; judged at the start, which is known."""
+    history = zeroth_order_run.history
+    truth = problems.bowl(START) + STDDEV**2 / 2 * CURVATURE.sum()
+    assert abs(history.cost[0] - truth) < 4 * history.cost_error[0]
+    assert history.cost_error[0] < 0.1 * truth
+
+
+def test_descent_on_a_quadratic_is_a_geometric_sequence(key):
+    """The distance to the minimum shrinks by 1 - rate * curvature in each step."""
+    result = run(key)
+    np.testing.assert_allclose(result.params, CENTRE + (START - CENTRE) * (1 - 0.1 * CURVATURE) ** 30, rtol=1e-12)
+    distance = (np.asarray(START - CENTRE)) * (1 - 0.1 * np.asarray(CURVATURE)) ** np.arange(30)[:, None]
+    norms = np.linalg.norm(np.asarray(CURVATURE) * distance, axis=1)
+    np.testing.assert_allclose(result.history.gradient_norm, norms, rtol=1e-10)
+    np.testing.assert_allclose(result.history.step_norm, 0.1 * norms, rtol=1e-10)
+
+
+def test_a_step_draws_its_noise_from_its_number(key):
+    """The same steps by hand: first order on the bowl is the curvature times the mean of the noisy points."""
+    x = np.asarray(START)
+    for n in range(5):
+        own = jax.random.fold_in(key, n)
+        noise = [problems.objective.sample_noise(jax.random.fold_in(own, i)) for i in range(4)]
+        x = x - 0.1 * np.asarray(CURVATURE) * (x + np.mean(noise, axis=0) - np.asarray(CENTRE))
+    np.testing.assert_allclose(run(key, problems.first_order, num_steps=5).params, x, rtol=1e-12)
+
+
+def test_a_clipped_gradient_has_the_threshold_as_its_norm(key):
+    result = run(key, lambda *_: made_up([3.0, -4.0]), clip_norm=2.0, num_steps=1)
+    np.testing.assert_allclose(result.params, START - 0.1 * jnp.array([1.2, -1.6]), rtol=1e-12)
+
+
+def test_a_short_gradient_is_not_clipped(key):
+    result = run(key, lambda *_: made_up([0.3, -0.4]), clip_norm=2.0, num_steps=1)
+    np.testing.assert_allclose(result.params, START - 0.1 * jnp.array([0.3, -0.4]), rtol=1e-12)
+
+
+def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
+    """Every other estimate is NaN: Adam ends where it would have without those."""
+
+    def every_other(objective, params, key):
+        gradient = problems.exact(objective, params, key).value
+        return made_up(jnp.where(is_odd(key), jnp.nan, gradient))
+
+    with_gaps = run(key, every_other, optimiser=optax.adam(0.1), num_steps=40)
+    is_taken = with_gaps.history.is_taken
+    assert 5 < is_taken.sum() < 35
+    assert with_gaps.num_skipped == (~is_taken).sum()
+    without = run(key, optimiser=optax.adam(0.1), num_steps=int(is_taken.sum()))
+    np.testing.assert_allclose(with_gaps.params, without.params, rtol=1e-12)
+    np.testing.assert_array_equal(with_gaps.history.step_norm == 0, ~is_taken)
+
+
+def is_odd(key):
+    return jax.random.key_data(key).sum() % 2 == 1
+
+
+def test_a_run_gives_up_after_steps_in_a_row_that_are_not_finite(key):
+    result = run(key, lambda *_: made_up([jnp.nan, 0.0]), patience=4)
+    assert result.stopped == mg.Stopped.not_finite
+    assert result.num_steps == result.num_skipped == 4
+    np.testing.assert_array_equal(result.params, START)
+
+
+def test_a_diverging_cost_never_reaches_the_parameters(key):
+    """NaN beyond x₀ = 0.3: samples there are left out, and every estimate that remains is finite."""
+    cost = mg.parameter_noise(lambda x: jnp.where(x[0] > 0.3, jnp.nan, problems.bowl(x)), STDDEV)
+    result = mg.optimise(cost, START, key, estimator=problems.zeroth_order, optimiser=SGD, num_steps=60)
+    assert np.isfinite(result.params).all()
+    assert np.nanmin(result.history.finite_fraction) < 1
+    assert np.isfinite(result.best_cost)
+
+
+def test_the_best_has_no_advantage_from_samples_left_out(key):
+    """Costs fall all the way, but beyond the middle some samples were not finite: the best is the last one before."""
+
+    def spoiled(objective, params, key):
+        estimate = problems.exact(objective, params, key)
+        num_finite = jnp.where(params[0] > 0.5, 3, 4)
+        return dataclasses.replace(estimate, num_samples=jnp.asarray(4), num_finite=num_finite)
+
+    result = run(key, spoiled)
+    full = result.history.finite_fraction == 1
+    assert result.best_cost == result.history.cost[full].min() > result.history.cost.min()
+
+
+def test_the_reason_of_the_least_weight_is_kept(key):
+    def in_blocks(objective, params, key):
+        reason = jax.tree.map(lambda a, b: jnp.stack([a, b]), Reason.inverse_variance, Reason.uncertain)
+        return dataclasses.replace(made_up([1.0, 1.0]), alpha=jnp.array([0.8, 0.2]), reason=reason)
+
+    history = run(key, in_blocks, num_steps=2).history
+    np.testing.assert_allclose(history.alpha, 0.5)
+    assert np.all(history.reason == Reason.uncertain)
+
+
+def test_the_optimiser_is_told_the_cost(key):
+    """reduce_on_plateau halves the step when the cost it is told no longer falls: here it never does."""
+    plateau = optax.chain(optax.sgd(1.0), optax.contrib.reduce_on_plateau(factor=0.5, patience=1))
+    result = run(key, lambda *_: made_up([1.0, 0.0], cost=3.0), optimiser=plateau, num_steps=6)
+    assert result.history.step_norm[0] == 1
+    assert result.history.step_norm[-1] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"num_steps": 0}, "num_steps must be at least 1, got 0"),
+        ({"segment": -1}, "segment must be at least 1, got -1"),
+        ({"evaluate_every": 0}, "evaluate_every must be at least 1, got 0"),
+        ({"max_seconds": 0.0}, "max_seconds must be positive, got 0.0"),
+        ({"max_rollouts": 2**31}, r"max_rollouts must be below 2\*\*30"),
+        ({"clip_norm": 0.0}, "clip_norm must be positive, got 0.0"),
+        ({"smoothing": optax.constant_schedule(1.0)}, "objective must be a function from a scale"),
+        ({"checkpoint": "/nowhere/at/all.npz"}, "checkpoint must be in a folder that exists"),
+    ],
+)
+def test_settings_without_meaning_are_refused(key, settings, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        run(key, **settings)
+
+
+@pytest.mark.parametrize(
+    ("params", "num_keys", "sentence"),
+    [
+        (jnp.zeros((3, 2)), None, "params must have a leading axis only where key has the same"),
+        (jnp.zeros((3, 2)), 4, "params must have a leading axis only where key has the same"),
+        (jnp.zeros(()), None, "params must be a vector of shape"),
+    ],
+)
+def test_starts_that_do_not_fit_are_refused(key, params, num_keys, sentence):
+    key = key if num_keys is None else jax.random.split(key, num_keys)
+    with pytest.raises(ValueError, match=sentence):
+        mg.optimise(problems.objective, params, key, estimator=problems.exact, optimiser=SGD, num_steps=1)
+
+
+def test_a_function_that_is_no_objective_is_refused(key):
+    with pytest.raises(ValueError, match="objective must be an Objective, got function; wrap a function by"):
+        mg.optimise(problems.bowl, START, key, estimator=problems.exact, optimiser=SGD, num_steps=1)
