@@ -1,19 +1,25 @@
 """What an estimator sees."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.objective import closed_loop, open_loop, parameter_noise
+from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
+from mjxgrad.rollout import initial_state
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks import SceneTask
 from tests.estimators import textbook
 
 STDDEV = 0.3
+CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
+POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
 
 
 @pytest.fixture
 def policy_params():
-    return {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+    return POLICY_PARAMS
 
 
 @pytest.fixture
@@ -109,3 +115,218 @@ def test_single_precision_stays_single():
 def test_noise_of_an_unknown_dimension_is_refused_by_name():
     with pytest.raises(ValueError, match="dim is not known: pass dim"):
         parameter_noise(textbook.bumpy, STDDEV).sample_noise(jax.random.key(0))
+
+
+class RandomStart(textbook.LinearSystem):
+    """The same system from a start that is drawn."""
+
+    def sample_start(self, key):
+        return self.start + 0.5 * jax.random.normal(key, (2,))
+
+
+class Laplace(Objective):
+    """Noise that is not Gaussian, known by its density alone: exp(-|w|)/2 on each parameter."""
+
+    dim: int | None = eqx.field(static=True, default=3)
+
+    def sample_noise(self, key):
+        return jax.random.laplace(key, (3,))
+
+    def value(self, params, noise):
+        return textbook.bumpy(params + noise)
+
+    def score(self, params, noise):
+        return jnp.sign(noise)
+
+
+def objectives():
+    """One of each kind, with a point."""
+    closed = closed_loop(textbook.LinearSystem(), textbook.linear_policy, STDDEV, params=POLICY_PARAMS)
+    return {
+        "parameters": (parameter_noise(textbook.bumpy, STDDEV, dim=3), jnp.array([0.2, 0.5, -0.1])),
+        "open_loop": (open_loop(RandomStart(), STDDEV), CONTROLS.ravel()),
+        "closed_loop": (closed, closed.ravel(POLICY_PARAMS)),
+        "random_start": (eqx.tree_at(lambda o: o.task, closed, RandomStart()), closed.ravel(POLICY_PARAMS)),
+        "laplace": (Laplace(), jnp.array([0.2, 0.5, -0.1])),
+    }
+
+
+@pytest.mark.parametrize("name", objectives())
+def test_pulled_back_the_derivative_by_noise_is_the_first_order_gradient(name, key):
+    objective, params = objectives()[name]
+    noise = objective.sample_noise(key)
+    found = objective.differentiate(params, noise)
+    gradient = jax.grad(objective.value)(params, noise)
+    np.testing.assert_allclose(found.cost, objective.value(params, noise), rtol=1e-14)
+    # The same sum of the same terms in another order.
+    np.testing.assert_allclose(found.pull_back(found.gradient_by_noise), gradient, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", objectives())
+def test_pulled_back_the_score_of_the_noise_is_the_score(name, key):
+    objective, params = objectives()[name]
+    noise = objective.sample_noise(key)
+    found = objective.differentiate(params, noise)
+    np.testing.assert_allclose(found.pull_back(found.noise_score), objective.score(params, noise), rtol=1e-14)
+
+
+def test_the_derivative_by_noise_goes_through_the_whole_closed_loop(objective, key):
+    """The cost is quadratic in the noise, for which central differences are exact at any distance."""
+    params, noise = objective.ravel(POLICY_PARAMS), objective.sample_noise(key)
+    cost = jax.vmap(lambda step: objective.value(params, noise + step.reshape(4, 1)))
+    slopes = (cost(jnp.eye(4)) - cost(-jnp.eye(4))) / 2
+    np.testing.assert_allclose(objective.differentiate(params, noise).gradient_by_noise, slopes, rtol=1e-10)
+
+
+def test_a_batch_of_pull_backs_can_be_kept_and_applied_later(objective, key):
+    """Out of one compiled function, into another, and through a branch: it is a pytree that equals its like."""
+    params = objective.ravel(POLICY_PARAMS)
+    noises = jax.vmap(objective.sample_noise)(jax.random.split(key, 3))
+    batch = jax.jit(jax.vmap(lambda noise: objective.differentiate(params, noise)))(noises)
+    again = jax.jit(jax.vmap(lambda noise: objective.differentiate(params, noise)))(noises)
+    pull_backs = jax.lax.cond(batch.cost.sum() > 0, lambda: batch.pull_back, lambda: again.pull_back)
+    scores = jax.jit(jax.vmap(lambda pull_back, vector: pull_back(vector)))(pull_backs, batch.noise_score)
+    np.testing.assert_allclose(scores, [objective.score(params, noise) for noise in noises], rtol=1e-12)
+
+
+def test_a_kept_pull_back_holds_nothing_of_the_task():
+    """A vmapped function that returns it would copy the scene for every sample."""
+    objective = closed_loop(RandomStart(), textbook.linear_policy, STDDEV, params=POLICY_PARAMS)
+    params = objective.ravel(POLICY_PARAMS)
+    found = objective.differentiate(params, objective.zero_noise())
+    # Three parameters and the four states of the plane that were visited.
+    assert sorted(leaf.shape for leaf in jax.tree.leaves(found.pull_back)) == [(3,), (4, 2)]
+
+
+def test_the_noise_is_told_by_component():
+    stddev = jnp.array([[0.1], [0.2], [0.3], [0.4]])
+    objective = open_loop(textbook.LinearSystem(), stddev)
+    found = objective.differentiate(CONTROLS.ravel(), stddev * jnp.array([[1.0], [2.0], [-1.0], [0.5]]))
+    assert objective.noise_shape == (4, 1)
+    np.testing.assert_allclose(found.noise_stddev, [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(found.noise_score, [1 / 0.1, 2 / 0.2, -1 / 0.3, 0.5 / 0.4])
+
+
+def test_noise_of_unknown_kind_has_no_standard_deviation(key):
+    objective = Laplace()
+    assert np.isnan(objective.differentiate(jnp.zeros(3), objective.sample_noise(key)).noise_stddev).all()
+    with pytest.raises(ValueError, match="Laplace must have a stddev to change"):
+        objective.with_stddev(0.2)
+
+
+@pytest.mark.parametrize("name", ["parameters", "open_loop", "closed_loop"])
+def test_other_noise_is_the_old_one_scaled(name, key):
+    objective, _ = objectives()[name]
+    noises = jax.vmap(lambda scale: objective.with_stddev(scale * STDDEV).sample_noise(key))(jnp.array([0.5, 2.0]))
+    once = objective.sample_noise(key)
+    halved, doubled = (jax.tree.map(lambda leaf, i=i: leaf[i], noises) for i in (0, 1))
+    halved, doubled, once = (n[0] if isinstance(n, tuple) else n for n in (halved, doubled, once))
+    np.testing.assert_allclose(halved, once / 2, rtol=1e-12)
+    np.testing.assert_allclose(doubled, once * 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["parameters", "closed_loop"])
+def test_other_noise_is_checked_like_the_first(name):
+    objective, _ = objectives()[name]
+    with pytest.raises(ValueError, match="stddev must be positive"):
+        objective.with_stddev(-0.1)
+    with pytest.raises(ValueError, match="stddev must"):
+        objective.with_stddev(jnp.ones(7))
+
+
+def test_an_antithetic_pair_begins_at_the_same_place(key):
+    objective, _ = objectives()["random_start"]
+    noise, start = objective.sample_noise(key)
+    mirrored, same = objective.mirror((noise, start))
+    np.testing.assert_array_equal(mirrored, -noise)
+    np.testing.assert_array_equal(same, start)
+
+
+def test_zero_noise_takes_the_nominal_start():
+    objective, params = objectives()["random_start"]
+    fixed, _ = objectives()["closed_loop"]
+    assert objective.value(params, objective.zero_noise()) == fixed.value(params, fixed.zero_noise())
+
+
+def test_a_random_start_is_where_the_rollout_begins(key):
+    objective, params = objectives()["random_start"]
+    noise = objective.sample_noise(key)
+    np.testing.assert_array_equal(objective.outcome(params, noise).states[0], noise[1])
+    assert not np.allclose(noise[1], objective.task.start)
+
+
+def test_a_nominal_start_built_unlike_the_random_ones_is_refused():
+    class Forgetful(RandomStart):
+        def nominal_start(self):
+            return None
+
+    with pytest.raises(ValueError, match="nominal_start must have the structure of sample_start"):
+        open_loop(Forgetful(), STDDEV).zero_noise()
+
+
+def test_a_control_answers_for_its_own_step_and_those_after():
+    task = textbook.LinearSystem()
+    slopes = jax.jacobian(lambda controls: task.run(controls).step_costs)(CONTROLS)[..., 0]
+    assert slopes.shape == (5, 4)
+    np.testing.assert_array_equal(np.triu(slopes, k=1), 0)
+    assert (np.abs(slopes[np.tril_indices(4)]) > 1e-3).all()
+
+
+def test_a_rule_without_forward_mode_is_differentiated_in_reverse():
+    @jax.custom_vjp
+    def cube(x):
+        return x**3
+
+    cube.defvjp(lambda x: (x**3, x), lambda x, g: (3 * x**2 * g,))
+    objective = parameter_noise(lambda x: cube(x[0]), STDDEV, dim=1)
+    found = objective.differentiate(jnp.array([2.0]), jnp.array([1.0]))
+    np.testing.assert_allclose(found.gradient_by_noise, [27.0])
+
+
+CART = """
+<mujoco>
+  <option timestep="0.05"/>
+  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body></worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>
+"""
+THRUSTS = jnp.array([[1.0], [-2.0], [4.0]])
+
+
+def per_state(trajectory):
+    """Of every state, and of the control that follows it."""
+    return (trajectory.qpos[:, 0] - 0.1) ** 2 + jnp.append(trajectory.ctrl[:, 0] ** 2, 0.0)
+
+
+@pytest.fixture(scope="module")
+def cart():
+    scene = load_scene(CART)
+
+    def start(key):
+        return initial_state(scene, qpos=0.3 + 0.2 * jax.random.normal(key, (1,)))
+
+    return SceneTask(scene, initial_state(scene), per_state, horizon=3, start_distribution=start)
+
+
+def test_a_scene_charges_by_step_from_where_it_starts(cart, key):
+    """Semi-implicit Euler of a mass of 2 kg: v += h u/m, x += h v."""
+    objective = open_loop(cart, STDDEV)
+    noise, start = objective.sample_noise(key)
+    outcome = eqx.filter_jit(objective.outcome)(THRUSTS.ravel(), (noise, start))
+    x, v, expected = float(start.qpos[0]), 0.0, []
+    for u in np.asarray(THRUSTS + noise)[:, 0]:
+        expected.append((x - 0.1) ** 2 + u**2)
+        v += 0.05 * u / 2
+        x += 0.05 * v
+    expected.append((x - 0.1) ** 2)
+    np.testing.assert_allclose(outcome.step_costs, expected, rtol=1e-9)
+    np.testing.assert_allclose(outcome.cost, np.sum(expected), rtol=1e-9)
+    assert objective.zero_noise()[1].qpos == 0
+
+
+def test_a_scene_whose_cost_has_another_length_is_refused(cart):
+    wrong = SceneTask(cart.scene, cart.state, lambda trajectory: per_state(trajectory)[1:], horizon=3)
+    with pytest.raises(
+        ValueError, match=r"scalar of shape \(\) or one number per state, shape \(4,\), got shape \(3,\)"
+    ):
+        jax.eval_shape(wrong.run, THRUSTS)

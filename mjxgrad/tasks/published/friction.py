@@ -48,4 +48,4 @@ def friction_task() -> Friction:
     """Make the task; see `Friction`."""
     weight = jnp.array([0.1, 10.0, 0.1, 0.1])
     cost = QuadraticCost(jnp.array([2.0, 2.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return Friction(cost, horizon=400)
+    return Friction(cost=cost, horizon=400)

@@ -44,4 +44,5 @@ class LQR(DynamicsTask):
 def lqr_task(num_states: int = 100) -> LQR:
     """Make the task; see `LQR`."""
     ones = jnp.ones(num_states)
-    return LQR(QuadraticCost(0 * ones, ones, 10 * ones, jnp.array(0.1)), num_states, horizon=10)
+    cost = QuadraticCost(0 * ones, ones, 10 * ones, jnp.array(0.1))
+    return LQR(cost=cost, num_controls=num_states, horizon=10)

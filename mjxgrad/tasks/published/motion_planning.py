@@ -43,4 +43,4 @@ class MotionPlanning(DynamicsTask):
 def motion_planning_task() -> MotionPlanning:
     """Make the task; see `MotionPlanning`."""
     cost = QuadraticCost(jnp.array([0.0, 4.0]), jnp.ones(2), 10 * jnp.ones(2), jnp.array(0.001))
-    return MotionPlanning(cost, horizon=200)
+    return MotionPlanning(cost=cost, horizon=200)

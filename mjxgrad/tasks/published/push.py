@@ -50,4 +50,9 @@ def push_task(stiffness: float, velocity_factor: float, horizon: int) -> Push:
     """Make the task; see `Push`."""
     weight = jnp.array([0.1, 10.0, 0.1, 0.1])
     cost = QuadraticCost(jnp.array([1.0, 2.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return Push(jnp.asarray(stiffness, float), jnp.asarray(velocity_factor, float), cost, horizon)
+    return Push(
+        stiffness=jnp.asarray(stiffness, float),
+        velocity_factor=jnp.asarray(velocity_factor, float),
+        cost=cost,
+        horizon=horizon,
+    )

@@ -75,4 +75,4 @@ def tennis_task() -> Tennis:
     """Make the task; see `Tennis`."""
     goal = jnp.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     final_weight = jnp.array([100.0, 100.0, 10.0, 10.0, 0.0, 0.0, 0.0])
-    return Tennis(QuadraticCost(goal, jnp.zeros(7), final_weight, jnp.array(0.001)), horizon=200)
+    return Tennis(cost=QuadraticCost(goal, jnp.zeros(7), final_weight, jnp.array(0.001)), horizon=200)
