@@ -15,7 +15,7 @@ from mjxgrad.optimiser.convergence import Convergence
 from mjxgrad.optimiser.method import Method
 from mjxgrad.optimiser.program import Program, Saved
 from mjxgrad.optimiser.result import Optimisation, Progress, Stopped
-from mjxgrad.optimiser.segment import Best, Evaluate, Limits
+from mjxgrad.optimiser.segment import Evaluate, Limits
 
 # Progress shows in steps of five per cent; each costs one return from the device.
 DEFAULT_NUM_SEGMENTS = 20
@@ -148,10 +148,7 @@ def _loop(
 
 def _result(program: Program, saved: Saved, stopped: Stopped) -> Optimisation:
     carry, history = saved.carry, program.history(saved)
-    final_cost = program.final_cost(carry.params)
-    measured = Best(carry.params, final_cost, jnp.zeros_like(final_cost), jnp.ones_like(final_cost))
-    against = jax.vmap(Best.against) if program.key.ndim else Best.against
-    best = against(carry.best, measured)
+    final_cost, best = program.finish(carry)
     return Optimisation(
         params=carry.params,
         best_params=best.params,

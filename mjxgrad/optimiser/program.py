@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key, PyTree
 from mjxgrad.optimiser import checkpoint as checkpoints
 from mjxgrad.optimiser.method import Method, Record
 from mjxgrad.optimiser.result import History, Progress, Stopped
-from mjxgrad.optimiser.segment import Carry, Evaluate, Limits, run_segment
+from mjxgrad.optimiser.segment import Best, Carry, Evaluate, Limits, run_segment
 
 
 class Saved(NamedTuple):
@@ -57,14 +57,16 @@ class Program:
             method, evaluate = eqx.combine(arrays, static)
             return run_segment(method, evaluate, limits, key, carry, index)
 
-        def final(arrays: PyTree, params: Float[Array, " dim"]) -> Float[Array, ""]:
-            measure = eqx.combine(arrays, static)[1]
-            nothing = jnp.full((), jnp.nan, params.dtype)
-            return nothing if measure is None else jnp.asarray(measure(params), params.dtype)
+        def finish(arrays: PyTree, carry: Carry) -> tuple[Float[Array, ""], Best]:
+            measure, params = eqx.combine(arrays, static)[1], carry.params
+            if measure is None:
+                return jnp.full((), jnp.nan, params.dtype), carry.best
+            cost = jnp.asarray(measure(params), params.dtype)
+            return cost, carry.best.against(Best.measured(params, cost))
 
         self._start = jax.jit(over_seeds(start, None, 0))
         self._advance = jax.jit(over_seeds(advance, None, 0, 0, None))
-        self._final = jax.jit(over_seeds(final, None, 0))
+        self._finish = jax.jit(over_seeds(finish, None, 0))
         self.carry = self._start(self.arrays, params)
 
     def start(self) -> Saved:
@@ -106,9 +108,9 @@ class Program:
         """Put the history together, as far as any run has come."""
         return History.of(*saved.trace, saved.seconds)[: int(np.max(saved.carry.num_steps))]
 
-    def final_cost(self, params: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Evaluate the last point."""
-        return self._final(self.arrays, params)
+    def finish(self, carry: Carry) -> tuple[Float[Array, "..."], Best]:
+        """Evaluate the last point, and let it compete with the best before."""
+        return self._finish(self.arrays, carry)
 
     def fingerprint(self) -> dict[str, Any]:
         """Say what a resumed run must have in common with this one: the program itself, and all that it is given."""

@@ -43,6 +43,11 @@ class Best(eqx.Module):
     scale: Float[Array, ""]
     finite_fraction: Float[Array, ""]
 
+    @classmethod
+    def measured(cls, params: Float[Array, " dim"], cost: Float[Array, ""]) -> "Best":
+        """Give a point with the cost that `evaluate` gave for it, to be compared with its like alone."""
+        return cls(params, cost, jnp.zeros_like(cost), jnp.ones_like(cost))
+
     def against(self, other: "Best") -> "Best":
         """Give the better of both, itself if they are equal.
 
@@ -148,17 +153,14 @@ def _step(
     at = carry.params
     noise_free = _evaluated(evaluate, limits, at, index)
     params, state, record = method.advance(at, carry.state, jax.random.fold_in(key, index), index)
-    if evaluate is None:
-        candidate = Best(at, record.cost, record.scale, record.finite_fraction)
-    else:
-        candidate = Best(at, noise_free, jnp.zeros_like(noise_free), jnp.ones_like(noise_free))
+    under_noise = Best(at, record.cost, record.scale, record.finite_fraction)
     recent = carry.recent.push(record)
     num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
     num_rollouts = carry.num_rollouts + record.num_rollouts
     moved = Carry(
         params=params.astype(at.dtype),
         state=state,
-        best=carry.best.against(candidate),
+        best=carry.best.against(under_noise if evaluate is None else Best.measured(at, noise_free)),
         recent=recent,
         num_steps=carry.num_steps + 1,
         num_skipped=carry.num_skipped + ~record.is_taken,

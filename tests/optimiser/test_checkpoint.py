@@ -13,7 +13,7 @@ START = jnp.array([0.0, 0.5])
 KEY = jax.random.key(2)
 
 
-class Killed(Exception):
+class KilledError(Exception):
     pass
 
 
@@ -55,7 +55,7 @@ def uninterrupted():
     return run()
 
 
-@pytest.mark.parametrize("error", [Killed, KeyboardInterrupt])
+@pytest.mark.parametrize("error", [KilledError, KeyboardInterrupt])
 def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uninterrupted, error):
     path = tmp_path / "run.npz"
     for step in (7, 21):
@@ -69,8 +69,8 @@ def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uni
 
 def test_an_interruption_between_two_saves_loses_nothing(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
-    with pytest.raises(Killed):
-        run(path, checkpoint_every=100, callback=kill_at(14, Killed))
+    with pytest.raises(KilledError):
+        run(path, checkpoint_every=100, callback=kill_at(14, KilledError))
     steps = []
     assert_same(run(path, callback=lambda progress: steps.append(progress.step)), uninterrupted)
     assert steps[0] == 21
@@ -85,13 +85,13 @@ def test_a_run_stopped_by_its_callback_can_go_on(tmp_path, uninterrupted):
 def test_a_finished_run_is_read_without_running(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
     run(path)
-    assert_same(run(path, callback=kill_at(0, Killed)), uninterrupted)
+    assert_same(run(path, callback=kill_at(0, KilledError)), uninterrupted)
 
 
 def test_many_seeds_are_resumed(tmp_path):
     path, keys = tmp_path / "run.npz", jax.random.split(KEY, 3)
-    with pytest.raises(Killed):
-        run(path, key=keys, callback=kill_at(7, Killed))
+    with pytest.raises(KilledError):
+        run(path, key=keys, callback=kill_at(7, KilledError))
     assert_same(run(path, key=keys), run(key=keys))
 
 
@@ -127,14 +127,16 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, written, damage):
         content = b"something else"
     path = tmp_path / "run.npz"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"checkpoint must be a file that a run has saved, got .*delete it to begin anew"):
+    with pytest.raises(
+        ValueError, match=r"checkpoint must be a file that a run has saved, got .*delete it to begin anew"
+    ):
         run(path)
 
 
 def test_a_save_that_fails_leaves_the_former_file(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
-    with pytest.raises(Killed):
-        run(path, callback=kill_at(7, Killed))
+    with pytest.raises(KilledError):
+        run(path, callback=kill_at(7, KilledError))
     before = path.read_bytes()
 
     def fail(*_):

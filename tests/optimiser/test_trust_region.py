@@ -26,7 +26,8 @@ def step(key, gradient, bias_bound, region, *, rate=100.0, objective=problems.ob
 
 
 @pytest.mark.parametrize(
-    ("bias_bound", "share"), [(0.0, 1.0), (1.0, 0.8), (4.5, 0.1), (5.0, 0.0), (7.0, 0.0), (jnp.inf, 0.0), (jnp.nan, 1.0)]
+    ("bias_bound", "share"),
+    [(0.0, 1.0), (1.0, 0.8), (4.5, 0.1), (5.0, 0.0), (7.0, 0.0), (jnp.inf, 0.0), (jnp.nan, 1.0)],
 )
 def test_a_step_is_limited_by_what_the_bias_leaves(key, bias_bound, share):
     """The gradient has norm 5; the limit is radius * (1 - bound / 5) standard deviations of 0.1."""
@@ -108,5 +109,5 @@ def test_a_bias_that_turns_the_gradient_round_does_no_harm(key):
 
 
 def test_a_radius_without_meaning_is_refused():
-    with pytest.raises(ValueError, match="radius must be positive, got 0.0"):
+    with pytest.raises(ValueError, match="radius must be positive"):
         mg.TrustRegion(0.0)
