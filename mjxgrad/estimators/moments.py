@@ -72,6 +72,10 @@ class Moments(Summary):
         squares = self.squares + other.squares + (theirs - mine) ** 2 * self.count * share
         return Moments(count, origin, mine + (theirs - mine) * share, squares)
 
+    def variance(self) -> Float[Array, "*shape"]:
+        """Give the variance, with N − 1; zero for fewer than two samples."""
+        return self.squares / as_real(jnp.maximum(self.count - 1, 1), self.squares)
+
     def squared_error(self) -> Float[Array, "*shape"]:
         """Give the squared standard error of the mean, NaN for fewer than two samples."""
         count = as_real(self.count, self.squares)

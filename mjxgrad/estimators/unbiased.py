@@ -20,12 +20,12 @@ from mjxgrad.estimators.by_noise import SamplesByNoise
 
 
 class UnbiasedTerms(eqx.Module):
-    """One term per sample, whose mean is the estimate.
+    r"""One term per sample, whose mean is the estimate.
 
     Attributes:
         by_noise: before the pull-back.
         beta: share of the linear part that was taken off; zero is zeroth order.
-        linear_variance: variance of the linear part $a\\cdot w$ over the samples.
+        linear_variance: variance of the linear part $a\cdot w$ over the samples.
     """
 
     by_noise: Float[Array, "samples m"]

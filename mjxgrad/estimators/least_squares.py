@@ -1,0 +1,97 @@
+"""The slope of the cost over its noise by least squares."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.estimators.estimate import GradientEstimate, assemble
+from mjxgrad.estimators.moments import Moments
+from mjxgrad.estimators.sampling import Plan, sample
+from mjxgrad.objective import Objective, ParameterNoise
+from mjxgrad.objective.actions import OpenLoop
+
+
+def least_squares(
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    num_samples: int,
+    chunk_size: int | None = None,
+) -> GradientEstimate:
+    r"""Estimate the gradient of a smoothed objective by a linear fit to its samples, without derivatives.
+
+    The slope of the regression of $f$ on $w$ (with an intercept). For Gaussian noise that of infinitely many samples is
+    $\nabla F$ (Stein's lemma), whatever $f$ is; for a linear $f$ it is exact from $\mathrm{dim} + 1$ samples on, where
+    zeroth order has the full noise. With samples not much more than the dimension it is noisier than zeroth order.
+
+    The standard error is the sandwich with residuals over one less their leverage (HC3), since at a jump the residual
+    depends on the noise; it is a little too large rather than too small.
+
+    Args:
+        objective: with Gaussian noise on the parameters, or open loop from a fixed start.
+        params: the point $\theta$.
+        key: consumed here; do not use it again.
+        num_samples: rollouts to spend. More than dim + 1.
+        chunk_size: rollouts at a time. Noise and costs of all samples are kept: memory grows with num_samples * dim.
+
+    Returns:
+        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
+
+    Raises:
+        ValueError: if the noise is not on the parameters alone, or there are not enough samples for the dimension.
+
+    References:
+        Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic
+        Contact Models. IEEE T-RO 2023, arXiv:2206.10787, section III (fits to samples). MacKinnon, White. Some
+        heteroskedasticity-consistent covariance matrix estimators. Journal of Econometrics 29, 1985 (HC3).
+    """
+    params = jnp.asarray(params)
+    objective = objective.sized_for(params)
+    if not isinstance(objective, ParameterNoise | OpenLoop) or objective.has_circumstances:
+        raise ValueError(
+            "objective must have its noise on the parameters and nothing else at random, got "
+            f"{type(objective).__name__}{' with random starts' if objective.has_circumstances else ''}; "
+            "use zeroth_order or control_variate"
+        )
+    if num_samples <= params.size + 1:
+        raise ValueError(
+            f"num_samples must be more than dim + 1 = {params.size + 1}, got {num_samples}; "
+            "zeroth_order needs no more than 2"
+        )
+    plan = Plan(num_samples, chunk_size, with_score=True)
+    num_chunks, size = plan.chunks()
+    units = jnp.arange(num_chunks * size).reshape(num_chunks, size)
+    samples = jax.lax.map(lambda some: sample(objective, params, key, some, plan), units)
+    samples = jax.tree.map(lambda leaf: leaf.reshape(num_chunks * size, *leaf.shape[2:]), samples)
+    mask = samples.zeroth_order_mask()
+    costs = Moments.of(samples.costs[:, 0], mask)
+    # Scores in place of noise: of comparable size for all coordinates, and the units follow from their scale.
+    stddev = jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape)).astype(params.dtype)
+    noise = jnp.where(mask[:, None], samples.scores[:, 0] * stddev, 0)
+    slope, squared_error = _fit(noise, jnp.where(mask, samples.costs[:, 0] - costs.mean, 0), mask)
+    return assemble(
+        slope / stddev,
+        squared_error / stddev**2,
+        costs,
+        # A fit that leaves no residual degree of freedom is no estimate.
+        count=jnp.where(costs.count > params.size + 1, costs.count, 0),
+        rollouts_per_unit=1,
+        num_samples=num_samples,
+        num_rollouts=num_samples,
+        num_gradient_rollouts=0,
+    )
+
+
+def _fit(
+    noise: Float[Array, "samples dim"], costs: Float[Array, " samples"], mask: Array
+) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    """Regress, by QR, and give the slope with its squared error."""
+    design = jnp.concatenate([mask[:, None].astype(noise.dtype), noise], axis=1)
+    basis, triangle = jnp.linalg.qr(design)
+    to_slope = jax.scipy.linalg.solve_triangular(triangle, basis.T)
+    fitted = to_slope @ costs
+    leverage = (basis**2).sum(axis=1)
+    residual = (costs - design @ fitted) / jnp.maximum(1 - leverage, jnp.finfo(noise.dtype).eps)
+    squared_error = (to_slope**2 * jnp.where(mask, residual, 0) ** 2).sum(axis=1)
+    return fitted[1:], squared_error[1:]

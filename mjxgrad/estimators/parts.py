@@ -1,0 +1,148 @@
+"""A first-order and an unbiased estimate from the same rollouts, and all that is needed to weigh them."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mjxgrad.estimators.by_noise import SamplesByNoise
+from mjxgrad.estimators.consistency import SecantSums, secant_sums
+from mjxgrad.estimators.moments import Moments, Summary, as_real
+from mjxgrad.estimators.rules import Evidence
+from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
+
+ByNoise = Float[Array, "samples m"]
+
+
+class Parts(Summary):
+    """Moments of both parts over all samples; of pairs of them where starts are random.
+
+    Attributes:
+        first: of the derivatives.
+        unbiased: of the unbiased terms.
+        difference: of the terms less the derivatives.
+        costs: of the costs.
+        scaled: of the derivatives by noise, in its standard deviations.
+        secants: how far the derivatives explain the costs.
+        linear_variance: of the costs that the mean derivative explains, summed over samples.
+        beta: sum of the shares that were taken off.
+        num_costs: samples in these sums.
+    """
+
+    first: Moments
+    unbiased: Moments
+    difference: Moments
+    costs: Moments
+    scaled: Moments
+    secants: SecantSums
+    linear_variance: Float[Array, ""]
+    beta: Float[Array, ""]
+    num_costs: Float[Array, ""]
+
+    def merge(self, other: "Parts") -> "Parts":
+        """Give the summary of both sets of samples."""
+
+        def both(mine: Moments | Array, theirs: Moments | Array) -> Moments | Array:
+            return mine.merge(theirs) if isinstance(mine, Moments) else mine + theirs
+
+        return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
+
+    def evidence(self, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Evidence:
+        """Give what a rule may look at, block by block.
+
+        Args:
+            blocks: number of the block of each coordinate.
+            num_blocks: how many there are.
+
+        Returns:
+            The evidence, with an axis of blocks.
+        """
+
+        def by_block(values: Float[Array, " dim"]) -> Float[Array, " blocks"]:
+            return jax.ops.segment_sum(values, blocks, num_segments=num_blocks)
+
+        def in_all(value: Array) -> Array:
+            return jnp.broadcast_to(value, num_blocks)
+
+        missed, explained = self.secants.missed_variance(), self.linear_variance / jnp.maximum(self.num_costs, 1)
+        bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
+        return Evidence(
+            count=in_all(self.first.count),
+            dim=by_block(jnp.ones_like(self.first.offset)),
+            first_norm=jnp.sqrt(by_block(self.first.mean**2)),
+            zeroth_norm=jnp.sqrt(by_block(self.unbiased.mean**2)),
+            difference_norm=jnp.sqrt(by_block(self.difference.mean**2)),
+            first_variance=by_block(self.first.variance()),
+            zeroth_variance=by_block(self.unbiased.variance()),
+            difference_variance=by_block(self.difference.variance()),
+            inconsistency=in_all(self.secants.inconsistency()),
+            relative_bias_bound=in_all(jnp.where(missed == 0, 0, bound)),
+            cost_variance=in_all(self.costs.variance()),
+            scaled_first_variance=in_all(self.scaled.variance().sum()),
+            scaled_first_norm=in_all(jnp.sqrt((self.scaled.mean**2).sum())),
+        )
+
+    def mixture(self, alpha: Float[Array, " dim"]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+        """Give the weighted mean and its squared standard error, coordinate by coordinate.
+
+        Args:
+            alpha: weight of the first-order part.
+
+        Returns:
+            Both; where no derivative was finite, those of the unbiased part.
+        """
+        has_first = self.first.count >= 2
+        first = jnp.where(has_first, self.first.mean, 0)
+        value = alpha * first + (1 - alpha) * self.unbiased.mean
+        unbiased_error = self._unbiased_squared_error(first)
+        first_error = jnp.where(has_first, self.first.squared_error(), 0)
+        difference_error = jnp.where(has_first, self.difference.squared_error(), 0)
+        covariance = (unbiased_error + first_error - difference_error) / 2
+        mixed = alpha**2 * first_error + (1 - alpha) ** 2 * unbiased_error + 2 * alpha * (1 - alpha) * covariance
+        return value, jnp.where(has_first, mixed, unbiased_error)
+
+    def _unbiased_squared_error(self, first: Float[Array, " dim"]) -> Float[Array, " dim"]:
+        """Give the squared error of terms that share their baseline; the derivation is at `zeroth._leave_one_out`.
+
+        There c is the covariance of cost and score; here that of the remaining cost and the score.
+        """
+        spread = self.unbiased.squared_error()
+        others = as_real(jnp.maximum(self.unbiased.count - 1, 1), spread)
+        remaining = self.unbiased.mean - self.beta / jnp.maximum(self.num_costs, 1) * first
+        return spread + (remaining**2 - spread) / (others**2 + 1)
+
+
+def parts_and_terms(
+    samples: SamplesByNoise, *, control_variate: bool, take: Callable[[ByNoise], Array]
+) -> tuple[Parts, UnbiasedTerms]:
+    """Summarise a chunk.
+
+    Args:
+        samples: of the chunk.
+        control_variate: whether the unbiased part uses derivatives.
+        take: where the moments are wanted: `samples.pull_back` for parameters, the identity for noise.
+
+    Returns:
+        The summary, and the unbiased terms by noise.
+    """
+    slopes = gram(samples)
+    terms = unbiased_terms(samples, slopes, with_derivatives=control_variate)
+    # A cost without another to compare it with has no baseline.
+    has_cost = samples.complete(samples.has_cost) & (samples.has_cost.sum() >= 2)
+    has_both = has_cost & samples.complete(samples.has_derivative)
+    unbiased, first = samples.by_unit(take(terms.by_noise)), samples.by_unit(take(samples.derivatives))
+    count = as_real(samples.has_cost.sum(), samples.costs)
+    summary = Parts(
+        first=Moments.of(first, has_both),
+        unbiased=Moments.of(unbiased, has_cost),
+        difference=Moments.of(unbiased - first, has_both),
+        costs=Moments.of(samples.by_unit(samples.costs) + samples.mean_cost, has_cost),
+        scaled=Moments.of(samples.derivatives * samples.stddev, samples.has_derivative),
+        secants=secant_sums(samples, slopes),
+        linear_variance=count * terms.linear_variance,
+        beta=(samples.has_cost * terms.beta).sum(),
+        num_costs=count,
+    )
+    return summary, terms
