@@ -60,7 +60,7 @@ class MLPPolicy(eqx.Module):
         return params[-1](hidden)
 
 
-def whole_state(state: State | Float[Array, " states"]) -> Float[Array, " observed"]:
+def whole_state(state: Any) -> Float[Array, " observed"]:
     """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order.
 
     Args:
