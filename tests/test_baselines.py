@@ -28,7 +28,9 @@ def bowl(x):
 objective = mg.parameter_noise(bowl, 0.3, dim=2)
 
 METHODS = {
-    "cross_entropy": functools.partial(baselines.cross_entropy, num_samples=40, num_elite=8, min_stddev=0.01),
+    "cross_entropy": functools.partial(
+        baselines.cross_entropy, num_samples=40, num_elite=8, stddev=1.0, min_stddev=0.05
+    ),
     "mppi": functools.partial(baselines.mppi, num_samples=40),
     "predictive_sampling": functools.partial(baselines.predictive_sampling, num_samples=40),
 }
@@ -89,9 +91,9 @@ def test_a_width_is_not_let_below_its_minimum(key):
     method = functools.partial(
         baselines.cross_entropy, cost, jnp.zeros(1), key, num_samples=20, num_elite=4, num_steps=60
     )
-    # Far into the run the mean cost of candidates is the square of the width.
-    assert method().history.cost[-1] < 1e-12
-    assert 0.02 < np.sqrt(method(min_stddev=0.1).history.cost[-20:].mean()) < 0.2
+    assert method().history.step_norm[-1] < 1e-6
+    # Then the mean cost of the candidates is about the square of the width.
+    assert 0.08 < np.sqrt(method(min_stddev=0.1).history.cost[-20:].mean()) < 0.15
 
 
 def test_mppi_is_the_mean_of_a_tilted_gaussian(key):
@@ -223,11 +225,13 @@ def test_an_action_answers_for_what_comes_after_it_and_no_more(key, baseline):
     np.testing.assert_allclose(estimate.standard_error, samples.std(axis=0, ddof=1) / np.sqrt(5), rtol=1e-9)
 
 
-def test_reward_to_go_has_less_variance_than_the_whole_cost(key):
-    cost = closed_loop()
-    at = cost.ravel(POLICY)
-    whole = textbook.zeroth_order(cost, at, key, num_samples=20_000)
-    assert reinforce(cost, at, key, num_samples=20_000).variance < 0.9 * whole.variance
+def test_reward_to_go_spares_a_late_action_the_variance_of_what_came_before(key):
+    """For the first action all of the cost is still to come; for the last one of ten, little."""
+    cost, at = mg.open_loop(textbook.LinearSystem(horizon=10), 0.3), jnp.full(10, 0.3)
+    whole = textbook.zeroth_order(cost, at, key, num_samples=4000)
+    ratio = reinforce(cost, at, key, num_samples=4000).covariance_diagonal / whole.covariance_diagonal
+    assert abs(ratio[0] - 1) < 0.01
+    assert ratio[-1] < 0.3
 
 
 def test_the_error_bar_of_reinforce_is_the_spread_of_its_repetitions(key):
@@ -270,7 +274,7 @@ def test_reinforce_drives_an_optimisation(key):
 
 
 def test_reinforce_needs_steps(key):
-    with pytest.raises(ValueError, match="objective must have noise on actions.*got ParameterNoise"):
+    with pytest.raises(ValueError, match=r"objective must have noise on actions.*got ParameterNoise"):
         baselines.reinforce(objective, START, key, num_samples=4)
 
     class Total(textbook.LinearSystem):

@@ -78,8 +78,9 @@ class Program:
     def advance(self, saved: Saved) -> Saved:
         """Run one segment more."""
         if self._compiled is None:
+            lowered = self._lower()
             began = time.perf_counter()
-            self._compiled = self._lower().compile()
+            self._compiled = lowered.compile()
             self.compile_seconds += time.perf_counter() - began
         began = time.perf_counter()
         index = jnp.asarray(saved.seconds.size, jnp.int32)

@@ -47,3 +47,9 @@ def made_up(value, *, error=0.0, cost=0.0, cost_error=0.0, bias_bound=0.0, num_r
 def exact(objective, params, key):
     """The gradient of the bowl itself, one rollout."""
     return made_up(CURVATURE * (params - CENTRE), cost=bowl(params))
+
+
+def noisy(objective, params, key):
+    """The same with noise on it, as wide as the objective's; cheap to compile."""
+    noise = objective.sample_noise(key)
+    return made_up(CURVATURE * (params - CENTRE) + noise, cost=bowl(params + noise), error=objective.stddev)

@@ -23,7 +23,7 @@ def run(path=None, *, rate=0.05, num_steps=40, **settings):
         lambda scale: problems.objective.with_stddev(0.1 * scale),
         START,
         settings.pop("key", KEY),
-        estimator=problems.first_order,
+        estimator=problems.noisy,
         smoothing=mg.Plateau(patience=3),
         convergence=mg.Convergence(cost=0.0, window=15),
         evaluate=problems.bowl,

@@ -120,7 +120,7 @@ def seeds():
 
 def spoiled(objective, params, key):
     """NaN where the parameters are far."""
-    estimate = problems.first_order(objective, params, key)
+    estimate = problems.noisy(objective, params, key)
     gradient = jnp.where((params > 2).any(), jnp.nan, estimate.value)
     return made_up(gradient, cost=estimate.objective_mean, num_rollouts=4)
 
@@ -152,7 +152,7 @@ def test_seeds_draw_different_noise(key):
         problems.objective,
         START,
         jax.random.split(key, 3),
-        estimator=problems.first_order,
+        estimator=problems.noisy,
         optimiser=optax.sgd(0.1),
         num_steps=2,
     )
