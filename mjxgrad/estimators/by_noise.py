@@ -10,6 +10,10 @@ from mjxgrad.estimators.sampling import Plan
 from mjxgrad.objective import Objective
 
 
+# All pairs of a chunk are compared: twice as many samples at a time would be twice the work for each.
+DEFAULT_CHUNK_SIZE = 256
+
+
 class SamplesByNoise(eqx.Module):
     """Rollouts of a chunk, flat; where starts are random, samples 2i and 2i + 1 begin alike.
 
@@ -82,7 +86,7 @@ def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None
             f"objective must know its noise, got {type(objective).__name__}; override differentiate in it, "
             "or use first_order or zeroth_order"
         )
-    return Plan(num_samples, chunk_size, with_gradient=True, shares_start=objective.has_circumstances)
+    return Plan(num_samples, chunk_size or DEFAULT_CHUNK_SIZE, with_gradient=True, shares_start=objective.has_circumstances)
 
 
 def sample_by_noise(

@@ -25,6 +25,9 @@ def control_variate(
     Unbiased however wrong derivatives are; then $\beta$ is near zero and this is zeroth order. Where they explain the
     costs its error is smaller by the root of the share that they leave.
 
+    The standard error does not count that terms depend on each other through the mean derivative: at four samples it was
+    up to 8 % too small in the tests, from ten on less than 2 %.
+
     Args:
         objective: differentiated once per sample by its noise, under `jax.vmap`.
         params: the point $\theta$.
