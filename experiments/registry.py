@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.config import RunSettings
 from experiments.report import Report
+from experiments.textbook.settings import TextbookSettings
 from experiments.workspace import Workspace
 
 
@@ -31,4 +32,5 @@ class Experiment:
 
 EXPERIMENTS = {
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
+    "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

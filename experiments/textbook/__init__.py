@@ -1,0 +1,1 @@
+"""Estimators on costs whose smoothed gradient is known in closed form."""
