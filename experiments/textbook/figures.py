@@ -122,6 +122,8 @@ def missing(outcome: Outcome):
         p = outcome.missing.probability[i]
         left.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(x[i]))
         left.plot(counts, outcome.missing.frequency[i], ".", color=colour, ms=4)
+        if p > 0.5:
+            continue  # most samples are on the slope, so that the event is to be on it
         # Where half of the sets miss, and so the interval is widest; bands of all stiffnesses would hide each other.
         at = np.clip(np.log(0.5) / np.log1p(-p), counts[0], counts[-1])
         low, high = found[i].miss_probability_interval(at)

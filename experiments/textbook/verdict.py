@@ -125,7 +125,7 @@ def _unseen(outcome: Outcome) -> str | None:
         return None
     x, found = np.asarray(outcome.settings.stiffness), outcome.missing.found
     covered = [
-        one.probability_interval[0] <= p <= one.probability_interval[1]
+        one.probability_interval[0] <= min(p, 1 - p) <= one.probability_interval[1]  # of the rarer side
         for one, p in zip(found, outcome.missing.probability, strict=True)
     ]
     sentence = f"The interval of β contains the closed form at {sum(covered)} of {len(x)} stiffnesses."
