@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
-from mjxgrad.rollout import initial_state
-from mjxgrad.scene import load_scene
-from mjxgrad.tasks import SceneTask
 from tests.estimators import textbook
+from tests.estimators.textbook import RandomStart
 
 STDDEV = 0.3
 CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
@@ -115,13 +113,6 @@ def test_single_precision_stays_single():
 def test_noise_of_an_unknown_dimension_is_refused_by_name():
     with pytest.raises(ValueError, match="dim is not known: pass dim"):
         parameter_noise(textbook.bumpy, STDDEV).sample_noise(jax.random.key(0))
-
-
-class RandomStart(textbook.LinearSystem):
-    """The same system from a start that is drawn."""
-
-    def sample_start(self, key):
-        return self.start + 0.5 * jax.random.normal(key, (2,))
 
 
 class Laplace(Objective):
@@ -234,44 +225,6 @@ def test_other_noise_is_checked_like_the_first(name):
         objective.with_stddev(jnp.ones(7))
 
 
-def test_an_antithetic_pair_begins_at_the_same_place(key):
-    objective, _ = objectives()["random_start"]
-    noise, start = objective.sample_noise(key)
-    mirrored, same = objective.mirror((noise, start))
-    np.testing.assert_array_equal(mirrored, -noise)
-    np.testing.assert_array_equal(same, start)
-
-
-def test_zero_noise_takes_the_nominal_start():
-    objective, params = objectives()["random_start"]
-    fixed, _ = objectives()["closed_loop"]
-    assert objective.value(params, objective.zero_noise()) == fixed.value(params, fixed.zero_noise())
-
-
-def test_a_random_start_is_where_the_rollout_begins(key):
-    objective, params = objectives()["random_start"]
-    noise = objective.sample_noise(key)
-    np.testing.assert_array_equal(objective.outcome(params, noise).states[0], noise[1])
-    assert not np.allclose(noise[1], objective.task.start)
-
-
-def test_a_nominal_start_built_unlike_the_random_ones_is_refused():
-    class Forgetful(RandomStart):
-        def nominal_start(self):
-            return None
-
-    with pytest.raises(ValueError, match="nominal_start must have the structure of sample_start"):
-        open_loop(Forgetful(), STDDEV).zero_noise()
-
-
-def test_a_control_answers_for_its_own_step_and_those_after():
-    task = textbook.LinearSystem()
-    slopes = jax.jacobian(lambda controls: task.run(controls).step_costs)(CONTROLS)[..., 0]
-    assert slopes.shape == (5, 4)
-    np.testing.assert_array_equal(np.triu(slopes, k=1), 0)
-    assert (np.abs(slopes[np.tril_indices(4)]) > 1e-3).all()
-
-
 def test_a_rule_without_forward_mode_is_differentiated_in_reverse():
     @jax.custom_vjp
     def cube(x):
@@ -281,52 +234,3 @@ def test_a_rule_without_forward_mode_is_differentiated_in_reverse():
     objective = parameter_noise(lambda x: cube(x[0]), STDDEV, dim=1)
     found = objective.differentiate(jnp.array([2.0]), jnp.array([1.0]))
     np.testing.assert_allclose(found.gradient_by_noise, [27.0])
-
-
-CART = """
-<mujoco>
-  <option timestep="0.05"/>
-  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body></worldbody>
-  <actuator><motor joint="x"/></actuator>
-</mujoco>
-"""
-THRUSTS = jnp.array([[1.0], [-2.0], [4.0]])
-
-
-def per_state(trajectory):
-    """Of every state, and of the control that follows it."""
-    return (trajectory.qpos[:, 0] - 0.1) ** 2 + jnp.append(trajectory.ctrl[:, 0] ** 2, 0.0)
-
-
-@pytest.fixture(scope="module")
-def cart():
-    scene = load_scene(CART)
-
-    def start(key):
-        return initial_state(scene, qpos=0.3 + 0.2 * jax.random.normal(key, (1,)))
-
-    return SceneTask(scene, initial_state(scene), per_state, horizon=3, start_distribution=start)
-
-
-def test_a_scene_charges_by_step_from_where_it_starts(cart, key):
-    """Semi-implicit Euler of a mass of 2 kg: v += h u/m, x += h v."""
-    objective = open_loop(cart, STDDEV)
-    noise, start = objective.sample_noise(key)
-    outcome = eqx.filter_jit(objective.outcome)(THRUSTS.ravel(), (noise, start))
-    x, v, expected = float(start.qpos[0]), 0.0, []
-    for u in np.asarray(THRUSTS + noise)[:, 0]:
-        expected.append((x - 0.1) ** 2 + u**2)
-        v += 0.05 * u / 2
-        x += 0.05 * v
-    expected.append((x - 0.1) ** 2)
-    np.testing.assert_allclose(outcome.step_costs, expected, rtol=1e-9)
-    np.testing.assert_allclose(outcome.cost, np.sum(expected), rtol=1e-9)
-    assert objective.zero_noise()[1].qpos == 0
-
-
-def test_a_scene_whose_cost_has_another_length_is_refused(cart):
-    wrong = SceneTask(cart.scene, cart.state, lambda trajectory: per_state(trajectory)[1:], horizon=3)
-    with pytest.raises(
-        ValueError, match=r"scalar of shape \(\) or one number per state, shape \(4,\), got shape \(3,\)"
-    ):
-        jax.eval_shape(wrong.run, THRUSTS)

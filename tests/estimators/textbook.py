@@ -136,6 +136,13 @@ class LinearSystem(Task):
         return total + 2 * (((mean - 1) ** 2).sum() + jnp.trace(covariance))
 
 
+class RandomStart(LinearSystem):
+    """The same system from a start that is drawn."""
+
+    def sample_start(self, key):
+        return self.start + 0.5 * jax.random.normal(key, (2,))
+
+
 def linear_policy(params: dict, state: Float[Array, " 2"]) -> Float[Array, " 1"]:
     return params["gain"] @ state + params["offset"]
 

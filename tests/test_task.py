@@ -1,0 +1,124 @@
+"""Where rollouts begin, and what they are charged by step."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.objective import closed_loop, open_loop
+from mjxgrad.rollout import initial_state
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks import SceneTask
+from tests.estimators import textbook
+
+STDDEV = 0.3
+CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
+POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+
+
+@pytest.fixture
+def objective():
+    return closed_loop(textbook.RandomStart(), textbook.linear_policy, STDDEV, params=POLICY_PARAMS)
+
+
+@pytest.fixture
+def params(objective):
+    return objective.ravel(POLICY_PARAMS)
+
+
+def test_an_antithetic_pair_begins_at_the_same_place(objective, key):
+    noise, start = objective.sample_noise(key)
+    mirrored, same = objective.mirror((noise, start))
+    np.testing.assert_array_equal(mirrored, -noise)
+    np.testing.assert_array_equal(same, start)
+
+
+def test_redrawn_noise_begins_at_the_same_place(objective, key):
+    """It is what `sample_noise` would draw otherwise: new actions, old start."""
+    noise, start = objective.sample_noise(key)
+    other, same = objective.redraw((noise, start), jax.random.key(1))
+    np.testing.assert_array_equal(same, start)
+    assert np.abs(other - noise).min() > 0
+
+
+def test_only_a_random_start_is_a_circumstance_beside_the_noise(objective):
+    assert objective.has_circumstances
+    assert not open_loop(textbook.LinearSystem(), STDDEV).has_circumstances
+
+
+def test_zero_noise_takes_the_nominal_start(objective, params):
+    fixed = eqx.tree_at(lambda o: o.task, objective, textbook.LinearSystem())
+    assert objective.value(params, objective.zero_noise()) == fixed.value(params, fixed.zero_noise())
+
+
+def test_a_random_start_is_where_the_rollout_begins(objective, params, key):
+    noise = objective.sample_noise(key)
+    np.testing.assert_array_equal(objective.outcome(params, noise).states[0], noise[1])
+    assert not np.allclose(noise[1], objective.task.start)
+
+
+def test_a_nominal_start_built_unlike_the_random_ones_is_refused():
+    class Forgetful(textbook.RandomStart):
+        def nominal_start(self):
+            return None
+
+    with pytest.raises(ValueError, match="nominal_start must have the structure of sample_start"):
+        open_loop(Forgetful(), STDDEV).zero_noise()
+
+
+def test_a_control_answers_for_its_own_step_and_those_after():
+    task = textbook.LinearSystem()
+    slopes = jax.jacobian(lambda controls: task.run(controls).step_costs)(CONTROLS)[..., 0]
+    assert slopes.shape == (5, 4)
+    np.testing.assert_array_equal(np.triu(slopes, k=1), 0)
+    assert (np.abs(slopes[np.tril_indices(4)]) > 1e-3).all()
+
+
+CART = """
+<mujoco>
+  <option timestep="0.05"/>
+  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body></worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>
+"""
+THRUSTS = jnp.array([[1.0], [-2.0], [4.0]])
+
+
+def per_state(trajectory):
+    """Of every state, and of the control that follows it."""
+    return (trajectory.qpos[:, 0] - 0.1) ** 2 + jnp.append(trajectory.ctrl[:, 0] ** 2, 0.0)
+
+
+@pytest.fixture(scope="module")
+def cart():
+    scene = load_scene(CART)
+
+    def start(key):
+        return initial_state(scene, qpos=0.3 + 0.2 * jax.random.normal(key, (1,)))
+
+    return SceneTask(scene, initial_state(scene), per_state, horizon=3, start_distribution=start)
+
+
+def test_a_scene_charges_by_step_from_where_it_starts(cart, key):
+    """Semi-implicit Euler of a mass of 2 kg: v += h u/m, x += h v."""
+    objective = open_loop(cart, STDDEV)
+    noise, start = objective.sample_noise(key)
+    outcome = eqx.filter_jit(objective.outcome)(THRUSTS.ravel(), (noise, start))
+    x, v, expected = float(start.qpos[0]), 0.0, []
+    for u in np.asarray(THRUSTS + noise)[:, 0]:
+        expected.append((x - 0.1) ** 2 + u**2)
+        v += 0.05 * u / 2
+        x += 0.05 * v
+    expected.append((x - 0.1) ** 2)
+    np.testing.assert_allclose(outcome.step_costs, expected, rtol=1e-9)
+    np.testing.assert_allclose(outcome.cost, np.sum(expected), rtol=1e-9)
+    assert objective.zero_noise()[1].qpos == 0
+
+
+def test_a_scene_whose_cost_has_another_length_is_refused(cart):
+    wrong = SceneTask(cart.scene, cart.state, lambda trajectory: per_state(trajectory)[1:], horizon=3)
+    with pytest.raises(
+        ValueError, match=r"scalar of shape \(\) or one number per state, shape \(4,\), got shape \(3,\)"
+    ):
+        jax.eval_shape(wrong.run, THRUSTS)
