@@ -78,7 +78,7 @@ def optimise(
         )
         # Contact from soft to stiff, by itself:
         mg.optimise(
-            lambda scale: task.objective(stddev=0.1, softness=mg.Softness(stiffness=1e4 / scale)), params, key,
+            lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
             smoothing=mg.Plateau(factor=0.5, patience=10, minimum=0.01), ...
         )
 
