@@ -76,11 +76,11 @@ def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None
         The plan.
 
     Raises:
-        ValueError: if `num_samples` is below 2, or odd or below 4 where starts are random; if `chunk_size` is below 2;
+        ValueError: if `num_samples` is below 2, or odd or below 4 where starts are random; if `chunk_size` is below 4;
             or if the objective does not say what its noise is.
     """
-    if chunk_size is not None and chunk_size < 2:
-        raise ValueError(f"chunk_size must be at least 2, got {chunk_size}: samples are compared within a chunk")
+    if chunk_size is not None and chunk_size < 4:
+        raise ValueError(f"chunk_size must be at least 4, got {chunk_size}: samples are compared within a chunk")
     if type(objective).differentiate is Objective.differentiate:
         raise ValueError(
             f"objective must know its noise, got {type(objective).__name__}; override differentiate in it, "

@@ -33,7 +33,7 @@ def control_variate(
         params: the point $\theta$.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
-        chunk_size: rollouts at a time, at least 2; memory grows with its square. Samples leave each other out within a
+        chunk_size: rollouts at a time, at least 4; memory grows with its square. Samples leave each other out within a
             chunk.
 
     Returns:

@@ -40,7 +40,7 @@ def per_step(
         rule: chooses each $\alpha_{t,a}$. None is `Consistent()`, whose first question is one for all steps;
             `InverseVariance()` is the published IVW-H.
         control_variate: whether the unbiased terms use derivatives.
-        chunk_size: rollouts at a time, at least 2; $\alpha$ is chosen within a chunk.
+        chunk_size: rollouts at a time, at least 4; $\alpha$ is chosen within a chunk.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number for each

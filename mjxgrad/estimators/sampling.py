@@ -177,18 +177,23 @@ def accumulate(plan: Plan, one_chunk: Callable[[Int[Array, " units"]], tuple[Sum
         The merged summaries.
     """
     num_chunks, size = plan.chunks()
+    total = plan.num_units + plan.with_zero_noise
+    fewest, num_larger = divmod(total, num_chunks)
 
     # The start of a chunk is in the carry: an array of all starts would grow with the number of samples.
-    def step(carry: tuple[Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
-        start, kept = carry
-        new_ones = one_chunk(start + jnp.arange(size))
+    def step(carry: tuple[Int[Array, ""], Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
+        chunk, start, kept = carry
+        end = start + fewest + (chunk < num_larger)
+        units = start + jnp.arange(size)
+        # What fills up the chunk is no unit of the plan, and not the rollout without noise either.
+        new_ones = one_chunk(jnp.where(units < end, units, total))
         merged = tuple(old.merge(new) for old, new in zip(kept, new_ones, strict=True))
-        return (start + size, merged), None
+        return (chunk + 1, end, merged), None
 
     start = jnp.zeros((), int)
-    shapes = jax.eval_shape(lambda: one_chunk(start + jnp.arange(size)))
+    shapes = jax.eval_shape(one_chunk, start + jnp.arange(size))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return jax.lax.scan(step, (start, empty), None, length=num_chunks)[0][1]
+    return jax.lax.scan(step, (start, start, empty), None, length=num_chunks)[0][2]
 
 
 def check_baseline(baseline: str) -> None:
