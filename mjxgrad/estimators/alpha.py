@@ -21,7 +21,7 @@ def alpha_order(
     num_samples: int,
     rule: Rule | None = None,
     control_variate: bool = True,
-    blocks: Int[np.ndarray, " dim"] | None = None,
+    blocks: np.ndarray | None = None,
     chunk_size: int | None = None,
 ) -> GradientEstimate:
     r"""Mix a first-order and an unbiased estimate of the gradient of a smoothed objective.
@@ -87,10 +87,12 @@ def weigh(rule: Rule, parts: Parts, blocks: Int[np.ndarray, " dim"], num_blocks:
     return jax.vmap(one_block)(parts.evidence(blocks, num_blocks))
 
 
-def _checked_blocks(blocks: Int[np.ndarray, " dim"] | None, dim: int) -> tuple[Int[np.ndarray, " dim"], int]:
+def _checked_blocks(blocks: np.ndarray | None, dim: int) -> tuple[Int[np.ndarray, " dim"], int]:
     """Give the block of each coordinate, and how many blocks there are."""
     if blocks is None:
         return np.zeros(dim, int), 1
+    if isinstance(blocks, jax.core.Tracer):
+        raise ValueError("blocks must be known when compiling, got a traced array; fix it by functools.partial")
     blocks = np.asarray(blocks)
     if blocks.shape != (dim,):
         raise ValueError(f"blocks must have one number for each of the {dim} coordinates, got shape {blocks.shape}")

@@ -86,7 +86,9 @@ def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None
             f"objective must know its noise, got {type(objective).__name__}; override differentiate in it, "
             "or use first_order or zeroth_order"
         )
-    return Plan(num_samples, chunk_size or DEFAULT_CHUNK_SIZE, with_gradient=True, shares_start=objective.has_circumstances)
+    return Plan(
+        num_samples, chunk_size or DEFAULT_CHUNK_SIZE, with_gradient=True, shares_start=objective.has_circumstances
+    )
 
 
 def sample_by_noise(

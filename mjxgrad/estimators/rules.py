@@ -20,6 +20,8 @@ from mjxgrad.estimators.estimate import Reason
 class Evidence(eqx.Module):
     """What a rule may look at: norms and variances of one block of coordinates, and what concerns all of them.
 
+    A rule sees numbers; the axis of blocks is mapped over.
+
     Attributes:
         count: samples (pairs of them where starts are random) behind the means.
         dim: coordinates in the block.
@@ -37,26 +39,26 @@ class Evidence(eqx.Module):
         scaled_first_norm: of their mean.
     """
 
-    count: Int[Array, ""]
-    dim: Float[Array, ""]
-    first_norm: Float[Array, ""]
-    zeroth_norm: Float[Array, ""]
-    difference_norm: Float[Array, ""]
-    first_variance: Float[Array, ""]
-    zeroth_variance: Float[Array, ""]
-    difference_variance: Float[Array, ""]
-    inconsistency: Float[Array, ""]
-    relative_bias_bound: Float[Array, ""]
-    cost_variance: Float[Array, ""]
-    scaled_first_variance: Float[Array, ""]
-    scaled_first_norm: Float[Array, ""]
+    count: Int[Array, "*blocks"]
+    dim: Float[Array, "*blocks"]
+    first_norm: Float[Array, "*blocks"]
+    zeroth_norm: Float[Array, "*blocks"]
+    difference_norm: Float[Array, "*blocks"]
+    first_variance: Float[Array, "*blocks"]
+    zeroth_variance: Float[Array, "*blocks"]
+    difference_variance: Float[Array, "*blocks"]
+    inconsistency: Float[Array, "*blocks"]
+    relative_bias_bound: Float[Array, "*blocks"]
+    cost_variance: Float[Array, "*blocks"]
+    scaled_first_variance: Float[Array, "*blocks"]
+    scaled_first_norm: Float[Array, "*blocks"]
 
     @property
-    def real_count(self) -> Float[Array, ""]:
+    def real_count(self) -> Float[Array, "*blocks"]:
         """Give the count as a real number."""
         return self.count.astype(self.first_norm.dtype)
 
-    def least_variance(self) -> Float[Array, ""]:
+    def least_variance(self) -> Float[Array, "*blocks"]:
         """Give the weights of inverse variance, V⁰/(V⁰ + V¹); 1 where both are zero."""
         total = self.first_variance + self.zeroth_variance
         return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
@@ -71,9 +73,9 @@ class Weights(eqx.Module):
         bias_bound: on the norm of the bias; NaN where the rule knows none.
     """
 
-    alpha: Float[Array, ""]
+    alpha: Float[Array, "*blocks"]
     reason: Reason
-    bias_bound: Float[Array, ""]
+    bias_bound: Float[Array, "*blocks"]
 
 
 Rule = Callable[[Evidence], Weights]

@@ -60,11 +60,13 @@ def unbiased_terms(
     # (mean derivative without j) · w_k
     along = (slopes.sum(axis=0)[None, :] - slopes) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
     if with_derivatives:
-        beta, linear_variance = _fitted_share(samples, slopes, others, num_others)
+        beta, linear_variance = _fitted_share(samples, slopes, others)
     else:
         beta, linear_variance = jnp.zeros_like(costs), jnp.zeros_like(num_slopes)
     rest = costs[None, :] - beta[:, None] * along
     baseline = (others * rest).sum(axis=1) / num_others
+    if samples.per_unit == 2:
+        baseline += _partners_surplus(samples, rest - baseline[:, None], others)
     residual = jnp.diagonal(rest) - baseline
     total = samples.derivatives.sum(axis=0)[None, :]
     without = (total - samples.derivatives) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
@@ -76,7 +78,6 @@ def _fitted_share(
     samples: SamplesByNoise,
     slopes: Float[Array, "samples samples"],
     others: Float[Array, "samples samples"],
-    num_others: Float[Array, " samples"],
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
@@ -89,12 +90,39 @@ def _fitted_share(
     weights = others * (count >= 1)
 
     def centred(values: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+        if samples.per_unit == 2:  # what the start does to the costs is not the noise's doing
+            return pairs * (values - _partner(values)) / jnp.sqrt(2.0)
         mean = (weights * values).sum(axis=1) / jnp.maximum(weights.sum(axis=1), 1)
         return weights * (values - mean[:, None])
 
+    weights = weights * samples.has_cost[:, None]
+    pairs = weights * _partner(weights) if samples.per_unit == 2 else weights
     explaining, explained = centred(along), centred(jnp.broadcast_to(samples.costs, along.shape))
     squares = (explaining**2).sum(axis=1)
     has_any = squares > 0
     share = (explaining * explained).sum(axis=1) / jnp.where(has_any, squares, 1)
-    variance = squares.sum() / jnp.maximum((num_others * samples.has_cost).sum(), 1)
+    variance = squares.sum() / jnp.maximum(pairs.sum(), 1)
     return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
+
+
+def _partners_surplus(
+    samples: SamplesByNoise, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
+) -> Float[Array, " samples"]:
+    """Give what the cost of the other sample from the same start tells about this one's, beyond the mean of all.
+
+    The best linear guess: its distance from the mean times the correlation within pairs, which is taken from the other
+    pairs. Where starts make most of the spread it is near one, and the baseline is the partner's cost.
+    """
+    both = others * _partner(others)
+    together = (both * rest * _partner(rest)).sum(axis=1)
+    alone = (both * rest**2).sum(axis=1)
+    correlation = jnp.where(alone > 0, jnp.clip(together / jnp.where(alone > 0, alone, 1), 0, 1), 0)
+    index = jnp.arange(len(rest))
+    partner = index + 1 - 2 * (index % 2)
+    has_partner = samples.has_cost[partner]
+    return jnp.where(has_partner, correlation * rest[index, partner], 0)
+
+
+def _partner(rows: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+    """Swap the two samples of each start in every row."""
+    return rows.reshape(len(rows), -1, 2)[:, :, ::-1].reshape(rows.shape)

@@ -64,9 +64,7 @@ def test_it_is_unbiased_in_closed_loop_from_random_starts():
 
     def expected(flat):
         starts = [task.start + sign * jnp.array([0.5, -0.3]) for sign in (-1, 1)]
-        costs = [
-            textbook.LinearSystem(start=start).expected_cost(objective.unravel(flat), 0.2) for start in starts
-        ]
+        costs = [textbook.LinearSystem(start=start).expected_cost(objective.unravel(flat), 0.2) for start in starts]
         return sum(costs) / 2
 
     flat = objective.ravel(params)

@@ -1,0 +1,183 @@
+"""The α-order estimate: what it mixes, where it trusts derivatives, and what it says about it."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from mjxgrad import estimators
+from mjxgrad.estimators import Diagnosis, Reason, rules
+from mjxgrad.objective import closed_loop, parameter_noise
+from tests.estimators import textbook
+
+alpha_order = eqx.filter_jit(estimators.alpha_order)
+per_step = eqx.filter_jit(estimators.per_step)
+STDDEVS = jnp.array([0.1, 0.2, 0.3])
+POINT = jnp.array([0.3, 0.1, -0.5])
+BUMPY = parameter_noise(textbook.bumpy, STDDEVS)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """Both parts from the same 200 rollouts."""
+    key = jax.random.key(11)
+    first = textbook.first_order(BUMPY, POINT, key, num_samples=200)
+    unbiased = eqx.filter_jit(estimators.control_variate)(BUMPY, POINT, key, num_samples=200)
+    return key, first, unbiased
+
+
+def test_the_ends_of_alpha_are_first_order_and_the_control_variate(parts):
+    key, first, unbiased = parts
+    for alpha, part in ((1.0, first), (0.0, unbiased)):
+        estimate = alpha_order(BUMPY, POINT, key, num_samples=200, rule=rules.FixedAlpha(alpha))
+        np.testing.assert_allclose(estimate.value, part.value, rtol=1e-9)
+        np.testing.assert_allclose(estimate.standard_error, part.standard_error, rtol=1e-6)
+
+
+def test_without_control_variate_the_unbiased_part_is_zeroth_order(parts):
+    key = parts[0]
+    rule = rules.FixedAlpha(0.0)
+    estimate = alpha_order(BUMPY, POINT, key, num_samples=200, rule=rule, control_variate=False)
+    zeroth = textbook.zeroth_order(BUMPY, POINT, key, num_samples=200)
+    np.testing.assert_allclose(estimate.value, zeroth.value, rtol=1e-9)
+    np.testing.assert_allclose(estimate.standard_error, zeroth.standard_error, rtol=1e-9)
+
+
+def test_each_block_has_its_own_weight(parts):
+    key, first, unbiased = parts
+    blocks = np.array([1, 0, 1])
+    run = functools.partial(estimators.alpha_order, num_samples=200, rule=rules.InverseVariance(), blocks=blocks)
+    estimate = jax.jit(run)(BUMPY, POINT, key)
+    # The variance of terms, without the correction of the standard error for their dependence (1/n of it).
+    zeroth, derivatives = np.asarray(unbiased.covariance_diagonal), np.asarray(first.covariance_diagonal)
+    expected = np.array(
+        [zeroth[mine].sum() / (zeroth + derivatives)[mine].sum() for mine in (blocks == 0, blocks == 1)]
+    )
+    np.testing.assert_allclose(estimate.alpha, expected, rtol=0.01)
+    weights = np.asarray(estimate.alpha)[blocks]
+    mixed = weights * np.asarray(first.value) + (1 - weights) * np.asarray(unbiased.value)
+    np.testing.assert_allclose(estimate.value, mixed, rtol=1e-9)
+
+
+def test_the_error_bar_of_a_mixture_knows_that_its_parts_share_rollouts():
+    times = 20_000
+    rule = rules.FixedAlpha(0.5)
+    keys = jax.random.split(jax.random.key(2), times)
+    run = jax.jit(jax.vmap(lambda k: estimators.alpha_order(BUMPY, POINT, k, num_samples=20, rule=rule)))
+    estimates = run(keys)
+    values = np.asarray(estimates.value)
+    assert np.all(
+        np.abs(values.mean(axis=0) - textbook.bumpy_gradient(np.asarray(POINT), np.asarray(STDDEVS)))
+        < 4 * values.std(axis=0) / np.sqrt(times)
+    )
+    ratio = (np.asarray(estimates.standard_error) ** 2).mean(axis=0) / values.var(axis=0)
+    np.testing.assert_allclose(ratio, 1, atol=0.06)
+
+
+def test_a_quadratic_is_always_left_to_first_order():
+    """The trapezoidal rule is exact for it, whatever its curvature and however near its minimum."""
+    matrix = jnp.array([[30.0, 1.0, 0.0], [1.0, 0.01, 0.2], [0.0, 0.2, -4.0]])
+    objective = parameter_noise(lambda x: 1e4 + x @ matrix @ x, STDDEVS)
+    keys = jax.random.split(jax.random.key(0), 500)
+    run = jax.jit(jax.vmap(lambda k: estimators.alpha_order(objective, jnp.zeros(3), k, num_samples=10)))
+    estimates = run(keys)
+    assert not np.any(jax.tree.leaves(estimates.reason)[0] == jax.tree.leaves(Reason.inconsistent)[0])
+    assert np.all(np.asarray(estimates.alpha) > 0)
+
+
+def test_a_jump_between_samples_is_always_seen():
+    """A step on a slope at ten samples: either all fall on one side, with chance 2/2^10 here, or the jump is seen."""
+    objective = parameter_noise(lambda x: 3 * x[0] + jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=1)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    run = jax.jit(jax.vmap(lambda k: estimators.alpha_order(objective, jnp.zeros(1), k, num_samples=10)))
+    accepted = (np.asarray(run(keys).alpha) > 0).mean()
+    assert accepted < 0.01
+
+
+def test_at_a_jump_it_is_as_unbiased_as_zeroth_order(key):
+    objective = parameter_noise(textbook.step, 0.1, dim=1)
+    estimate = alpha_order(objective, jnp.array([0.05]), key, num_samples=20_000)
+    assert estimate.alpha == 0
+    assert estimate.bias_bound == 0
+    assert Reason[estimate.reason] == Reason[Reason.inconsistent]
+    textbook.assert_within_error(estimate, norm.pdf(0.05, scale=0.1))
+
+
+def test_the_bound_on_the_bias_holds_for_a_small_jump_in_many_dimensions(key):
+    """A jump of 0.05 in one of 40 coordinates passes the test; its bias is 0.05 φ(0)/σ, its bound sd(J)/σ."""
+    slope = jnp.linspace(1, 2, 40)
+    objective = parameter_noise(lambda x: slope @ x + 0.05 * jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=40)
+    rule = rules.Consistent(failure_probability=1e-9)
+    estimate = alpha_order(objective, jnp.zeros(40), key, num_samples=200, rule=rule)
+    assert estimate.alpha > 0.5
+    bias = 0.05 * norm.pdf(0) / 0.1
+    assert bias * estimate.alpha < estimate.bias_bound
+    # The standard deviation of a jump that half of the samples take is half of it.
+    np.testing.assert_allclose(estimate.bias_bound, estimate.alpha * 0.5 * 0.05 / 0.1, rtol=0.2)
+
+
+def test_a_large_constant_changes_nothing_in_single_precision(key):
+    def cost(x):
+        return jnp.float32(0.3) * x[0] + x[0] ** 2
+
+    point, stddev = jnp.array([0.1], jnp.float32), jnp.float32(0.1)
+    plain = alpha_order(parameter_noise(cost, stddev), point, key, num_samples=64)
+    lifted = alpha_order(parameter_noise(lambda x: cost(x) + 1000.0, stddev), point, key, num_samples=64)
+    assert plain.value.dtype == jnp.float32
+    assert Reason[lifted.reason] != Reason[Reason.inconsistent]
+    np.testing.assert_allclose(lifted.value, plain.value, rtol=0.05)
+
+
+def test_without_finite_derivatives_the_unbiased_part_stands_alone(key):
+    objective = parameter_noise(lambda x: jnp.sqrt(jnp.maximum(x[0], 0)), 0.1, dim=1)
+    # Everything is at -1 or below: costs are zero and derivatives NaN.
+    estimate = alpha_order(objective, jnp.array([-1.0]), key, num_samples=20)
+    assert Reason[estimate.reason] == Reason[Reason.not_finite]
+    assert Diagnosis[estimate.diagnosis] == Diagnosis[Diagnosis.fine]
+    assert estimate.value == 0
+
+
+def test_rollouts_are_counted_once(key):
+    estimate = alpha_order(BUMPY, POINT, key, num_samples=200)
+    assert estimate.num_rollouts == estimate.num_gradient_rollouts == 200
+
+
+@pytest.mark.parametrize(
+    ("blocks", "message"),
+    [
+        (np.array([0.0, 1.0, 1.0]), "integers from 0"),
+        (np.array([0, 1]), "one number for each of the 3 coordinates"),
+        (np.array([0, 2, 2]), "without gaps"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_answered(blocks, message, key):
+    with pytest.raises(ValueError, match=message):
+        estimators.alpha_order(BUMPY, POINT, key, num_samples=10, blocks=blocks)
+
+
+def test_by_step_is_by_coordinate_where_the_noise_is_on_the_parameters(key):
+    rule = rules.InverseVariance()
+    by_step = per_step(BUMPY, POINT, key, num_samples=100, rule=rule)
+    run = functools.partial(estimators.alpha_order, num_samples=100, rule=rule, blocks=np.arange(3))
+    by_coordinate = jax.jit(run)(BUMPY, POINT, key)
+    np.testing.assert_allclose(by_step.alpha, by_coordinate.alpha, rtol=1e-9)
+    np.testing.assert_allclose(by_step.value, by_coordinate.value, rtol=1e-9)
+    assert Reason[Reason.inverse_variance] == Reason[jax.tree.map(lambda leaf: leaf[0], by_step.reason)]
+
+
+def test_by_step_is_unbiased_in_closed_loop_if_its_parts_are():
+    """Weights that do not depend on the samples keep it unbiased; the expected cost is known by recursion."""
+    task, params = textbook.LinearSystem(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
+    objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
+    flat, times = objective.ravel(params), 10_000
+    rule = rules.FixedAlpha(0.6)
+    run = jax.jit(jax.vmap(lambda k: estimators.per_step(objective, flat, k, num_samples=10, rule=rule)))
+    estimates = run(jax.random.split(jax.random.key(4), times))
+    truth = jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2))(flat)
+    values = np.asarray(estimates.value)
+    np.testing.assert_array_less(np.abs(values.mean(axis=0) - truth), 4 * values.std(axis=0) / np.sqrt(times))
+    assert estimates.alpha.shape == (times, task.horizon * task.num_controls)

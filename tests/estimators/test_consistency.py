@@ -1,0 +1,70 @@
+"""Whether derivatives explain costs, pair by pair."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxgrad.estimators.by_noise import plan_by_noise, sample_by_noise
+from mjxgrad.estimators.consistency import secant_sums
+from mjxgrad.estimators.unbiased import gram
+from mjxgrad.objective import parameter_noise
+
+STDDEVS = jnp.array([0.1, 0.2])
+POINT = jnp.array([0.05, -0.3])
+
+
+def samples_of(function, key, num_samples=40):
+    objective = parameter_noise(function, STDDEVS).sized_for(POINT)
+    plan = plan_by_noise(objective, num_samples, None)
+    return sample_by_noise(objective, POINT, key, jnp.arange(num_samples), plan)
+
+
+def sums_of(function, key):
+    samples = samples_of(function, key)
+    return secant_sums(samples, gram(samples)), samples
+
+
+def test_the_sums_are_those_of_the_definition(key):
+    def cost(x):
+        return jnp.sin(9 * x[0]) * x[1] + jnp.where(x[0] > 0, 0.2, 0.0)
+
+    sums, samples = sums_of(cost, key)
+    x = np.asarray(POINT + samples.noise)
+    costs = np.array([cost(one) for one in x])
+    slopes = np.array([jax.grad(cost)(one) for one in x])
+    residual = difference = missed = 0.0
+    for j in range(40):
+        for k in set(range(40)) - {j}:
+            rest = costs[j] - costs[k] - (slopes[j] + slopes[k]) @ (x[j] - x[k]) / 2
+            distance = (((x[j] - x[k]) / np.asarray(STDDEVS)) ** 2).sum()
+            residual += rest**2 / distance
+            difference += (costs[j] - costs[k]) ** 2 / distance
+            missed += rest**2 / 2
+    np.testing.assert_allclose(sums.inconsistency(), residual / difference, rtol=1e-9)
+    np.testing.assert_allclose(sums.missed_variance(), missed / (40 * 39), rtol=1e-9)
+
+
+def test_nothing_of_a_quadratic_is_missed(key):
+    sums, _ = sums_of(lambda x: 1e3 + 7 * x[0] ** 2 - 3 * x[0] * x[1] + x[1], key)
+    assert sums.inconsistency() == 0
+    assert sums.missed_variance() == 0
+
+
+def test_what_is_missed_of_a_jump_is_its_variance(key):
+    """Half the mean square of differences of all pairs is the variance with N - 1."""
+    sums, samples = sums_of(lambda x: 2 * x[1] + jnp.where(x[0] > 0, 0.7, 0.0), key)
+    jump = np.where(np.asarray(POINT + samples.noise)[:, 0] > 0, 0.7, 0.0)
+    np.testing.assert_allclose(sums.missed_variance(), jump.var(ddof=1), rtol=1e-9)
+
+
+def test_a_constant_is_consistent(key):
+    sums, _ = sums_of(lambda x: 3.0 + 0 * x[0], key)
+    assert sums.inconsistency() == 0
+
+
+def test_a_sample_without_derivative_is_compared_with_none(key):
+    """The root below zero has no derivative; what remains is smooth enough to be explained."""
+    sums, samples = sums_of(lambda x: x[1] + jnp.sqrt(jnp.where(x[0] > 0, 1.0, x[0] * 0)), key)
+    kept = int(samples.has_derivative.sum())
+    assert 0 < kept < 40
+    assert sums.pairs == kept * (kept - 1)
