@@ -1,0 +1,1 @@
+"""Optimisation of the published tasks by several methods, at equal rollouts."""

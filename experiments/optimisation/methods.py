@@ -1,0 +1,122 @@
+"""From the name of a method to something that runs."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import optax
+from jaxtyping import Array, Key
+
+import mjxgrad as mg
+from experiments.optimisation.settings import MethodSettings, OptimisationSettings
+from mjxgrad.diagnostics import Rollouts
+from mjxgrad.diagnostics.budget import affordable
+from mjxgrad.estimators import GradientEstimate, rules
+from mjxgrad.tasks.published import TASKS, Published
+
+Run = Callable[..., mg.Optimisation]
+
+_SCENES = {
+    "push_soft": lambda: mg.tasks.push(10.0),
+    "push_stiff": lambda: mg.tasks.push(1000.0),
+    "friction": lambda: mg.tasks.friction(),
+    "motion_planning": lambda: mg.tasks.motion_planning(),
+    "tennis": lambda: mg.tasks.tennis(),
+}
+
+
+def problem(settings: OptimisationSettings) -> Published:
+    """Set up the task, with the run's own settings in place of the published ones where they are given.
+
+    Args:
+        settings: of the run.
+
+    Returns:
+        The task. It has reference results only under the published settings.
+    """
+    found = TASKS[settings.task]() if settings.dynamics == "published" else _SCENES[settings.task]().problem()
+    chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
+    return dataclasses.replace(found, **chosen, reference={}) if chosen else found
+
+
+def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
+    """Give an estimator, to be called with `num_samples`.
+
+    Args:
+        method: that is no search.
+        task: for the published constants of its rule.
+
+    Returns:
+        The function of `mjxgrad.estimators`, its options bound.
+    """
+    options = method.options
+    if method.rule is not None:
+        options["rule"] = {
+            "consistent": rules.Consistent,
+            "inverse_variance": rules.InverseVariance,
+            "concavity": rules.Concavity,
+            "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
+        }[method.rule]()
+    library = mg.baselines if method.name == "reinforce" else mg.estimators
+    return functools.partial(getattr(library, method.name), **options)
+
+
+def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Run:
+    """Give the function that runs a method.
+
+    A baseline without noise is a rollout, too: an estimator gets as many samples as the rollouts of a step allow.
+
+    Args:
+        method: which one.
+        task: what it optimises.
+        key: for tracing alone.
+
+    Returns:
+        A function of keys, one per seed, and of the options of `mg.optimise`.
+    """
+    if method.is_search:
+        return _search(method, task)
+    function = estimator(method, task)
+    afforded = affordable(function, task.objective, task.params, key, Rollouts(task.num_samples)).num_samples
+
+    def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
+        return mg.optimise(
+            task.objective,
+            task.params,
+            keys,
+            estimator=functools.partial(function, num_samples=afforded),
+            optimiser=optax.sgd(task.learning_rate),
+            num_steps=task.num_steps,
+            **options,
+        )
+
+    return run
+
+
+def _search(method: MethodSettings, task: Published) -> Run:
+    objective, width = task.objective, method.stddev
+    if width is None and isinstance(objective, mg.objective.OpenLoop):
+        # The controls are the parameters, so noise on the ones is noise on the others.
+        width = jax.numpy.broadcast_to(objective.stddev, objective.noise_shape).ravel()
+    own: dict[str, Any] = {}
+    if method.name == "cross_entropy":
+        own["num_elite"] = max(2, round(method.elite * task.num_samples))
+    if method.name == "mppi":
+        own["temperature"] = method.temperature
+    search = getattr(mg.baselines, method.name)
+
+    def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
+        return search(
+            objective,
+            task.params,
+            keys,
+            num_samples=task.num_samples,
+            num_steps=task.num_steps,
+            stddev=width,
+            **own,
+            **options,
+        )
+
+    return run

@@ -1,0 +1,123 @@
+"""What an optimisation experiment can be told; imports nothing heavy."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from experiments.config import Positive, RunSettings, Settings
+
+Count = Annotated[int, Field(ge=2)]
+
+ESTIMATORS = (
+    "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "per_step", "reinforce",
+)  # fmt: skip
+SEARCHES = ("cross_entropy", "mppi", "predictive_sampling")
+
+_NAMES = {"mppi": "MPPI", "reinforce": "REINFORCE", "cross_entropy": "cross-entropy", "alpha_order": "α-order"}
+
+
+class MethodSettings(Settings):
+    """One method, with what is set of its options: an estimator for gradient descent, or a search."""
+
+    name: Literal[
+        "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "per_step", "reinforce",
+        "cross_entropy", "mppi", "predictive_sampling",
+    ]  # fmt: skip
+    """Of a function in `mjxgrad.estimators` or `mjxgrad.baselines`."""
+    baseline: Literal["leave_one_out", "zero_noise", "none"] | None = None
+    """Of zeroth order and REINFORCE; their own default if it is not set."""
+    antithetic: bool | None = None
+    """Whether zeroth order uses noise in pairs."""
+    rule: Literal["consistent", "inverse_variance", "concavity", "bias_constrained"] | None = None
+    """How alpha_order chooses its weight; bias_constrained takes the published constants of the task."""
+    control_variate: bool | None = None
+    """Whether the unbiased part of alpha_order uses derivatives."""
+    stddev: Positive | None = None
+    """Width of a search, in the parameters' units; without it, the noise on the controls if they are the parameters."""
+    elite: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """Share of the candidates that cross_entropy fits to."""
+    temperature: Positive = 0.1
+    """Of mppi, in standard deviations of the costs."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "MethodSettings":
+        takes = {
+            "baseline": ("zeroth_order", "reinforce"),
+            "antithetic": ("zeroth_order",),
+            "rule": ("alpha_order",),
+            "control_variate": ("alpha_order",),
+            "stddev": SEARCHES,
+            "elite": ("cross_entropy",),
+            "temperature": ("mppi",),
+        }
+        if wrong := [key for key in sorted(self.model_fields_set - {"name"}) if self.name not in takes[key]]:
+            raise ValueError(f"{self.name} takes no {', '.join(wrong)}")
+        return self
+
+    @property
+    def is_search(self) -> bool:
+        """Say whether the method moves by itself, without a gradient."""
+        return self.name in SEARCHES
+
+    @property
+    def is_default_alpha(self) -> bool:
+        """Say whether this is α-order as it comes."""
+        return self.name == "alpha_order" and self.options == {}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Give what is set for an estimator."""
+        return self.model_dump(include={"baseline", "antithetic", "rule", "control_variate"}, exclude_none=True)
+
+    @property
+    def label(self) -> str:
+        """Give a name for legends and tables."""
+        parts = [self.rule.replace("_", " ")] if self.rule else []
+        if self.baseline is not None:
+            parts.append(self.baseline.replace("_", " ") if self.baseline != "none" else "no baseline")
+        parts += ["pairs"] if self.antithetic else []
+        if self.control_variate is not None:
+            # A rule of the literature mixes with plain zeroth order; said where it is not so.
+            is_usual = self.control_variate == (self.rule in (None, "consistent"))
+            parts += [] if is_usual else ["with control variate" if self.control_variate else "no control variate"]
+        elif self.rule not in (None, "consistent"):
+            parts.append("with control variate")
+        parts += [f"width {self.stddev:g}"] if self.stddev else []
+        name = _NAMES.get(self.name, self.name.replace("_", " "))
+        return name + (f" ({', '.join(parts)})" if parts else "")
+
+
+class OptimisationSettings(RunSettings):
+    """A published task, optimised by several methods from the same start at equal rollouts, over many seeds."""
+
+    task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"]
+    """What is optimised; see `mjxgrad.tasks.published`."""
+    dynamics: Literal["published", "mjx"] = "published"
+    """Whether the paper's own equations simulate the task, or MJX with contact."""
+    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
+    """In the order of the table."""
+    seeds: Count = 10
+    """Runs of each method, in one program."""
+    num_steps: Annotated[int, Field(ge=1)] | None = None
+    """Of each run; without it, as many as published."""
+    num_samples: Count | None = None
+    """Rollouts per step, all that a method spends included; without it, as many as published."""
+    learning_rate: Positive | None = None
+    """Of plain gradient descent; without it, as published."""
+    evaluations: Annotated[int, Field(ge=1)] = 50
+    """How often the cost without noise is measured on the way."""
+    error_repeats: Annotated[int, Field(ge=0)] = 100
+    """Estimates at the start of which the relative error is measured; 0 leaves it out."""
+    reference_samples: Annotated[int, Field(ge=100)] = 50_000
+    """Rollouts behind the gradient that those are compared with."""
+    confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
+    """Of every interval."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "OptimisationSettings":
+        labels = [method.label for method in self.methods]
+        if repeated := {label for label in labels if labels.count(label) > 1}:
+            raise ValueError(f"methods must differ, got {', '.join(sorted(repeated))} more than once")
+        if self.dynamics == "mjx" and self.task == "lqr":
+            raise ValueError('dynamics: must be "published" for lqr, which has no contact to simulate')
+        return self
