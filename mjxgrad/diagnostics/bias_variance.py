@@ -118,7 +118,7 @@ def bias_variance(
         raise ValueError(f"num_reference must be at least 4, got {num_reference}")
     params = jnp.asarray(params)
     stacked, count = _stacked(softness)
-    plan = both_plan(num_samples, chunk_size, False, baseline)
+    plan = both_plan(num_samples, chunk_size, with_zero_noise=baseline == "zero_noise")
     measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
     rows = []
     for i in range(count):

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from mjxgrad.estimators.sampling import Plan
 from mjxgrad.objective import Objective
 
-
 # All pairs of a chunk are compared: twice as many samples at a time would be twice the work for each.
 DEFAULT_CHUNK_SIZE = 256
 

@@ -33,6 +33,7 @@ class Plan:
         with_gradient: whether the cost is differentiated.
         with_score: whether the score is wanted.
         with_zero_noise: whether one more rollout goes without noise.
+        with_silence: whether each unit has one more rollout, without noise, from its own random start.
         shares_start: whether samples come in pairs that differ in their noise alone, not in a random start.
     """
 
@@ -43,6 +44,7 @@ class Plan:
     with_score: bool = False
     with_zero_noise: bool = False
     shares_start: bool = False
+    with_silence: bool = False
 
     def __post_init__(self):
         pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
@@ -66,8 +68,8 @@ class Plan:
 
     @property
     def num_rollouts(self) -> int:
-        """Give the number of rollouts, that without noise included."""
-        return self.num_samples + self.with_zero_noise
+        """Give the number of rollouts, those without noise included."""
+        return self.num_samples + self.with_zero_noise + self.with_silence * self.num_units
 
     def chunks(self) -> tuple[int, int]:
         """Give the number of chunks and the units in each, as even as they can be."""
@@ -86,6 +88,7 @@ class Samples(eqx.Module):
         scores: of the noise; likewise.
         is_noisy: False for units that fill up the last chunk and for the one without noise.
         is_noise_free: True for the one without noise.
+        silent_costs: of the rollout without noise of each unit; zero if there is none.
     """
 
     costs: Float[Array, "units rollouts"]
@@ -93,6 +96,7 @@ class Samples(eqx.Module):
     scores: Float[Array, "units rollouts score_dim"]
     is_noisy: Bool[Array, " units"]
     is_noise_free: Bool[Array, " units"]
+    silent_costs: Float[Array, " units"]
 
     def first_order_mask(self) -> Bool[Array, " units"]:
         """Pick the units that a first-order estimate can use."""
@@ -100,7 +104,7 @@ class Samples(eqx.Module):
 
     def zeroth_order_mask(self) -> Bool[Array, " units"]:
         """Pick the units that a zeroth-order estimate can use: gradients do not matter to it."""
-        return self.is_noisy & _all_finite(self.costs) & _all_finite(self.scores)
+        return self.is_noisy & _all_finite(self.costs) & _all_finite(self.scores) & jnp.isfinite(self.silent_costs)
 
     def noise_free_cost(self) -> Float[Array, ""]:
         """Give the cost without noise if it is among these, else zero."""
@@ -136,12 +140,18 @@ def sample(
         if plan.with_zero_noise:
             noise = jax.tree.map(lambda free, noisy: jnp.where(is_free, free, noisy), objective.zero_noise(), noise)
         images = [noise, objective.mirror(noise)] if plan.antithetic else [noise]
+        # Among the others, so that the rollout is compiled once.
+        images += [objective.silence(noise)] if plan.with_silence else []
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
 
     noises = jax.vmap(noise_of)(units, is_noise_free)
     evaluate = jax.vmap(jax.vmap(lambda noise: _evaluate(objective, params, noise, plan)))
     costs, gradients, scores = evaluate(noises)
-    return Samples(costs, gradients, scores, units < plan.num_units, is_noise_free)
+    silent_costs = jnp.zeros_like(costs[:, 0])
+    if plan.with_silence:
+        silent_costs = costs[:, -1]
+        costs, gradients, scores = costs[:, :-1], gradients[:, :-1], scores[:, :-1]
+    return Samples(costs, gradients, scores, units < plan.num_units, is_noise_free, silent_costs)
 
 
 def stream(

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first import first_order_result, first_order_summary
 from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
-from mjxgrad.estimators.zeroth import zeroth_order_result, zeroth_order_summary
+from mjxgrad.estimators.zeroth import noise_free_rollouts, zeroth_order_result, zeroth_order_summary
 from mjxgrad.objective import Objective
 
 
@@ -42,13 +42,20 @@ def first_and_zeroth_order(
         ValueError: as in `zeroth_order`.
     """
     check_baseline(baseline)
-    plan = both_plan(num_samples, chunk_size, antithetic, baseline)
+    plan = both_plan(num_samples, chunk_size, antithetic, **noise_free_rollouts(objective, baseline))
     params = jnp.asarray(params)
     kept = stream(objective.sized_for(params), params, key, plan, both_summary)
     return both_results(kept, plan, baseline)
 
 
-def both_plan(num_samples: int, chunk_size: int | None, antithetic: bool, baseline: str) -> Plan:
+def both_plan(
+    num_samples: int,
+    chunk_size: int | None,
+    antithetic: bool = False,
+    *,
+    with_zero_noise: bool,
+    with_silence: bool = False,
+) -> Plan:
     """Plan rollouts that serve both estimates."""
     return Plan(
         num_samples,
@@ -56,7 +63,8 @@ def both_plan(num_samples: int, chunk_size: int | None, antithetic: bool, baseli
         antithetic,
         with_gradient=True,
         with_score=True,
-        with_zero_noise=baseline == "zero_noise",
+        with_zero_noise=with_zero_noise,
+        with_silence=with_silence,
     )
 
 

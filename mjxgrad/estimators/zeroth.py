@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
-from mjxgrad.estimators.moments import ScoreMoments, Total, as_real
+from mjxgrad.estimators.moments import Moments, ScoreMoments, Total, as_real
 from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
 from mjxgrad.objective import Objective
 
@@ -34,7 +34,8 @@ def zeroth_order(
         num_samples: rollouts with noise to spend. At least 2; even and at least 4 with
             antithetic pairs.
         baseline: "leave_one_out", the mean cost of the other samples (of the other pairs);
-            "zero_noise", the cost without noise, one more rollout; or "none".
+            "zero_noise", the cost without noise, one more rollout, or where starts are random one
+            more for each sample (for each pair), from the same start; or "none".
         antithetic: use every noise together with its mirror image. The standard error is then
             taken over pairs. Where the score is odd in the noise (parameter noise, open loop)
             all baselines cancel within a pair.
@@ -60,37 +61,45 @@ def zeroth_order(
         chunk_size,
         antithetic,
         with_score=True,
-        with_zero_noise=baseline == "zero_noise",
+        **noise_free_rollouts(objective, baseline),
     )
     params = jnp.asarray(params)
     summary = stream(objective.sized_for(params), params, key, plan, zeroth_order_summary)
     return zeroth_order_result(summary, plan, baseline)
 
 
-def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Total]:
-    """Keep of samples what the estimate needs: joint moments, and the cost without noise."""
-    moments = ScoreMoments.of(samples.costs, samples.scores, samples.zeroth_order_mask())
-    return moments, Total(samples.noise_free_cost())
+def noise_free_rollouts(objective: Objective, baseline: str) -> dict[str, bool]:
+    """Say which rollouts without noise a plan needs for a baseline."""
+    is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
+    return {"with_zero_noise": is_needed and not has_own, "with_silence": is_needed and has_own}
+
+
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Total, Moments]:
+    """Keep of samples what the estimate needs: joint moments, the cost without noise, and moments of the cost."""
+    mask = samples.zeroth_order_mask()
+    moments = ScoreMoments.of(samples.costs - samples.silent_costs[:, None], samples.scores, mask)
+    return moments, Total(samples.noise_free_cost()), Moments.of(samples.costs.mean(axis=1), mask)
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> GradientEstimate:
     """Turn what `zeroth_order_summary` kept into the estimate."""
-    moments, noise_free = summary
+    moments, noise_free, costs = summary
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
     else:
-        centre = noise_free.value if baseline == "zero_noise" else jnp.zeros_like(noise_free.value)
+        # Costs are already above those from their own starts, if there are any.
+        centre = noise_free.value if plan.with_zero_noise else jnp.zeros_like(noise_free.value)
         value, squared_error = _fixed_baseline(moments, centre)
     return assemble(
         value,
         squared_error,
-        moments.costs,
+        costs,
         count=moments.costs.count,
         rollouts_per_unit=plan.rollouts_per_unit,
         num_samples=plan.num_samples,
         num_rollouts=plan.num_rollouts,
         num_gradient_rollouts=plan.num_rollouts if plan.with_gradient else 0,
-        has_baseline=baseline != "zero_noise" or jnp.isfinite(noise_free.value),
+        has_baseline=jnp.isfinite(noise_free.value),
     )
 
 

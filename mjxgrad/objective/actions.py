@@ -55,6 +55,11 @@ class ActionNoise(Objective):
         actions = gaussian(key, self.stddev, self.noise_shape)
         return actions if start is None else (actions, start)
 
+    def silence(self, noise: PyTree) -> PyTree:
+        """Give no action noise, and keep the start."""
+        actions, start = self.split(noise)
+        return jnp.zeros_like(actions) if start is None else (jnp.zeros_like(actions), start)
+
     @property
     def has_circumstances(self) -> bool:
         """Say whether starts are random."""

@@ -81,6 +81,10 @@ class Objective(eqx.Module):
         """Draw other noise under the same circumstances: what is random beside the noise, such as the start, stays."""
         return self.sample_noise(key)
 
+    def silence(self, noise: PyTree) -> PyTree:
+        """Give the noise that changes nothing, under the circumstances of this one."""
+        return self.zero_noise()
+
     @property
     def has_circumstances(self) -> bool:
         """Say whether anything is random beside the noise, so that costs differ for reasons no derivative explains."""

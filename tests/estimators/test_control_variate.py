@@ -1,6 +1,7 @@
 """The control-variate estimate: unbiased whatever derivatives say, and exact where they say all."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ import pytest
 from scipy.stats import norm
 
 from mjxgrad import estimators
-from mjxgrad.estimators import Diagnosis
+from mjxgrad.estimators import Diagnosis, rules
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.tasks import published
 from tests.estimators import textbook
@@ -52,24 +53,56 @@ def test_it_is_unbiased_at_a_jump_from_few_samples_on(num_samples):
     assert_unbiased_with_right_errors(estimates, jumpy_gradient(), num_samples)
 
 
-def test_it_is_unbiased_in_closed_loop_from_random_starts():
-    """The expected cost is quadratic in the start, so that two starts at ±d about the nominal one average it."""
+class TwoStarts(textbook.LinearSystem):
+    """The same system from either of two starts, so that its expected cost is the mean of two."""
 
-    class RandomStart(textbook.LinearSystem):
-        def sample_start(self, key):
-            return self.start + jnp.array([0.5, -0.3]) * jax.random.rademacher(key, (), float)
+    def sample_start(self, key):
+        return self.start + jnp.array([0.5, -0.3]) * jax.random.rademacher(key, (), float)
 
-    task, params = RandomStart(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
-    objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
-
-    def expected(flat):
-        starts = [task.start + sign * jnp.array([0.5, -0.3]) for sign in (-1, 1)]
-        costs = [textbook.LinearSystem(start=start).expected_cost(objective.unravel(flat), 0.2) for start in starts]
+    def expected_cost(self, policy_params, stddev):
+        starts = [self.start + sign * jnp.array([0.5, -0.3]) for sign in (-1, 1)]
+        costs = [textbook.LinearSystem(start=start).expected_cost(policy_params, stddev) for start in starts]
         return sum(costs) / 2
 
+
+@pytest.mark.parametrize(
+    ("estimator", "num_rollouts"),
+    [
+        (estimators.control_variate, 8),
+        (functools.partial(estimators.zeroth_order, baseline="zero_noise"), 16),
+        (functools.partial(estimators.zeroth_order, baseline="zero_noise", antithetic=True), 12),
+    ],
+    ids=["control variate", "zero noise", "zero noise, pairs"],
+)
+def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_from_the_same_start(
+    estimator, num_rollouts
+):
+    task, params = TwoStarts(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
+    objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
     flat = objective.ravel(params)
-    estimates = repeat(estimators.control_variate, objective, flat, 20_000, num_samples=8)
-    assert_unbiased_with_right_errors(estimates, np.asarray(jax.grad(expected)(flat)), 8)
+    estimates = repeat(estimator, objective, flat, 20_000, num_samples=8)
+    truth = jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2))(flat)
+    assert_unbiased_with_right_errors(estimates, np.asarray(truth), 8)
+    assert np.all(np.asarray(estimates.num_rollouts) == num_rollouts)
+
+
+def test_the_partner_from_the_same_start_takes_away_what_starts_do():
+    """Starts a hundred times as far apart as the noise: the mean of other starts would be no baseline at all."""
+
+    class FarStarts(textbook.LinearSystem):
+        def sample_start(self, key):
+            return self.start + 10 * jax.random.normal(key, (2,))
+
+    params = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
+    objective = closed_loop(FarStarts(), textbook.linear_policy, 0.1, params=params)
+    flat = objective.ravel(params)
+    rule = rules.FixedAlpha(0.0)
+    paired = functools.partial(estimators.alpha_order, rule=rule, control_variate=False)
+    spreads = [
+        np.asarray(repeat(estimator, objective, flat, 500, num_samples=20).value).std(axis=0)
+        for estimator in (paired, estimators.zeroth_order)
+    ]
+    np.testing.assert_array_less(spreads[0], 0.3 * spreads[1])
 
 
 def test_the_linear_part_of_a_cost_makes_no_noise(key):
