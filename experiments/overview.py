@@ -2,11 +2,14 @@
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from experiments.config import Run
 from experiments.report import document
+
+# A run may leave a file of this name, a heading and a text for each of its main numbers; the page sets them side by side.
+HEADLINE = "headline.json"
 
 
 def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
@@ -20,18 +23,44 @@ def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
         The page.
     """
     keys = list(runs[0].varied)
-    head = "".join(f'<th scope="col">{html.escape(text)}</th>' for text in [*keys, "verdict", ""])
-    rows = "".join(_row(run, folder) for run, folder in zip(runs, folders, strict=True))
     return document(
         f"{runs[0].name}, {len(runs)} runs",
         f'<header><p class="kicker">{html.escape(runs[0].name)}, swept over {html.escape(", ".join(keys))}</p>'
         f"<h1>{html.escape(runs[0].question)}</h1></header>"
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>',
+        f"{_numbers(runs, folders)}"
+        f"{_table([*keys, 'verdict', ''], map(_verdict_row, runs, folders))}",
     )
 
 
-def _row(run: Run, folder: Path) -> str:
+def _numbers(runs: Sequence[Run], folders: Sequence[Path]) -> str:
+    """Set the main numbers of all runs side by side; nothing if they have none."""
+    found = [_headline(folder) for folder in folders]
+    # In the order of their first appearance.
+    headings = list(dict.fromkeys(heading for one in found for heading in one))
+    if not headings:
+        return ""
+    rows = (
+        _row([*map(html.escape, map(str, run.varied.values())), *(html.escape(one.get(name, "")) for name in headings)])
+        for run, one in zip(runs, found, strict=True)
+    )
+    return _table([*runs[0].varied, *headings], rows)
+
+
+def _headline(folder: Path) -> dict[str, str]:
+    path = folder / HEADLINE
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def _verdict_row(run: Run, folder: Path) -> str:
     verdict = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["verdict"]
     cells = [html.escape(str(text)) for text in [*run.varied.values(), verdict]]
-    cells.append(f'<a href="{html.escape(folder.name)}/report.html">report</a>')
+    return _row([*cells, f'<a href="{html.escape(folder.name)}/report.html">report</a>'])
+
+
+def _row(cells: Iterable[str]) -> str:
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def _table(headings: Iterable[str], rows: Iterable[str]) -> str:
+    head = "".join(f'<th scope="col">{html.escape(text)}</th>' for text in headings)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'

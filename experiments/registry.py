@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.config import RunSettings
+from experiments.optimisation.settings import OptimisationSettings
 from experiments.report import Report
 from experiments.textbook.settings import TextbookSettings
 from experiments.workspace import Workspace
@@ -31,6 +32,7 @@ class Experiment:
 
 
 EXPERIMENTS = {
+    "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

@@ -85,9 +85,7 @@ def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     return {name: where for name, where in found.items() if where.any()}
 
 
-def _errors(
-    task: Published, settings: OptimisationSettings, key: jax.Array, workspace: Workspace
-) -> Comparison | None:
+def _errors(task: Published, settings: OptimisationSettings, key: jax.Array, workspace: Workspace) -> Comparison | None:
     named = {one.label: estimator(one, task) for one in settings.methods if not one.is_search}
     if not named:
         return None
@@ -111,4 +109,3 @@ def _errors(
             confidence=settings.confidence,
             progress=lambda done, _: advance_to(1 + done),
         )
-

@@ -112,8 +112,8 @@ class Difference:
         )
         # Rounded, so that runs that are the same but for rounding tie.
         size = max(ROUNDING * abs(other.mean), 1e-300) if other.kept.size else 1.0
-        ranks = [np.where(run.is_lost, np.inf, np.round(run.final_cost / size)) for run in (ours, other)]
-        p_value = float(stats.mannwhitneyu(*ranks).pvalue)
+        first, second = (np.where(run.is_lost, np.inf, np.round(run.final_cost / size)) for run in (ours, other))
+        p_value = float(stats.mannwhitneyu(first, second).pvalue)
         return cls(ours, other, ours.mean - other.mean, float(low), float(high), p_value, confidence)
 
     @property

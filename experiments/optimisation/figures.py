@@ -1,0 +1,264 @@
+"""The pictures of an optimisation experiment."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from experiments.optimisation.outcome import Outcome, Run
+from experiments.report import Figure
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
+
+# One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
+_COLOURS = {
+    "first order": FIRST,
+    "zeroth order": ZEROTH,
+    "zeroth order (zero noise)": "#56b4e9",
+    "control variate": "#cc79a7",
+    "α-order": "#00795a",
+    "α-order (bias constrained)": "#b58900",
+    "α-order (concavity)": "#6b6ecf",
+    "α-order (inverse variance)": "#843c39",
+    "REINFORCE": "#7f3c8d",
+    "cross-entropy": "#3b4452",
+    "MPPI": "#8c6d31",
+    "predictive sampling": "#8b94a1",
+}
+_OTHERS = ("#17becf", "#bcbd22", "#e377c2", "#393b79", "#637939", "#ad494a")
+
+# From the best to the worst cost, as a factor; beyond, differences near the best are seen on a logarithmic axis only.
+_WIDE = 3.0
+
+_SENTENCES = {
+    "inverse_variance": ("least variance", "#7fb8a6"),
+    "bias_limit": ("bias limits it", "#e69f00"),
+    "uncertain": ("too uncertain for first order", "#9db4d0"),
+    "inconsistent": ("derivatives contradict costs", "#0b5c8f"),
+    "not_finite": ("derivatives not finite", "#22262e"),
+    "fixed": ("given", "#c9ced6"),
+}
+_DARK = ("inconsistent", "not_finite")
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw all figures.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by name: final, curves, alpha.
+
+    Returns:
+        The figures in order of reading.
+    """
+    pictures = {
+        "final": ("Where each method ends, and how far off one estimate is", final),
+        "curves": ("Cost against rollouts and against time", curves),
+    }
+    if any(run.reasons for run in outcome.runs):
+        pictures["alpha"] = ("The weight of the first-order part", alpha)
+    return [
+        Figure(save(drawing(outcome), folder, name), title, captions[name])
+        for name, (title, drawing) in pictures.items()
+    ]
+
+
+def final(outcome: Outcome):
+    """Final cost of every seed, and the relative error of one estimate, a row for each method."""
+    has_errors = outcome.errors is not None
+    widths = {"width_ratios": [1.5, 1]} if has_errors else None
+    height = 1.1 + 0.31 * len(outcome.runs)
+    figure, axes = subplots(1, 1 + has_errors, height=height, sharey=True, gridspec_kw=widths)
+    left = axes[0, 0]
+    rows = np.arange(len(outcome.runs))[::-1]
+    limit = _limit(outcome)
+    for y, run in zip(rows, outcome.runs, strict=True):
+        colour = _colours(outcome)[run.method.label]
+        kept = run.kept
+        # Spread out by number, not by chance: the same picture from the same numbers.
+        left.plot(kept, y + np.linspace(-0.22, 0.22, kept.size), "o", ms=3.2, color=colour, alpha=0.45, mew=0)
+        if kept.size > 1:
+            low, high = run.interval(outcome.settings.confidence)
+            left.plot([low, high], [y, y], color=colour, lw=2.4, solid_capstyle="butt")
+        left.plot(run.mean, y, "|", color=colour, ms=13, mew=2.2)
+        _published(left, outcome, run, y)
+        notes = [f"{run.is_lost.sum()} of {len(run.is_lost)} not finite"] if run.is_lost.any() else []
+        notes += [f"{run.mean:.4g} →"] if run.mean > limit else []
+        if notes:
+            text = ", ".join(notes)
+            left.text(0.99, y, text, transform=left.get_yaxis_transform(), ha="right", va="center", fontsize=8.5)
+        error = outcome.relative_error(run)
+        if has_errors and error is not None:
+            spread = np.maximum([[error[0] - error[1]], [error[2] - error[0]]], 0)
+            axes[0, 1].errorbar(error[0], y, xerr=spread, fmt="o", ms=5, color=colour, capsize=2.5, elinewidth=1.3)
+    left.set_yticks(rows, [run.method.label for run in outcome.runs])
+    left.set_ylim(-0.6, len(rows) - 0.4)
+    low = min([*_finals(outcome), limit])
+    if limit > _WIDE * low > 0:
+        _log_scale(left, "x")
+        left.set_xlim(low / 1.08, limit * 1.08)
+    else:
+        margin = 0.04 * (limit - low or 1.0)
+        left.set_xlim(low - margin, limit + margin)
+    left.set(title="Cost without noise after the last step", xlabel="cost")
+    if has_errors:
+        _log_scale(axes[0, 1], "x")
+        axes[0, 1].set(title="Relative error of one estimate at the start", xlabel="error / norm of the gradient")
+    _mark_ours(left, outcome.runs)
+    return figure
+
+
+def curves(outcome: Outcome):
+    """Cost without noise against what was spent, the median and the range over seeds."""
+    groups = [group for group in (_descents(outcome), _searches(outcome)) if group]
+    figure, axes = subplots(len(groups), 2, height=3.7 * len(groups), sharey=True)
+    lowest = _lowest(outcome)
+    for row, group in zip(axes, groups, strict=True):
+        for axis, spent in zip(row, ("rollouts", "seconds"), strict=True):
+            for run in group:
+                _curve(axis, outcome, run, getattr(run, spent))
+            axis.set_yscale("log")
+            axis.margins(x=0)
+        row[0].set_ylabel(f"cost − {lowest:.4g}")
+        row[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5)
+        row[0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009")))
+    axes[0, 0].set_title("Against rollouts")
+    axes[0, 1].set_title("Against time")
+    axes[-1, 0].set_xlabel("rollouts of one run")
+    axes[-1, 1].set_xlabel(f"seconds for all {outcome.settings.seeds} runs, without compilation")
+    # A run that climbs by decades, or one that is the lowest itself, would flatten all others.
+    above = outcome.start_cost - lowest
+    axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * _smallest(outcome)), 1.5 * above)
+    for axis in axes.flat:
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    return figure
+
+
+def alpha(outcome: Outcome):
+    """α over steps, and the share of steps for each reason."""
+    runs = [run for run in outcome.runs if run.reasons]
+    figure, axes = subplots(1, 2, height=2.2 + 0.42 * len(runs), gridspec_kw={"width_ratios": [1.25, 1]})
+    left, right = axes[0]
+    for run in runs:
+        colour = _colours(outcome)[run.method.label]
+        middle = _smooth(np.nanmean(run.alpha, axis=0))
+        left.plot(np.arange(middle.size), middle, color=colour, lw=1.8, label=run.method.label)
+    left.set(title="Mean α over seeds", xlabel="step", ylim=(-0.04, 1.04), ylabel="α")
+    left.margins(x=0)
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=8.5)
+    rows = np.arange(len(runs))[::-1]
+    starts = np.zeros(len(runs))
+    for name, (text, colour) in _SENTENCES.items():
+        totals = np.array([max((~np.isnan(run.alpha)).sum(), 1) for run in runs])
+        shares = np.array([run.reasons[name].sum() if name in run.reasons else 0 for run in runs]) / totals
+        if shares.any():
+            right.barh(rows, shares, left=starts, color=colour, height=0.6, label=text)
+            _name_bars(right, rows, starts, shares, "white" if name in _DARK else REFERENCE)
+        starts += shares
+    right.set_yticks(rows, [run.method.label for run in runs])
+    _mark_ours(right, runs)
+    right.set(title="Share of steps by the reason for α", xlim=(0, 1))
+    right.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
+    right.grid(visible=False, axis="y")
+    right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
+    return figure
+
+
+def _descents(outcome: Outcome) -> list[Run]:
+    return [run for run in outcome.runs if not _is_baseline(run)]
+
+
+def _searches(outcome: Outcome) -> list[Run]:
+    """Give what one would otherwise use, with α-order as it comes beside it."""
+    baselines = [run for run in outcome.runs if _is_baseline(run)]
+    return [run for run in outcome.runs if run.method.is_default_alpha] + baselines if baselines else []
+
+
+def _is_baseline(run: Run) -> bool:
+    return run.method.is_search or run.method.name == "reinforce"
+
+
+def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
+    colour = _colours(outcome)[run.method.label]
+    cost = np.maximum(np.where(np.isfinite(run.cost), run.cost, np.nan) - _lowest(outcome), _floor(outcome))
+    seen = np.isfinite(cost).any(axis=0)
+    x, cost = x[seen], cost[:, seen]
+    axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.13, lw=0)
+    # Ours is a broad line beneath the others, so that those it agrees with are seen on it.
+    width, order = (3.4, 2.5) if run.method.is_default_alpha else (1.4, 3.0)
+    axis.plot(x, np.nanmedian(cost, axis=0), color=colour, lw=width, label=run.method.label, zorder=order)
+
+
+def _published(axis: Axes, outcome: Outcome, run: Run, y: float) -> None:
+    found = outcome.published(run)
+    if found is None:
+        return
+    error = found[1] if np.isfinite(found[1]) else 0.0
+    axis.errorbar(
+        found[0], y - 0.33, xerr=error, fmt="D", ms=4.5, mfc="white", mec=REFERENCE, ecolor=REFERENCE, elinewidth=1.0,
+        capsize=2, zorder=5,
+    )  # fmt: skip
+
+
+def _mark_ours(axis: Axes, runs: Sequence[Run]) -> None:
+    for label, run in zip(axis.get_yticklabels(), runs, strict=True):
+        if run.method.is_default_alpha:
+            label.set_fontweight("bold")
+
+
+def _finals(outcome: Outcome) -> list[float]:
+    return [float(cost) for run in outcome.runs for cost in run.kept]
+
+
+def _limit(outcome: Outcome) -> float:
+    """Give the highest final cost to show: of descents, for searches that fail would set the scale."""
+    shown = [float(cost) for run in _descents(outcome) for cost in run.kept]
+    shown += [found[0] for run in outcome.runs if (found := outcome.published(run)) is not None]
+    return min(max(shown, default=outcome.start_cost), 2 * outcome.start_cost)
+
+
+def _lowest(outcome: Outcome) -> float:
+    """Give the lowest cost that any run has seen."""
+    return min([outcome.start_cost, *(float(np.min(run.cost)) for run in outcome.runs)])
+
+
+def _floor(outcome: Outcome) -> float:
+    """Give what stands for zero on a logarithmic axis."""
+    return 1e-5 * (outcome.start_cost - _lowest(outcome)) or 1.0
+
+
+def _smallest(outcome: Outcome) -> float:
+    """Give how near to the lowest cost the median of the nearest method comes."""
+    medians = [float(np.nanmin(np.nanmedian(run.cost, axis=0))) for run in outcome.runs if run.kept.size]
+    return min(medians, default=outcome.start_cost) - _lowest(outcome)
+
+
+def _log_scale(axis: Axes, which: str) -> None:
+    getattr(axis, f"set_{which}scale")("log")
+    side = getattr(axis, f"{which}axis")
+    low, high = side.get_view_interval()
+    wide = high > 30 * low
+    side.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=12))
+    side.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
+    side.set_minor_formatter(NullFormatter())
+
+
+def _name_bars(axis: Axes, rows: np.ndarray, starts: np.ndarray, shares: np.ndarray, ink: str) -> None:
+    for y, start, share in zip(rows, starts, shares, strict=True):
+        if share >= 0.08:
+            axis.text(start + share / 2, y, f"{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Average over a fiftieth of the steps, so that the lines do not hide each other."""
+    width = max(1, values.size // 50)
+    return np.convolve(values, np.ones(width) / width, mode="valid") if values.size >= width else values
+
+
+def _colours(outcome: Outcome) -> dict[str, str]:
+    labels: Iterable[str] = (run.method.label for run in outcome.runs)
+    others = iter(_OTHERS)
+    return {label: _COLOURS.get(label) or next(others, MUTED) for label in labels}
