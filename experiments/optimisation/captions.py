@@ -25,7 +25,7 @@ def captions(outcome: Outcome) -> dict[str, str]:
     return {
         "final": (
             f"Left, dots are seeds, bars the means with their {percent} intervals{published}. An arrow stands for a mean "
-            f"beyond the panel.{errors}"
+            f"± standard deviation beyond the panel.{errors}"
         ),
         "curves": (
             f"Lines are medians over {settings.seeds} seeds, bands reach from the lowest to the highest. The axis is the "

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
-from experiments.report import Figure
+from experiments.report import Figure, quantity
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
 
 # One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
@@ -30,6 +30,9 @@ _OTHERS = ("#17becf", "#bcbd22", "#e377c2", "#393b79", "#637939", "#ad494a")
 
 # From the best to the worst cost, as a factor; beyond, differences near the best are seen on a logarithmic axis only.
 _WIDE = 3.0
+
+# Beyond the quartiles of the final costs by so many times their distance a method is far off.
+_REACH = 6.0
 
 _SENTENCES = {
     "inverse_variance": ("least variance", "#7fb8a6"),
@@ -85,7 +88,7 @@ def final(outcome: Outcome):
         left.plot(run.mean, y, "|", color=colour, ms=13, mew=2.2)
         _published(left, outcome, run, y)
         notes = [f"{run.is_lost.sum()} of {len(run.is_lost)} not finite"] if run.is_lost.any() else []
-        notes += [f"{run.mean:.4g} →"] if run.mean > limit else []
+        notes += [f"{quantity(run.mean, run.spread)} →"] if run.mean > limit else []
         if notes:
             text = ", ".join(notes)
             left.text(0.99, y, text, transform=left.get_yaxis_transform(), ha="right", va="center", fontsize=8.5)
@@ -214,10 +217,13 @@ def _finals(outcome: Outcome) -> list[float]:
 
 
 def _limit(outcome: Outcome) -> float:
-    """Give the highest final cost to show: of descents, for searches that fail would set the scale."""
+    """Give the highest final cost to show: methods that fail would set the scale, and hide how the others differ."""
     shown = [float(cost) for run in _descents(outcome) for cost in run.kept]
     shown += [found[0] for run in outcome.runs if (found := outcome.published(run)) is not None]
-    return min(max(shown, default=outcome.start_cost), 2 * outcome.start_cost)
+    if not shown:
+        return outcome.start_cost
+    low, high = np.quantile(shown, [0.25, 0.75])
+    return float(min(max(shown), high + _REACH * (high - low)))
 
 
 def _lowest(outcome: Outcome) -> float:

@@ -87,7 +87,8 @@ def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Run:
             task.params,
             keys,
             estimator=functools.partial(function, num_samples=afforded),
-            optimiser=optax.sgd(task.learning_rate),
+            # The schedules of tasks are optax's, but for the arrays that optax allows and they do not need.
+            optimiser=optax.sgd(task.learning_rate),  # pyright: ignore[reportArgumentType]
             num_steps=task.num_steps,
             **options,
         )
