@@ -40,8 +40,8 @@ def alpha_order(
         control_variate: whether $g^0$ uses derivatives; without, it is zeroth order with the leave-one-out baseline.
         blocks: number of the block of each coordinate, from 0; $\alpha$ is then chosen for each block. None is one
             block, `np.arange(dim)` one for each coordinate.
-        chunk_size: rollouts at a time, at least 4; memory grows with its square. Samples are compared, and leave each
-            other out, within a chunk.
+        chunk_size: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
+            within groups of at most 64 of a chunk.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.

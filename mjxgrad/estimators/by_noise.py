@@ -9,58 +9,94 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from mjxgrad.estimators.sampling import Plan
 from mjxgrad.objective import Objective
 
-# All pairs of a chunk are compared: twice as many samples at a time would be twice the work for each.
-DEFAULT_CHUNK_SIZE = 256
+# All pairs of a group are compared: larger ones cost more for each sample, smaller ones leave out more of what is known.
+GROUP_SIZE = 64
 
 
-class SamplesByNoise(eqx.Module):
-    """Rollouts of a chunk, flat; where starts are random, samples 2i and 2i + 1 begin alike.
+class Group(eqx.Module):
+    """Samples that are compared with each other; where starts are random, samples 2i and 2i + 1 begin alike.
 
     What is not finite is zero here, and the masks say so.
 
     Attributes:
-        costs: about the mean of those that are finite; no estimator here minds a constant.
-        mean_cost: what was taken off.
+        costs: about some constant; no estimator here minds which.
         derivatives: of the cost by each component of the noise.
         noise: in its own units.
         stddev: of the noise.
         scores: noise over variance.
         has_cost: whether the sample is one of the plan and its cost is finite.
         has_derivative: whether its derivative is finite, too.
-        pull_backs: from components of the noise to parameters, one for each sample.
+        rounding: size of the costs before the constant was taken off.
         per_unit: 2 where pairs share a start, else 1.
     """
 
-    costs: Float[Array, " samples"]
-    mean_cost: Float[Array, ""]
-    derivatives: Float[Array, "samples m"]
-    noise: Float[Array, "samples m"]
-    stddev: Float[Array, " m"]
-    scores: Float[Array, "samples m"]
-    has_cost: Bool[Array, " samples"]
-    has_derivative: Bool[Array, " samples"]
-    pull_backs: Partial
+    costs: Float[Array, "*groups samples"]
+    derivatives: Float[Array, "*groups samples m"]
+    noise: Float[Array, "*groups samples m"]
+    stddev: Float[Array, "*groups m"]
+    scores: Float[Array, "*groups samples m"]
+    has_cost: Bool[Array, "*groups samples"]
+    has_derivative: Bool[Array, "*groups samples"]
+    rounding: Float[Array, "*groups"]
     per_unit: int = eqx.field(static=True)
+
+    def same_start(self) -> Bool[Array, "samples samples"]:
+        """Say which samples differ in nothing but their noise."""
+        count = len(self.costs)
+        if self.per_unit == 1:
+            return jnp.ones((count, count), bool)
+        unit = jnp.arange(count) // self.per_unit
+        return unit[:, None] == unit[None, :]
+
+
+class SamplesByNoise(eqx.Module):
+    """Rollouts of a chunk.
+
+    Attributes:
+        group: all of them.
+        mean_cost: what was taken off the costs.
+        pull_backs: from components of the noise to parameters, one for each sample.
+    """
+
+    group: Group
+    mean_cost: Float[Array, ""]
+    pull_backs: Partial
 
     def pull_back(self, by_noise: Float[Array, "samples m"]) -> Float[Array, "samples dim"]:
         """Take each sample's components of the noise to the parameters; zero where there is no sample."""
         by_params = jax.vmap(lambda pull, vector: pull(vector))(self.pull_backs, by_noise)
-        return jnp.where(self.has_cost[:, None], by_params, 0)
+        return jnp.where(self.group.has_cost[:, None], by_params, 0)
 
     def by_unit(self, values: Float[Array, "samples *shape"]) -> Float[Array, "units *shape"]:
         """Give the mean over each unit."""
-        return values.reshape(-1, self.per_unit, *values.shape[1:]).mean(axis=1)
+        return values.reshape(-1, self.group.per_unit, *values.shape[1:]).mean(axis=1)
 
     def complete(self, mask: Bool[Array, " samples"]) -> Bool[Array, " units"]:
         """Say which units have all their samples in a mask."""
-        return mask.reshape(-1, self.per_unit).all(axis=1)
+        return mask.reshape(-1, self.group.per_unit).all(axis=1)
 
-    def same_start(self) -> Bool[Array, "samples samples"]:
-        """Say which samples differ in nothing but their noise."""
-        if self.per_unit == 1:
-            return jnp.ones((len(self.costs), len(self.costs)), bool)
-        unit = jnp.arange(len(self.costs)) // self.per_unit
-        return unit[:, None] == unit[None, :]
+    def groups(self) -> Group:
+        """Split the chunk into groups, as even as they can be, with an axis of groups; samples that fill up have no cost."""
+        count, unit = len(self.group.costs), self.group.per_unit
+        num_groups = -(-count // GROUP_SIZE)
+        size = unit * -(-count // (num_groups * unit))
+
+        def split(leaf: Array) -> Array:
+            filled = jnp.pad(leaf, [(0, num_groups * size - count)] + [(0, 0)] * (leaf.ndim - 1))
+            return filled.reshape(num_groups, size, *leaf.shape[1:])
+
+        group = self.group
+        return Group(
+            costs=split(group.costs),
+            derivatives=split(group.derivatives),
+            noise=split(group.noise),
+            stddev=jnp.broadcast_to(group.stddev, (num_groups, *group.stddev.shape)),
+            scores=split(group.scores),
+            has_cost=split(group.has_cost),
+            has_derivative=split(group.has_derivative),
+            rounding=jnp.broadcast_to(group.rounding, num_groups),
+            per_unit=unit,
+        )
 
 
 def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None) -> Plan:
@@ -79,15 +115,13 @@ def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None
             or if the objective does not say what its noise is.
     """
     if chunk_size is not None and chunk_size < 4:
-        raise ValueError(f"chunk_size must be at least 4, got {chunk_size}: samples are compared within a chunk")
+        raise ValueError(f"chunk_size must be at least 4, got {chunk_size}: samples of a chunk are compared")
     if type(objective).differentiate is Objective.differentiate:
         raise ValueError(
             f"objective must know its noise, got {type(objective).__name__}; override differentiate in it, "
             "or use first_order or zeroth_order"
         )
-    return Plan(
-        num_samples, chunk_size or DEFAULT_CHUNK_SIZE, with_gradient=True, shares_start=objective.has_circumstances
-    )
+    return Plan(num_samples, chunk_size, with_gradient=True, shares_start=objective.has_circumstances)
 
 
 def sample_by_noise(
@@ -129,15 +163,15 @@ def sample_by_noise(
     # About one of the costs first: a mean of large costs is not exact enough to take off.
     origin = costs[jnp.argmax(has_cost)]
     offset = jnp.where(has_cost, costs - origin, 0).sum() / jnp.maximum(has_cost.sum(), 1).astype(costs.dtype)
-    return SamplesByNoise(
+    group = Group(
         costs=jnp.where(has_cost, (costs - origin) - offset, 0),
-        mean_cost=origin + offset,
         derivatives=jnp.where(has_derivative[:, None], result.gradient_by_noise, 0),
         noise=result.noise_score * stddev**2,
         stddev=stddev,
         scores=result.noise_score,
         has_cost=has_cost,
         has_derivative=has_derivative,
-        pull_backs=result.pull_back,
+        rounding=jnp.abs(costs).max(),
         per_unit=plan.rollouts_per_unit,
     )
+    return SamplesByNoise(group, origin + offset, result.pull_back)

@@ -24,14 +24,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.estimators.by_noise import SamplesByNoise
+from mjxgrad.estimators.by_noise import Group
 
 # Differences of costs are rounded; what is within this many units in the last place of the largest cost is no residual.
 _ROUNDING = 32.0
 
 
 class SecantSums(eqx.Module):
-    """Sums over pairs of samples, to be added over chunks.
+    """Sums over pairs of samples, to be added over groups.
 
     Attributes:
         residual: squared residuals over squared distances, in standard deviations of the noise.
@@ -54,11 +54,11 @@ class SecantSums(eqx.Module):
         return self.missed / self.pairs
 
 
-def secant_sums(samples: SamplesByNoise, slopes: Float[Array, "samples samples"]) -> SecantSums:
-    """Compare all pairs of a chunk that differ in their noise alone.
+def secant_sums(samples: Group, slopes: Float[Array, "samples samples"]) -> SecantSums:
+    """Compare all pairs of a group that differ in their noise alone.
 
     Args:
-        samples: of the chunk.
+        samples: of the group.
         slopes: their `gram`.
 
     Returns:
@@ -69,7 +69,7 @@ def secant_sums(samples: SamplesByNoise, slopes: Float[Array, "samples samples"]
     # The derivatives of both along the way from k to j.
     rise = (own[:, None] - slopes + slopes.T - own[None, :]) / 2
     residual = difference - rise
-    rounding = _ROUNDING * jnp.finfo(residual.dtype).eps * (jnp.abs(samples.costs).max() + jnp.abs(samples.mean_cost))
+    rounding = _ROUNDING * jnp.finfo(residual.dtype).eps * samples.rounding
     scaled = samples.noise / samples.stddev
     squares = (scaled**2).sum(axis=1)
     distance = squares[:, None] + squares[None, :] - 2 * jnp.matmul(scaled, scaled.T, precision="highest")

@@ -33,8 +33,8 @@ def control_variate(
         params: the point $\theta$.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
-        chunk_size: rollouts at a time, at least 4; memory grows with its square. Samples leave each other out within a
-            chunk.
+        chunk_size: rollouts at a time, at least 4; memory grows with it. Samples leave each other out within groups of
+            at most 64 of a chunk.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mjxgrad.estimators.by_noise import SamplesByNoise
+from mjxgrad.estimators.by_noise import Group, SamplesByNoise
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
 from mjxgrad.estimators.moments import Moments, Summary, as_real
 from mjxgrad.estimators.rules import Evidence
@@ -29,6 +29,7 @@ class Parts(Summary):
         linear_variance: of the costs that the mean derivative explains, summed over samples.
         beta: sum of the shares that were taken off.
         num_costs: samples in these sums.
+        num_groups: groups of samples that share their baselines.
     """
 
     first: Moments
@@ -40,6 +41,7 @@ class Parts(Summary):
     linear_variance: Float[Array, ""]
     beta: Float[Array, ""]
     num_costs: Float[Array, ""]
+    num_groups: Float[Array, ""]
 
     def merge(self, other: "Parts") -> "Parts":
         """Give the summary of both sets of samples."""
@@ -109,14 +111,15 @@ class Parts(Summary):
         There c is the covariance of cost and score; here that of the remaining cost and the score.
         """
         spread = self.unbiased.squared_error()
-        others = as_real(jnp.maximum(self.unbiased.count - 1, 1), spread)
+        num_groups = jnp.maximum(self.num_groups, 1)
+        others = jnp.maximum(as_real(self.unbiased.count, spread) / num_groups - 1, 1)
         remaining = self.unbiased.mean - self.beta / jnp.maximum(self.num_costs, 1) * first
-        return spread + (remaining**2 - spread) / (others**2 + 1)
+        return spread + (remaining**2 - spread) / (num_groups * others**2 + 1)
 
 
 def parts_and_terms(
     samples: SamplesByNoise, *, control_variate: bool, take: Callable[[ByNoise], Array]
-) -> tuple[Parts, UnbiasedTerms]:
+) -> tuple[Parts, ByNoise]:
     """Summarise a chunk.
 
     Args:
@@ -127,22 +130,32 @@ def parts_and_terms(
     Returns:
         The summary, and the unbiased terms by noise.
     """
-    slopes = gram(samples)
-    terms = unbiased_terms(samples, slopes, with_derivatives=control_variate)
+    groups = samples.groups()
+
+    def compare(group: Group) -> tuple[UnbiasedTerms, SecantSums]:
+        slopes = gram(group)
+        return unbiased_terms(group, slopes, with_derivatives=control_variate), secant_sums(group, slopes)
+
+    terms, secants = jax.vmap(compare)(groups)
+    whole, count = samples.group, len(samples.group.costs)
+    terms_by_noise = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[:count]
     # A cost without another to compare it with has no baseline.
-    has_cost = samples.complete(samples.has_cost) & (samples.has_cost.sum() >= 2)
-    has_both = has_cost & samples.complete(samples.has_derivative)
-    unbiased, first = samples.by_unit(take(terms.by_noise)), samples.by_unit(take(samples.derivatives))
-    count = as_real(samples.has_cost.sum(), samples.costs)
+    num_costs = groups.has_cost.sum(axis=1)
+    is_compared = (groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count]
+    has_cost = samples.complete(is_compared)
+    has_both = has_cost & samples.complete(whole.has_derivative)
+    unbiased, first = samples.by_unit(take(terms_by_noise)), samples.by_unit(take(whole.derivatives))
+    real_counts = as_real(num_costs, whole.costs)
     summary = Parts(
         first=Moments.of(first, has_both),
         unbiased=Moments.of(unbiased, has_cost),
         difference=Moments.of(unbiased - first, has_both),
-        costs=Moments.of(samples.by_unit(samples.costs) + samples.mean_cost, has_cost),
-        scaled=Moments.of(samples.derivatives * samples.stddev, samples.has_derivative),
-        secants=secant_sums(samples, slopes),
-        linear_variance=count * terms.linear_variance,
-        beta=(samples.has_cost * terms.beta).sum(),
-        num_costs=count,
+        costs=Moments.of(samples.by_unit(whole.costs) + samples.mean_cost, has_cost),
+        scaled=Moments.of(whole.derivatives * whole.stddev, whole.has_derivative),
+        secants=jax.tree.map(lambda sums: sums.sum(axis=0), secants),
+        linear_variance=(real_counts * terms.linear_variance).sum(),
+        beta=(groups.has_cost * terms.beta).sum(),
+        num_costs=real_counts.sum(),
+        num_groups=as_real((num_costs >= 2).sum(), whole.costs),
     )
-    return summary, terms
+    return summary, terms_by_noise

@@ -60,12 +60,14 @@ def per_step(
 
     def one_chunk(units: Array) -> tuple[Summary, ...]:
         samples = sample_by_noise(objective, params, key, units, plan)
-        parts, terms = parts_and_terms(samples, control_variate=control_variate, take=lambda by_noise: by_noise)
+        parts, terms_by_noise = parts_and_terms(
+            samples, control_variate=control_variate, take=lambda by_noise: by_noise
+        )
         weights = weigh(rule or Consistent(), parts, np.arange(num_actions), num_actions)
         alpha = weights.alpha
-        mixed = jnp.where(samples.has_derivative[:, None], alpha * samples.derivatives, 0)
-        mixed += jnp.where(samples.has_derivative[:, None], 1 - alpha, 1) * terms.by_noise
-        has_cost = samples.complete(samples.has_cost) & (samples.has_cost.sum() >= 2)
+        group = samples.group
+        mixed = alpha * group.derivatives + jnp.where(group.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
+        has_cost = samples.complete(group.has_cost) & (group.has_cost.sum() >= 2)
         values = Moments.of(samples.by_unit(samples.pull_back(mixed)), has_cost)
         reasons = jax.nn.one_hot(jax.tree.leaves(weights.reason)[0], len(Reason), axis=0)
         return values, parts.costs, Total((parts.num_costs * alpha, parts.num_costs * reasons, parts.num_costs))

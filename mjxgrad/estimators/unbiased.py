@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.estimators.by_noise import SamplesByNoise
+from mjxgrad.estimators.by_noise import Group
 
 
 class UnbiasedTerms(eqx.Module):
@@ -33,18 +33,16 @@ class UnbiasedTerms(eqx.Module):
     linear_variance: Float[Array, ""]
 
 
-def gram(samples: SamplesByNoise) -> Float[Array, "samples samples"]:
+def gram(samples: Group) -> Float[Array, "samples samples"]:
     """Give the slope of sample i along the noise of sample k, from which all comparisons follow."""
     return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def unbiased_terms(
-    samples: SamplesByNoise, slopes: Float[Array, "samples samples"], *, with_derivatives: bool
-) -> UnbiasedTerms:
-    """Give the terms of a chunk.
+def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, with_derivatives: bool) -> UnbiasedTerms:
+    """Give the terms of a group.
 
     Args:
-        samples: of the chunk.
+        samples: of the group.
         slopes: their `gram`.
         with_derivatives: whether they are used; without, the terms are those of the zeroth-order estimate.
 
@@ -75,7 +73,7 @@ def unbiased_terms(
 
 
 def _fitted_share(
-    samples: SamplesByNoise,
+    samples: Group,
     slopes: Float[Array, "samples samples"],
     others: Float[Array, "samples samples"],
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
@@ -106,7 +104,7 @@ def _fitted_share(
 
 
 def _partners_surplus(
-    samples: SamplesByNoise, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
+    samples: Group, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
 ) -> Float[Array, " samples"]:
     """Give what the cost of the other sample from the same start tells about this one's, beyond the mean of all.
 

@@ -16,7 +16,7 @@ POINT = jnp.array([0.05, -0.3])
 def samples_of(function, key, num_samples=40):
     objective = parameter_noise(function, STDDEVS).sized_for(POINT)
     plan = plan_by_noise(objective, num_samples, None)
-    return sample_by_noise(objective, POINT, key, jnp.arange(num_samples), plan)
+    return sample_by_noise(objective, POINT, key, jnp.arange(num_samples), plan).group
 
 
 def sums_of(function, key):
