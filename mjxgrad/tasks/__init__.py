@@ -3,5 +3,25 @@
 from mjxgrad.task import Outcome, SceneTask, Task
 from mjxgrad.tasks import published, textbook
 from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
+from mjxgrad.tasks.friction import friction
+from mjxgrad.tasks.motion_planning import motion_planning
+from mjxgrad.tasks.push import push, push_softness
+from mjxgrad.tasks.story import StoryTask
+from mjxgrad.tasks.tennis import tennis
 
-__all__ = ["BallWall", "Outcome", "SceneTask", "Task", "ball_wall", "published", "textbook", "wall_softness"]
+__all__ = [
+    "BallWall",
+    "Outcome",
+    "SceneTask",
+    "StoryTask",
+    "Task",
+    "ball_wall",
+    "friction",
+    "motion_planning",
+    "published",
+    "push",
+    "push_softness",
+    "tennis",
+    "textbook",
+    "wall_softness",
+]

@@ -1,0 +1,42 @@
+r"""A tray drags a puck by friction, and loses it if pulled too hard.
+
+References:
+    Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+    arXiv:2202.00817, section 5 (there with a law of friction in place of contact).
+"""
+
+import jax.numpy as jnp
+
+from mjxgrad.rollout import initial_state
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.published import QuadraticCost
+from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+
+
+def friction(*, horizon: int = 400) -> StoryTask:
+    """Load the tray and the puck: both are to be 2 m ahead and at rest, the puck above all.
+
+    Masses, time step, friction, start, goal and cost are the published ones. A puck that is off the tray falls, at the
+    speed ahead that it has.
+
+    Args:
+        horizon: number of steps; the default is 2 s.
+
+    Returns:
+        The task. The state is the positions of the tray and of the puck (ahead, and above the tray's level), then
+        their velocities; the control is the force on the tray, in N.
+    """
+    scene = load_scene(scene_path("friction"))
+    weight = jnp.array([0.1, 10.0, 0.0, 0.1, 0.1, 0.0])
+    cost = QuadraticCost(jnp.array([2.0, 2.0, 0.0, 0.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
+    return StoryTask(
+        scene,
+        initial_state(scene),
+        StateCost(cost),
+        horizon,
+        start_params=jnp.zeros((horizon, 1)),
+        settings=Settings(
+            "friction", stddev=0.1, num_samples=10, learning_rate=1e-4, num_steps=100, gamma=2e4, bound=100.0
+        ),
+    )

@@ -1,0 +1,63 @@
+r"""A ball pushes another along a rail, by contact of any stiffness.
+
+References:
+    Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+    arXiv:2202.00817, section 5 (there with a spring in place of contact).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjxgrad.rollout import initial_state
+from mjxgrad.scene import load_scene
+from mjxgrad.softness import Softness
+from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.published import QuadraticCost
+from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+
+PUSH_CONTACT = (("pusher", "pushed"),)
+# Two bodies of 0.1 kg move against each other like one of half that mass.
+REDUCED_MASS = 0.05  # kg
+START_FORCE = 0.1  # N
+
+
+def push(stiffness: float = 10.0, *, horizon: int = 200) -> StoryTask:
+    """Load the push: both balls are to be 1 m ahead and at rest, the second above all.
+
+    Masses, time step, start, goal and cost are the published ones. Those of 10 and 1000 N/m differ there in damping and
+    horizon, too; here in stiffness alone.
+
+    Args:
+        stiffness: of the contact, in N/m.
+        horizon: number of steps; the default is 1 s.
+
+    Returns:
+        The task. The state is how far both have come, then their velocities; the control is the force on the first, in N.
+    """
+    scene = load_scene(scene_path("push"), softness=push_softness(stiffness))
+    weight = jnp.array([0.1, 10.0, 0.1, 0.1])
+    cost = QuadraticCost(jnp.array([1.0, 1.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
+    return StoryTask(
+        scene,
+        initial_state(scene),
+        StateCost(cost),
+        horizon,
+        start_params=jnp.full((horizon, 1), START_FORCE),
+        settings=Settings(
+            "push", stddev=0.1, num_samples=10, learning_rate=1e-3, num_steps=200, gamma=1e8, bound=100.0
+        ),
+    )
+
+
+def push_softness(stiffness: float | Float[Array, "..."], damping_ratio: float | Float[Array, "..."] = 0.0) -> Softness:
+    """Set the softness of the balls' contact.
+
+    Args:
+        stiffness: in N/m; 10 is soft, 1000 stiff. Without damping it is stable to 8000 at the scene's time step.
+        damping_ratio: 0 is elastic, as published; 1 is critical.
+
+    Returns:
+        The softness, or a stack of them if an argument has an axis.
+    """
+    stiffness, damping_ratio = jnp.broadcast_arrays(jnp.asarray(stiffness, float), jnp.asarray(damping_ratio, float))
+    return Softness(stiffness / REDUCED_MASS, damping_ratio, pairs=PUSH_CONTACT)
