@@ -5,6 +5,7 @@ import warnings
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from mjxgrad.estimators import zeroth_order
 from mjxgrad.objective import parameter_noise
 from mjxgrad.rollout import rollout
 from mjxgrad.tasks import friction, motion_planning, push, push_softness, tennis
+from mjxgrad.tasks.files import scene_path
 
 TIMESTEP, MASS, RAIL_DAMPING = 0.005, 0.1, 0.04  # s, kg, N s/m: of the push
 COEFFICIENT, GRAVITY = 0.1835, 9.81  # of the friction; m/s²
@@ -127,6 +129,40 @@ def test_a_puck_that_sticks_comes_along(dragged):
 def test_the_derivative_of_a_sliding_stretch_is_that_of_central_differences(dragged):
     numeric, exact = slope(dragged, PULLED, 1e-5)
     np.testing.assert_allclose(exact, numeric, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """From a scene, a start, constant controls and a number of steps to positions and velocities, in C MuJoCo."""
+
+    def course(name, qpos, qvel, ctrl, num_steps):
+        model = mujoco.MjModel.from_xml_path(str(scene_path(name)))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
+        states = []
+        for _ in range(num_steps):
+            mujoco.mj_step(model, data)
+            states.append((data.qpos.copy(), data.qvel.copy()))
+        return [np.stack(column) for column in zip(*states, strict=True)]
+
+    return course
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.4, 0.8])
+@pytest.mark.parametrize("height", [0.5, 0.51])
+def test_a_pad_returns_the_ball_with_its_speed_and_is_not_passed_through(simulated, speed, height):
+    """A bounce of an undamped spring takes half a period; ten steps are exact to a few per cent, whatever the phase."""
+    qpos, qvel = simulated("tennis", [0, height, 0, 0, 0], [0, -speed, 0, 0, 0], 0, int(1.2 / speed / 0.05))
+    np.testing.assert_allclose(qvel[-1, 1], speed, rtol=0.03)
+    assert qpos[:, 1].min() > 0.05
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0, 8.0])
+def test_no_speed_takes_the_robot_through_a_pillar(simulated, speed):
+    """Pressed at a pillar it rests at depth (1 − d) u / (h k), with d = 0.95 and k = 900/s²."""
+    qpos, _ = simulated("motion_planning", [0, 1.0], 0, [0, speed], 100)
+    np.testing.assert_allclose(qpos[-1], [0, 1.3 + 0.05 * speed / (0.02 * 900)], atol=1e-6)
+    assert qpos[:, 1].max() < 1.33
 
 
 def blind_and_seeing(function, params, stddev, key):

@@ -7,11 +7,10 @@ References:
 
 import jax.numpy as jnp
 
-from mjxgrad.rollout import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 
 def friction(*, horizon: int = 400) -> StoryTask:
@@ -30,10 +29,9 @@ def friction(*, horizon: int = 400) -> StoryTask:
     scene = load_scene(scene_path("friction"))
     weight = jnp.array([0.1, 10.0, 0.0, 0.1, 0.1, 0.0])
     cost = QuadraticCost(jnp.array([2.0, 2.0, 0.0, 0.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return StoryTask(
+    return story_task(
         scene,
-        initial_state(scene),
-        StateCost(cost),
+        cost,
         horizon,
         start_params=jnp.zeros((horizon, 1)),
         settings=Settings(

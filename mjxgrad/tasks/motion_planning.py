@@ -7,11 +7,10 @@ References:
 
 import jax.numpy as jnp
 
-from mjxgrad.rollout import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 START_SPEED = 0.01  # m/s
 
@@ -30,10 +29,9 @@ def motion_planning(*, horizon: int = 100) -> StoryTask:
     scene = load_scene(scene_path("motion_planning"))
     weight = jnp.array([1.0, 1.0, 0.0, 0.0])
     cost = QuadraticCost(jnp.array([0.0, 4.0, 0.0, 0.0]), weight, 10 * weight, jnp.array(0.001))
-    return StoryTask(
+    return story_task(
         scene,
-        initial_state(scene),
-        StateCost(cost),
+        cost,
         horizon,
         start_params=jnp.full((horizon, 2), START_SPEED),
         settings=Settings(

@@ -8,12 +8,11 @@ References:
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.rollout import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.softness import Softness
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 PUSH_CONTACT = (("pusher", "pushed"),)
 # Two bodies of 0.1 kg move against each other like one of half that mass.
@@ -37,10 +36,9 @@ def push(stiffness: float = 10.0, *, horizon: int = 200) -> StoryTask:
     scene = load_scene(scene_path("push"), softness=push_softness(stiffness))
     weight = jnp.array([0.1, 10.0, 0.1, 0.1])
     cost = QuadraticCost(jnp.array([1.0, 1.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return StoryTask(
+    return story_task(
         scene,
-        initial_state(scene),
-        StateCost(cost),
+        cost,
         horizon,
         start_params=jnp.full((horizon, 1), START_FORCE),
         settings=Settings(
@@ -53,7 +51,8 @@ def push_softness(stiffness: float | Float[Array, "..."], damping_ratio: float |
     """Set the softness of the balls' contact.
 
     Args:
-        stiffness: in N/m; 10 is soft, 1000 stiff. Without damping it is stable to 8000 at the scene's time step.
+        stiffness: in N/m; 10 is soft, 1000 stiff. Undamped, a knock adds energy where it takes few time steps: 6 % at
+            1000.
         damping_ratio: 0 is elastic, as published; 1 is critical.
 
     Returns:

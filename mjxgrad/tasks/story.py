@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.rollout import Trajectory
+from mjxgrad.rollout import State, Trajectory, initial_state
+from mjxgrad.scene import Scene
 from mjxgrad.softness import Softness
 from mjxgrad.task import SceneTask
 from mjxgrad.tasks.published import Published, QuadraticCost
@@ -102,3 +103,39 @@ class StoryTask(SceneTask):
         settings = dataclasses.asdict(self.settings)
         del settings["stddev"]
         return Published(objective=self.objective(), params=self.initial_params(), reference={}, **settings)
+
+
+def story_task(
+    scene: Scene,
+    cost: QuadraticCost,
+    horizon: int,
+    *,
+    settings: Settings,
+    start_params: PyTree,
+    state: State | None = None,
+    **policy_and_starts: Any,
+) -> StoryTask:
+    """Make a task.
+
+    Args:
+        scene: from `load_scene`.
+        cost: of the vector of positions and velocities, and of the controls.
+        horizon: number of steps.
+        settings: to optimise it with.
+        start_params: the controls, or the policy's parameters.
+        state: the nominal start; None is the scene's reference pose at rest.
+        **policy_and_starts: `policy` and `start_distribution` of `StoryTask`, where there are any.
+
+    Returns:
+        The task.
+    """
+    # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
+    return StoryTask(  # pyright: ignore[reportCallIssue]
+        scene=scene,
+        state=initial_state(scene) if state is None else state,
+        cost=StateCost(cost),
+        horizon=horizon,
+        settings=settings,
+        start_params=start_params,
+        **policy_and_starts,
+    )

@@ -15,7 +15,7 @@ from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
 from mjxgrad.tasks.published.tennis import Tennis, tennis_task
-from mjxgrad.tasks.story import Settings, StateCost, StoryTask
+from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 
 class Starts(eqx.Module):
@@ -61,12 +61,12 @@ def tennis(*, horizon: int = 200) -> StoryTask:
     policy, params = linear_policy(7, 3, bias=False, observe=published_state)
     goal = jnp.zeros(10).at[1].set(2.5)
     final_weight = jnp.zeros(10).at[jnp.array([0, 1, 5, 6])].set(jnp.array([100.0, 100.0, 10.0, 10.0]))
-    return StoryTask(
+    return story_task(
         scene,
-        starts.state(published.nominal_start()),
-        StateCost(QuadraticCost(goal, jnp.zeros(10), final_weight, jnp.array(0.001))),
+        QuadraticCost(goal, jnp.zeros(10), final_weight, jnp.array(0.001)),
         horizon,
-        starts,
+        state=starts.state(published.nominal_start()),
+        start_distribution=starts,
         start_params=params,
         policy=policy,
         settings=Settings(
