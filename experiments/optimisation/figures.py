@@ -82,7 +82,7 @@ def final(outcome: Outcome):
         kept = run.kept
         # Spread out by number, not by chance: the same picture from the same numbers.
         left.plot(kept, y + np.linspace(-0.22, 0.22, kept.size), "o", ms=3.2, color=colour, alpha=0.45, mew=0)
-        if kept.size > 1:
+        if kept.size > 1 and run.mean <= limit:
             low, high = run.interval(outcome.settings.confidence)
             left.plot([low, high], [y, y], color=colour, lw=2.4, solid_capstyle="butt")
         left.plot(run.mean, y, "|", color=colour, ms=13, mew=2.2)

@@ -233,8 +233,8 @@ def test_settings_that_make_no_sense_are_refused_by_name(change, words):
 @pytest.mark.parametrize("name", FILES)
 def test_every_file_shows_default_alpha_order_beside_first_and_zeroth_order(name):
     for run in load_runs(name, []):
-        labels = [method.label for method in run.settings.methods]
-        assert {"first order", "zeroth order", "α-order"} <= set(labels)
+        names = {method.name for method in run.settings.methods}
+        assert {"first_order", "zeroth_order", "alpha_order"} <= names
         assert sum(method.is_default_alpha for method in run.settings.methods) == 1
         assert run.settings.seeds >= 6
 
