@@ -151,7 +151,8 @@ def sample_by_noise(
         return [noise, objective.redraw(noise, jax.random.fold_in(key, plan.num_units + unit))]
 
     def in_order(*members: Array) -> Array:
-        return jnp.stack(members, axis=1).reshape(-1, *members[0].shape[1:])
+        # Not -1: the state of a scene without activations has an axis of length zero.
+        return jnp.stack(members, axis=1).reshape(len(members) * len(members[0]), *members[0].shape[1:])
 
     noises = jax.tree.map(in_order, *jax.vmap(noise_of)(units))
     result = jax.vmap(lambda noise: objective.differentiate(params, noise))(noises)
