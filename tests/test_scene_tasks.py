@@ -203,3 +203,18 @@ def test_a_pad_that_misses_is_blind_to_its_velocity_and_zeroth_order_is_not(key)
     derivative, estimate = blind_and_seeing(end, jnp.zeros(1), 0.3, key)
     assert derivative == 0
     assert estimate.value[0] > 4 * estimate.standard_error[0]
+
+
+@pytest.mark.slow
+def test_seeds_and_samples_may_be_mapped_over_at_once():
+    """Two nested batches of elliptic contacts, differentiated: XLA's CPU backend once died of it (jax 0.10.2)."""
+    problem = motion_planning(horizon=10).problem()
+    params = jnp.stack([problem.params] * 2)
+
+    def gradient(params, key):
+        return mg.estimators.first_order(problem.objective, params, key, num_samples=50).value
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    both = jax.jit(jax.vmap(gradient))(params, keys)
+    one = jax.jit(gradient)(params[1], keys[1])
+    np.testing.assert_allclose(both[1], one, rtol=1e-6, atol=1e-9)

@@ -22,6 +22,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad.dynamics.linear import sum_of_few
+
 
 @dataclasses.dataclass(frozen=True)
 class ConeGroup:
@@ -86,7 +88,7 @@ def _cone(
     group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim *batch"], x: Float[Array, "rows *batch"]
 ) -> _Cone:
     u = _blocks(group, x) * scale
-    square = jnp.sum(u[:, 1:] ** 2, axis=1)
+    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
     slides = square > 0
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
     mu = scale[:, 0]
@@ -145,8 +147,8 @@ def curvature_product(
         mu = scale[:, 0]
         along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * cone.tangent], axis=1)
         ratio = jnp.where(cone.is_middle, -cone.gap / jnp.where(cone.slip > 0, cone.slip, 1.0), 0.0)
-        first = along[:, :, None] * jnp.sum(along[:, :, None] * scaled, axis=1, keepdims=True)
-        slide = jnp.sum(cone.tangent[:, :, None] * scaled[:, 1:], axis=1, keepdims=True)
+        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
+        slide = sum_of_few(cone.tangent[:, :, None] * scaled[:, 1:])
         across = scaled[:, 1:] - cone.tangent[:, :, None] * slide
         second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
         middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)

@@ -1,5 +1,7 @@
 """Constraint rows of contacts: pyramids, elliptic cones, frictionless."""
 
+import functools
+import operator
 from typing import Any
 
 import jax
@@ -125,4 +127,5 @@ def contact_jacobian(
 
 
 def _dot_axes(wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]) -> Float[Array, "contacts k nv"]:
-    return jnp.sum(wrench[:, :, None, :] * axes, axis=-1)
+    # Written out: XLA's CPU backend crashed on the derivative of the reduction under two jax.vmap (jax 0.10.2).
+    return functools.reduce(operator.add, (wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1])))

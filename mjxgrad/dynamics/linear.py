@@ -43,6 +43,15 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     return _add(a * b for a, b in zip(x, y, strict=True))
 
 
+def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "contacts 1 *rest"]:
+    """Return the sum over the second axis, written out.
+
+    XLA's CPU backend hands such a reduction to a library (YNNPACK)
+    that neither vectorises it over the batch nor, under two `jax.vmap` (jax 0.10.2), always survives it.
+    """
+    return _add(terms[:, i : i + 1] for i in range(terms.shape[1]))
+
+
 def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
     """Return leftᵀ right for a product known to be symmetric."""
     if left.ndim > 2 and len(left) <= _LONGEST_SUM:
@@ -91,8 +100,15 @@ def solve_positive_definite(matrix: Float[Array, "n n"], vector: Float[Array, " 
     return jax.lax.custom_linear_solve(lambda x: matrix @ x, vector, solve, symmetric=True)
 
 
-def batch_last(function):
-    """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis."""
+def batch_last(function, batch: int | None = None):
+    """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
+
+    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank.
+
+    Args:
+        function: of arrays whose trailing axis may be a batch.
+        batch: size of the trailing axis that the arguments have already; for the recursion.
+    """
 
     @functools.wraps(function)
     def wrapped(*args):
@@ -101,15 +117,16 @@ def batch_last(function):
         @batched.def_vmap
         def rule(size, is_batched, *args):
             def move(x: Array, has_batch: bool) -> Array:
-                if has_batch:
-                    return jnp.moveaxis(x, 0, -1)
-                return jnp.broadcast_to(x[..., None], (*x.shape, size))
+                moved = jnp.moveaxis(x, 0, -1) if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))
+                return moved if batch is None else moved.reshape(*moved.shape[:-2], batch * size)
 
-            result = wrapped(*jax.tree.map(move, args, tuple(is_batched)))
-            return (
-                jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), result),
-                jax.tree.map(lambda _: True, result),
-            )
+            def back(x: Array) -> Array:
+                split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
+                return jnp.moveaxis(split, -1, 0)
+
+            merged = jax.tree.map(move, args, tuple(is_batched))
+            result = batch_last(function, size if batch is None else batch * size)(*merged)
+            return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
         return batched(*args)
 

@@ -86,7 +86,7 @@ def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_f
     assert np.all(np.asarray(estimates.num_rollouts) == num_rollouts)
 
 
-def test_the_partner_from_the_same_start_takes_away_what_starts_do():
+def test_baselines_from_the_same_start_take_away_what_starts_do():
     """Starts a hundred times as far apart as the noise: the mean of other starts would be no baseline at all."""
 
     class FarStarts(textbook.LinearSystem):
@@ -98,11 +98,13 @@ def test_the_partner_from_the_same_start_takes_away_what_starts_do():
     flat = objective.ravel(params)
     rule = rules.FixedAlpha(0.0)
     paired = functools.partial(estimators.alpha_order, rule=rule, control_variate=False)
-    spreads = [
+    from_same_start = functools.partial(estimators.zeroth_order, baseline="zero_noise")
+    partner, silence, others = (
         np.asarray(repeat(estimator, objective, flat, 500, num_samples=20).value).std(axis=0)
-        for estimator in (paired, estimators.zeroth_order)
-    ]
-    np.testing.assert_array_less(spreads[0], 0.3 * spreads[1])
+        for estimator in (paired, from_same_start, estimators.zeroth_order)
+    )
+    np.testing.assert_array_less(partner, 0.3 * others)
+    np.testing.assert_array_less(silence, 0.3 * others)
 
 
 def test_the_linear_part_of_a_cost_makes_no_noise(key):
