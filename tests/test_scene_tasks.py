@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.estimators import zeroth_order
+from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
 from mjxgrad.rollout import rollout
 from mjxgrad.tasks import friction, motion_planning, push, push_softness, tennis
@@ -212,7 +212,7 @@ def test_seeds_and_samples_may_be_mapped_over_at_once():
     params = jnp.stack([problem.params] * 2)
 
     def gradient(params, key):
-        return mg.estimators.first_order(problem.objective, params, key, num_samples=50).value
+        return first_order(problem.objective, params, key, num_samples=50).value
 
     keys = jax.random.split(jax.random.key(0), 2)
     both = jax.jit(jax.vmap(gradient))(params, keys)
