@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from experiments.report import Figure
 from experiments.textbook.outcome import Outcome
@@ -166,6 +167,10 @@ def _errors(axis: Axes, outcome: Outcome, x: np.ndarray, tables: list[Comparison
             axis.plot(x * shift, exact[label], color=colour, lw=1.0)
     axis.set_xscale("log")
     axis.set_yscale("log")
+    # Errors often span a single decade, where powers of ten alone would leave one label.
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_locator(NullLocator())
 
 
 def _bars(axis: Axes, x, value, ends, colour, marker, label, *, is_line: bool = True) -> None:
