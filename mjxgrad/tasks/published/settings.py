@@ -13,7 +13,7 @@ Schedule = Callable[[Int[Array, ""] | int], Float[Array, ""] | float]
 
 @dataclasses.dataclass(frozen=True)
 class Published:
-    """A task as it was published.
+    """A task with its settings; those of the paper in `published.TASKS`, our own for a scene.
 
     The optimiser is plain gradient descent: params ← params − learning_rate · estimate.
 
