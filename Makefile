@@ -58,7 +58,7 @@ throughput: .venv/.installed  ## measure a sweep over softness in one program ag
 	@$(BIN)/python -m experiments.throughput $(ARGS)
 
 lint: .venv/.installed  ## ruff and pyright
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python
 
 clean:  ## remove .venv, caches and runs
 	@rm -rf .venv .cache .pytest_cache .ruff_cache build dist runs *.egg-info
