@@ -57,7 +57,7 @@ class Row:
 
 def main() -> None:
     """Print one table per scene."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--scene", nargs="*", choices=list(_SCENES), default=list(_SCENES))
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--steps", type=int, default=100)
@@ -158,7 +158,7 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
         begin = time.perf_counter()
         jax.block_until_ready(compiled(states))
         seconds.append(time.perf_counter() - begin)
-    return Row(name, tuple(seconds), compilation, compiled.memory_analysis().temp_size_in_bytes)
+    return Row(name, tuple(seconds), compilation, compiled.memory_analysis().temp_size_in_bytes)  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:

@@ -11,6 +11,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ _ESTIMATORS = (mg.estimators.first_order, mg.estimators.zeroth_order, mg.estimat
 
 def main() -> None:
     """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--samples", type=int, default=1000)
     parser.add_argument("--separate", type=int, default=10, help="how many of the ten programs to compile one by one")
     parser.add_argument("--most-samples", type=int, default=10**6, help="of the table of memory")
@@ -63,7 +64,7 @@ def _one_by_one(task: mg.tasks.BallWall, num_samples: int, stiffness: jax.Array,
     return _compile_and_run(jax.jit(lambda key: estimates(stiffness, key)), [(key,)])
 
 
-def _compile_and_run(function: Callable, arguments: list[tuple]) -> tuple[float, float]:
+def _compile_and_run(function: Any, arguments: list[tuple]) -> tuple[float, float]:
     """Give the seconds to compile for the first arguments, and to run all of them."""
     start = time.perf_counter()
     compiled = function.lower(*arguments[0]).compile()
@@ -78,7 +79,7 @@ def _memory(task: mg.tasks.BallWall, key: jax.Array, options: argparse.Namespace
     count = 1000
     while count <= options.most_samples:
         compiled = jax.jit(_estimates(task, count)).lower(_STIFFNESS[0], key).compile()
-        print(f"{count:8d} {compiled.memory_analysis().temp_size_in_bytes / 1e6:10.2f} MB", flush=True)
+        print(f"{count:8d} {compiled.memory_analysis().temp_size_in_bytes / 1e6:10.2f} MB", flush=True)  # pyright: ignore[reportOptionalMemberAccess]
         if options.run_most and count == options.most_samples:
             runs = []
             for stiffness in _STIFFNESS[:3]:

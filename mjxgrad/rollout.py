@@ -158,7 +158,9 @@ def rollout(
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     start = (state, jnp.full((), -1, jnp.int32))
     (final, first_bad), (qpos, qvel, ctrl, seen) = jax.lax.scan(
-        advance, start, (jnp.arange(horizon, dtype=jnp.int32), *inputs)
+        advance,
+        start,
+        (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
     )
     if observe is not None:
         data = _data(scene, final, ctrl[-1])

@@ -44,7 +44,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
         fields = dict.fromkeys(("D", "aref", "frictionloss", "pos", "margin"), empty)
-        fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)
+        fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)  # pyright: ignore[reportArgumentType]
     else:
         block = jax.tree.map(lambda *x: jnp.concatenate(x), *blocks)
         jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
@@ -60,7 +60,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             "pos": residual + block.margin,
             "margin": block.margin,
         }
-    return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})
+    return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})  # pyright: ignore[reportReturnType]
 
 
 def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> Rows:

@@ -28,7 +28,7 @@ class Bilinear:
     def __init__(self, table: np.ndarray):
         """Keep the terms of T that are not zero."""
         self._size = len(table)
-        self._terms = _ordered([(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)])
+        self._terms = _ordered([(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)])  # pyright: ignore[reportArgumentType]
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
         """Return c; both factors have the same leading axes."""

@@ -30,4 +30,4 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     height = jnp.sum(normal * (contact.pos - data.geom_xpos[first]), axis=1) + 0.5 * contact.dist
     # The value stays MJX's own; only the derivative is replaced.
     mended = jax.lax.stop_gradient(contact.dist - height) + height
-    return data.tree_replace({"_impl.contact.dist": jnp.where(stands, mended, contact.dist)})
+    return data.tree_replace({"_impl.contact.dist": jnp.where(stands, mended, contact.dist)})  # pyright: ignore[reportReturnType]

@@ -181,7 +181,7 @@ def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
     first, second = (data.qpos[a] - model.qpos0[a] for a in addresses)
     weights = tuple(model.dof_invweight0[dof] for dof in dofs)
-    return _coupling(model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights)
+    return _coupling(model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights)  # pyright: ignore[reportArgumentType]
 
 
 def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
@@ -189,4 +189,4 @@ def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     first, second = (data.ten_length[t] - model.tendon_length0[t] for t in objects)
     jacobians = tuple(data._impl.ten_J[t] for t in objects)
     weights = tuple(model.tendon_invweight0[t] for t in objects)
-    return _coupling(model, data, ids, (first, second), jacobians, weights)
+    return _coupling(model, data, ids, (first, second), jacobians, weights)  # pyright: ignore[reportArgumentType]

@@ -43,7 +43,7 @@ def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     drives = (model.jnt_dofadr[joint][:, None] == np.arange(model.nv)).astype(float)
     length = gear * pick(model.jnt_qposadr[joint], data.qpos)
     moment = spatial.scale(gear, jnp.asarray(drives, gear.dtype))
-    return data.tree_replace({"actuator_length": length, "_impl.actuator_moment": moment})
+    return data.tree_replace({"actuator_length": length, "_impl.actuator_moment": moment})  # pyright: ignore[reportReturnType]
 
 
 def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -58,10 +58,10 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """
     if model.nu:
         rate = contract("uv,v->u", data._impl.actuator_moment, data.qvel)
-        data = data.tree_replace({"_impl.actuator_velocity": rate})
+        data = data.tree_replace({"_impl.actuator_velocity": rate})  # pyright: ignore[reportAssignmentType]
     if model.ntendon:
         rate = contract("tv,v->t", data._impl.ten_J, data.qvel)
-        data = data.tree_replace({"_impl.ten_velocity": rate})
+        data = data.tree_replace({"_impl.ten_velocity": rate})  # pyright: ignore[reportAssignmentType]
     data = smooth.rne(model, passive(model, smooth.com_vel(model, data)))
     return mjx.tendon_bias(model, data) if model.ntendon else data
 

@@ -98,8 +98,8 @@ def _joint_motion(
         for values, value in zip((kept, turns, ways, origins), (q, turn, way, origin), strict=True):
             values.append(value)
     if not kept:
-        return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))
-    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))
+        return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))  # pyright: ignore[reportReturnType]
+    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
 
 
 def _orientations(
@@ -156,7 +156,7 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     offset = data.xipos - pick(model.body_rootid, centre)
     central = spatial.compose(data.ximat * model.body_inertia[:, None], data.ximat.transpose(0, 2, 1))
     inertia = spatial.inertia_about(offset, mass, central)
-    return data.tree_replace({"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)})
+    return data.tree_replace({"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)})  # pyright: ignore[reportReturnType]
 
 
 def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]) -> Float[Array, "nv 6"]:
@@ -169,9 +169,9 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
             axis = columns.reshape(-1, 3)
         still = jnp.zeros_like(axis)
         if run.kind == _Joint.mjJNT_FREE:
-            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)
-            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))
-            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))
+            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)  # pyright: ignore[reportPossiblyUnboundVariable]
+            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
+            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
         elif run.kind == _Joint.mjJNT_SLIDE:
             angular.append(still)
             linear.append(axis)
@@ -226,7 +226,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     lower = products * jnp.asarray(is_pair, products.dtype)
     mirrored = products.T * jnp.asarray(np.triu(is_pair.T, 1), products.dtype)
     diagonal = model.dof_armature[:, None] * jnp.eye(model.nv, dtype=products.dtype)
-    return data.tree_replace({"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal})
+    return data.tree_replace({"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal})  # pyright: ignore[reportReturnType]
 
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:

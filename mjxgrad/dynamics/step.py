@@ -122,7 +122,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         jax.lax.stop_gradient(tolerance),
     )
     point = problem.at(layout, acceleration)
-    return data.tree_replace(
+    return data.tree_replace(  # pyright: ignore[reportReturnType]
         {
             "qacc": acceleration,
             "qfrc_constraint": point.pull,

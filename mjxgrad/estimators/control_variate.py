@@ -1,5 +1,7 @@
 """The control-variate estimate: unbiased, and as good as derivatives allow."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -72,7 +74,7 @@ def stream_parts(
     return accumulate(plan, one_chunk)[0]
 
 
-def assemble_mixture(parts: Parts, plan: Plan, weights: Float[Array, " dim"], **facts: object) -> GradientEstimate:
+def assemble_mixture(parts: Parts, plan: Plan, weights: Float[Array, " dim"], **facts: Any) -> GradientEstimate:
     """Turn both parts into one estimate.
 
     Args:

@@ -1,6 +1,7 @@
 """A first-order and an unbiased estimate from the same rollouts, and all that is needed to weigh them."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +47,7 @@ class Parts(Summary):
     def merge(self, other: "Parts") -> "Parts":
         """Give the summary of both sets of samples."""
 
-        def both(mine: Moments | Array, theirs: Moments | Array) -> Moments | Array:
+        def both(mine: Any, theirs: Any) -> Any:
             return mine.merge(theirs) if isinstance(mine, Moments) else mine + theirs
 
         return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
