@@ -9,7 +9,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from mjxgrad.estimators import GradientEstimate
 from mjxgrad.estimators.estimate import assemble
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.objective import ActionNoise, ClosedLoop, Objective
+from mjxgrad.estimators.sampling import Plan
+from mjxgrad.objective import ActionNoise, Objective
 
 ReinforceBaseline = Literal["leave_one_out", "none"]
 
@@ -59,7 +60,8 @@ def reinforce(
         REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     params = jnp.asarray(params)
-    objective = _checked(objective.sized_for(params), num_samples, baseline)
+    objective = _checked(objective.sized_for(params), baseline)
+    plan = Plan(num_samples, with_score=True)
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_samples))
     noises = jax.vmap(objective.sample_noise)(keys)
     outcomes = jax.vmap(lambda noise: objective.outcome(params, noise))(noises)
@@ -77,7 +79,7 @@ def reinforce(
         mean = jnp.where(is_used[:, None], to_go, 0).sum(axis=0) / jnp.maximum(count, 1)
         to_go = (to_go - mean) * (as_real(count, to_go) / as_real(jnp.maximum(count - 1, 1), to_go))
     weighted = actions / objective.stddev**2 * to_go[:, :, None]
-    samples = jax.vmap(lambda states, weights: _pull_back(objective, params, states, weights))(
+    samples = jax.vmap(lambda states, weights: objective.pull_back_at(params, states)(jnp.ravel(weights)))(
         outcomes.states, jnp.where(is_used[:, None, None], weighted, 0).astype(params.dtype)
     )
     is_used &= jnp.isfinite(samples).all(axis=1)
@@ -86,11 +88,8 @@ def reinforce(
         gradients.mean,
         gradients.squared_error(),
         Moments.of(outcomes.cost, is_used),
+        plan,
         count=gradients.count,
-        rollouts_per_unit=1,
-        num_samples=num_samples,
-        num_rollouts=num_samples,
-        num_gradient_rollouts=0,
     )
 
 
@@ -99,27 +98,12 @@ def _costs_to_go(step_costs: Float[Array, "num_samples steps"], horizon: int) ->
     return jnp.cumsum(step_costs[:, ::-1], axis=1)[:, ::-1][:, :horizon]
 
 
-def _pull_back(
-    objective: ActionNoise, params: Float[Array, " dim"], states: Array, weights: Float[Array, "horizon nu"]
-) -> Float[Array, " dim"]:
-    """Take weights on the actions of a rollout to the parameters, the states being data."""
-    if not isinstance(objective, ClosedLoop):
-        return jnp.ravel(weights)
-
-    def actions(flat: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
-        return jax.vmap(lambda state: objective.policy(objective.unravel(flat), state))(states)
-
-    return jax.vjp(actions, params)[1](weights)[0]
-
-
-def _checked(objective: Objective, num_samples: int, baseline: str) -> ActionNoise:
+def _checked(objective: Objective, baseline: str) -> ActionNoise:
     if not isinstance(objective, ActionNoise):
         raise ValueError(
             f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
             "use estimators.zeroth_order where there are no steps"
         )
-    if num_samples < 2:
-        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
     choices = get_args(ReinforceBaseline)
     if baseline not in choices:
         raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")

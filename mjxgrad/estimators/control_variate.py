@@ -91,10 +91,7 @@ def assemble_mixture(parts: Parts, plan: Plan, weights: Float[Array, " dim"], **
         value,
         squared_error,
         parts.costs,
+        plan,
         count=parts.unbiased.count,
-        rollouts_per_unit=plan.rollouts_per_unit,
-        num_samples=plan.num_samples,
-        num_rollouts=plan.num_rollouts,
-        num_gradient_rollouts=plan.num_rollouts,
         **facts,
     )

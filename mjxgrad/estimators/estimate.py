@@ -6,6 +6,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.estimators.moments import Moments
+from mjxgrad.estimators.sampling import Plan
 
 
 class Diagnosis(eqx.Enumeration):
@@ -81,12 +82,9 @@ def assemble(
     value: Float[Array, " dim"],
     squared_error: Float[Array, " dim"],
     costs: Moments,
+    plan: Plan,
     *,
     count: Int[Array, ""],
-    rollouts_per_unit: int,
-    num_samples: int,
-    num_rollouts: int,
-    num_gradient_rollouts: int,
     has_baseline: Bool[Array, ""] | bool = True,
     alpha: ArrayLike = 0.0,
     reason: Reason = Reason.fixed,
@@ -98,11 +96,8 @@ def assemble(
         value: the mean.
         squared_error: its squared standard error.
         costs: moments of the cost over independent units.
+        plan: what was asked for, and spent.
         count: independent units (samples, or pairs of them) that were finite.
-        rollouts_per_unit: 2 for antithetic pairs, else 1.
-        num_samples: samples asked for.
-        num_rollouts: rollouts spent.
-        num_gradient_rollouts: rollouts differentiated.
         has_baseline: whether a baseline that had to be finite was so.
         alpha: weight of the first-order part.
         reason: why.
@@ -111,9 +106,9 @@ def assemble(
     Returns:
         The estimate, all NaN where there is none.
     """
-    num_finite = count * rollouts_per_unit
+    num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline
-    diagnosis = Diagnosis.where(num_finite == num_samples, Diagnosis.fine, Diagnosis.some_not_finite)
+    diagnosis = Diagnosis.where(num_finite == plan.num_samples, Diagnosis.fine, Diagnosis.some_not_finite)
     diagnosis = Diagnosis.where(count >= 2, diagnosis, Diagnosis.too_few_finite)
     diagnosis = Diagnosis.where(has_baseline, diagnosis, Diagnosis.baseline_not_finite)
     value = jnp.where(exists, value, jnp.nan)
@@ -124,10 +119,10 @@ def assemble(
         covariance_diagonal=squared_error * num_finite.astype(squared_error.dtype),
         objective_mean=jnp.where(costs.count > 0, costs.mean, jnp.nan),
         objective_standard_error=jnp.sqrt(costs.squared_error()),
-        num_samples=jnp.asarray(num_samples),
+        num_samples=jnp.asarray(plan.num_samples),
         num_finite=num_finite,
-        num_rollouts=jnp.asarray(num_rollouts),
-        num_gradient_rollouts=jnp.asarray(num_gradient_rollouts),
+        num_rollouts=jnp.asarray(plan.num_rollouts),
+        num_gradient_rollouts=jnp.asarray(plan.num_rollouts if plan.with_gradient else 0),
         diagnosis=diagnosis,
         alpha=jnp.asarray(alpha, value.dtype),
         reason=reason,

@@ -63,11 +63,8 @@ def first_order_result(summary: tuple[Any, ...], plan: Plan) -> GradientEstimate
         gradients.mean,
         gradients.squared_error(),
         costs,
+        plan,
         count=gradients.count,
-        rollouts_per_unit=plan.rollouts_per_unit,
-        num_samples=plan.num_samples,
-        num_rollouts=plan.num_rollouts,
-        num_gradient_rollouts=plan.num_rollouts,
         alpha=1.0,
         bias_bound=jnp.nan,
     )

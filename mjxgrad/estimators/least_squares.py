@@ -74,12 +74,9 @@ def least_squares(
         slope / stddev,
         squared_error / stddev**2,
         costs,
+        plan,
         # A fit that leaves no residual degree of freedom is no estimate.
         count=jnp.where(costs.count > params.size + 1, costs.count, 0),
-        rollouts_per_unit=1,
-        num_samples=num_samples,
-        num_rollouts=num_samples,
-        num_gradient_rollouts=0,
     )
 
 

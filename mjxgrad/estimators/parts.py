@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.estimators.by_noise import Group, SamplesByNoise
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
@@ -120,7 +120,7 @@ class Parts(Summary):
 
 def parts_and_terms(
     samples: SamplesByNoise, *, control_variate: bool, take: Callable[[ByNoise], Array]
-) -> tuple[Parts, ByNoise]:
+) -> tuple[Parts, ByNoise, Bool[Array, " units"]]:
     """Summarise a chunk.
 
     Args:
@@ -129,7 +129,7 @@ def parts_and_terms(
         take: where the moments are wanted: `samples.pull_back` for parameters, the identity for noise.
 
     Returns:
-        The summary, and the unbiased terms by noise.
+        The summary, the unbiased terms by noise, and which units have both cost and baseline.
     """
     groups = samples.groups()
 
@@ -159,4 +159,4 @@ def parts_and_terms(
         num_costs=real_counts.sum(),
         num_groups=as_real((num_costs >= 2).sum(), whole.costs),
     )
-    return summary, terms_by_noise
+    return summary, terms_by_noise, has_cost

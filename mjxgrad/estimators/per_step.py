@@ -60,14 +60,13 @@ def per_step(
 
     def one_chunk(units: Array) -> tuple[Summary, ...]:
         samples = sample_by_noise(objective, params, key, units, plan)
-        parts, terms_by_noise = parts_and_terms(
+        parts, terms_by_noise, has_cost = parts_and_terms(
             samples, control_variate=control_variate, take=lambda by_noise: by_noise
         )
         weights = weigh(rule or Consistent(), parts, np.arange(num_actions), num_actions)
         alpha = weights.alpha
         group = samples.group
         mixed = alpha * group.derivatives + jnp.where(group.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
-        has_cost = samples.complete(group.has_cost) & (group.has_cost.sum() >= 2)
         values = Moments.of(samples.by_unit(samples.pull_back(mixed)), has_cost)
         reasons = jax.nn.one_hot(jax.tree.leaves(weights.reason)[0], len(Reason), axis=0)
         return values, parts.costs, Total((parts.num_costs * alpha, parts.num_costs * reasons, parts.num_costs))
@@ -78,11 +77,8 @@ def per_step(
         values.mean,
         values.squared_error(),
         costs,
+        plan,
         count=values.count,
-        rollouts_per_unit=plan.rollouts_per_unit,
-        num_samples=plan.num_samples,
-        num_rollouts=plan.num_rollouts,
-        num_gradient_rollouts=plan.num_rollouts,
         alpha=alpha / jnp.maximum(count, 1),
         reason=jax.tree.map(lambda _: reasons.argmax(axis=0), Reason.fixed),
         bias_bound=jnp.where((alpha > 0).any(), jnp.nan, 0),

@@ -94,11 +94,8 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> 
         value,
         squared_error,
         costs,
+        plan,
         count=moments.costs.count,
-        rollouts_per_unit=plan.rollouts_per_unit,
-        num_samples=plan.num_samples,
-        num_rollouts=plan.num_rollouts,
-        num_gradient_rollouts=plan.num_rollouts if plan.with_gradient else 0,
         has_baseline=jnp.isfinite(noise_free.value),
     )
 

@@ -32,6 +32,10 @@ class ActionNoise(Objective):
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
         """Roll out once: the cost, the states, and the costs by step where the task gives them."""
 
+    @abstractmethod
+    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+        """Give the way from components by action noise, flattened, to the parameters; see `Differentiated`."""
+
     @property
     def noise_shape(self) -> tuple[int, int]:
         """Give (horizon, nu)."""
@@ -101,10 +105,13 @@ class ActionNoise(Objective):
         actions, _ = self.split(noise)
         return jnp.ravel(actions / self.stddev**2).astype(params.dtype)
 
-    def _differentiated(
-        self, params: Float[Array, " dim"], noise: PyTree, pull_back_at: Callable[[PyTree], Partial]
-    ) -> Differentiated:
-        """Differentiate by the action noise; the pull-back may depend on the states visited."""
+    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+        """Differentiate by the action noise through the whole loop, in one reverse pass.
+
+        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on
+        the cost through the actions alone, so pulling it back at the visited states gives the whole gradient by the
+        parameters.
+        """
         actions, start = self.split(noise)
 
         def cost_and_states(flat: Float[Array, " m"]) -> tuple[Float[Array, ""], PyTree]:
@@ -114,7 +121,8 @@ class ActionNoise(Objective):
 
         cost, states, gradient = value_and_gradient(cost_and_states, jnp.ravel(actions).astype(params.dtype))
         stddev = jnp.ravel(jnp.broadcast_to(self.stddev, self.noise_shape)).astype(params.dtype)
-        return Differentiated(cost, gradient, self._noise_score(params, noise), stddev, pull_back_at(states))
+        score, pull_back = self._noise_score(params, noise), self.pull_back_at(params, states)
+        return Differentiated(cost, gradient, score, stddev, pull_back)
 
 
 class OpenLoop(ActionNoise):
@@ -141,9 +149,9 @@ class OpenLoop(ActionNoise):
         """Give w/σ², flattened."""
         return self._noise_score(params, noise)
 
-    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
-        """Differentiate by the controls, which is by their noise: the pull-back is the identity."""
-        return self._differentiated(params, noise, lambda _: Partial(unchanged))
+    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+        """Give the identity: the parameters are the controls."""
+        return Partial(unchanged)
 
 
 class ClosedLoop(ActionNoise):
@@ -173,18 +181,10 @@ class ClosedLoop(ActionNoise):
     ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
         """Give both from one rollout."""
         outcome = self.outcome(params, noise)
-        return outcome.cost, self._pull_back(params, outcome.states)(self._noise_score(params, noise))
+        return outcome.cost, self.pull_back_at(params, outcome.states)(self._noise_score(params, noise))
 
-    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
-        """Differentiate by the action noise through the whole closed loop, in one reverse pass.
-
-        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on
-        the cost through the actions alone, so pulling it back through the policy at the visited states gives the whole
-        gradient by the parameters.
-        """
-        return self._differentiated(params, noise, lambda states: self._pull_back(params, states))
-
-    def _pull_back(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+        """Give the transpose of the derivative of the policy's actions by its parameters, at given states."""
         # Given the state, the action is Gaussian about the policy; the chance of the next state
         # given state and action does not depend on the parameters. So the states are data here.
         states = jax.lax.stop_gradient(states)
