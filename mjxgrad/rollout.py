@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import forward, step
+from mjxgrad.dynamics import Gradient, check_gradient, forward, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene
 
@@ -99,6 +99,7 @@ def rollout(
     horizon: int | None = None,
     observe: Observe | None = None,
     checkpoint: bool = True,
+    gradient: Gradient = "discrete",
     velocity_limit: float | None = 1e4,
 ) -> Trajectory:
     """Step a scene many times.
@@ -117,16 +118,18 @@ def rollout(
             in; its results are stacked. Name what you need: what it does not return is not kept.
         checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
             a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
+        gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
 
     Returns:
         The trajectory, with `horizon + 1` states.
 
     Raises:
-        ValueError: if shapes do not fit the scene, the horizon is missing or contradicted, or controls or noise hold
-            numbers that are not finite (checked where values are known, that is outside `jax.jit`; inside, the rollout
-            is flagged as diverged at that step).
+        ValueError: if there is no such gradient, shapes do not fit the scene, the horizon is missing or contradicted, or
+            controls or noise hold numbers that are not finite (checked where values are known, that is outside `jax.jit`;
+            inside, the rollout is flagged as diverged at that step).
     """
+    check_gradient(gradient)
     nu = scene.model.nu
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
@@ -144,7 +147,7 @@ def rollout(
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
         data = _data(scene, state, ctrl)
-        stepped = step(scene.model, data)
+        stepped = step(scene.model, data, gradient=gradient)
         moved = _state(stepped)
         is_bad = ~_is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)

@@ -1,8 +1,9 @@
 """What an objective needs of a thing to be controlled: how long, how many controls, where it starts, a cost."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import Gradient, check_gradient
 from mjxgrad.rollout import State, Trajectory, rollout
 from mjxgrad.scene import Scene
 
@@ -93,6 +95,7 @@ class SceneTask(Task):
             and controls up to t, whose sum is the cost; traceable.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
+        gradient: of each step, "discrete" or "event"; see `step`.
     """
 
     scene: Scene
@@ -100,6 +103,16 @@ class SceneTask(Task):
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
+    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
+
+    def with_gradient(self, gradient: Gradient) -> Self:
+        """Give the same task with another derivative of its steps.
+
+        Raises:
+            ValueError: if there is no such gradient.
+        """
+        check_gradient(gradient)
+        return dataclasses.replace(self, gradient=gradient)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -136,6 +149,7 @@ class SceneTask(Task):
             noise,
             horizon=self.horizon,
             observe=_activations if has_activations else None,
+            gradient=self.gradient,
         )
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
         activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))

@@ -1,5 +1,5 @@
 """One step that can be differentiated."""
 
-from mjxgrad.dynamics.step import forward, solve, step
+from mjxgrad.dynamics.step import Gradient, check_gradient, forward, solve, step
 
-__all__ = ["forward", "solve", "step"]
+__all__ = ["Gradient", "check_gradient", "forward", "solve", "step"]

@@ -38,29 +38,55 @@ def row_layout(model: mjx.Model, data: mjx.Data) -> RowLayout:
     return RowLayout(int(impl.ne), int(impl.nf), int(impl.nefc), tuple(cones))
 
 
-def make_constraint(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill the `efc_` fields; a drop-in for `mjx.make_constraint`."""
-    blocks = [block for block in _blocks(model, data) if block is not None]
+def gather(model: mjx.Model, data: mjx.Data) -> list[Block]:
+    """Return the rows of a state, kind by kind in MuJoCo's order, also those that are inactive."""
+    return [block for block in _blocks(model, data) if block is not None]
+
+
+def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None = None) -> mjx.Data:
+    """Fill the `efc_` fields; a drop-in for `mjx.make_constraint`.
+
+    Args:
+        model: with the solver's options.
+        data: with contacts, positions and velocities.
+        blocks: its rows, if they are at hand; otherwise they are gathered.
+    """
+    blocks = gather(model, data) if blocks is None else blocks
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
         fields = dict.fromkeys(("D", "aref", "frictionloss", "pos", "margin"), empty)
         fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)  # pyright: ignore[reportArgumentType]
     else:
-        block = jax.tree.map(lambda *x: jnp.concatenate(x), *blocks)
-        jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
+        block = joined(blocks)
         residual = jnp.where(block.is_active, block.residual, 0.0)
-        stiffness, damping = _stiffness_damping(model, block)
-        impedance = block.impedance[:, 0]
-        weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
+        jacobian, reference, weight = law(model, data.qvel, block)
         fields = {
             "J": jacobian,
             "D": weight,
-            "aref": -damping * (jacobian @ data.qvel) - stiffness * impedance * residual,
+            "aref": reference,
             "frictionloss": block.friction_loss,
             "pos": residual + block.margin,
             "margin": block.margin,
         }
     return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})  # pyright: ignore[reportReturnType]
+
+
+def joined(blocks: list[Block]) -> Block:
+    """Return all rows as one block; which of them begin and end together it no longer says."""
+    leaves = [jnp.concatenate(x) for x in zip(*(jax.tree.leaves(block) for block in blocks), strict=True)]
+    return Block(*leaves)
+
+
+def law(
+    model: mjx.Model, qvel: Float[Array, " nv"], block: Block
+) -> tuple[Float[Array, "rows nv"], Float[Array, " rows"], Float[Array, " rows"]]:
+    """Return Jacobian, a_ref and weight D of rows; those of inactive rows are zero, zero and of no effect."""
+    jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
+    residual = jnp.where(block.is_active, block.residual, 0.0)
+    stiffness, damping = _stiffness_damping(model, block)
+    impedance = block.impedance[:, 0]
+    weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
+    return jacobian, -damping * (jacobian @ qvel) - stiffness * impedance * residual, weight
 
 
 def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> Rows:

@@ -60,6 +60,8 @@ def _pyramids(
         margin=spread(contact.includemargin),
         friction_loss=jnp.zeros_like(residual),
         is_active=residual < 0,
+        rows_each=each,
+        is_pyramid=True,
     )
 
 
@@ -94,6 +96,7 @@ def _cones(
         margin=spread(contact.includemargin),
         friction_loss=jnp.zeros(count * dim, distance.dtype),
         is_active=spread(distance < 0),
+        rows_each=dim,
     )
 
 

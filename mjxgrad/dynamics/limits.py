@@ -55,6 +55,7 @@ def _limit(
         margin,
         zero,
         residual < 0,
+        rows_each=1,
     )
 
 

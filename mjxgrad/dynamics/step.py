@@ -11,6 +11,7 @@ Matrix products ask for full precision, since NVIDIA GPUs otherwise round their 
 
 import functools
 from collections.abc import Callable
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,8 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, forces, implicit, linear, smooth
+from mjxgrad.dynamics import assembly, events, forces, implicit, linear, smooth
+from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.newton import Problem
@@ -26,45 +28,61 @@ from mjxgrad.dynamics.newton import Problem
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
+Gradient = Literal["discrete", "event"]
+
 
 def _at_full_precision(function: Callable[..., mjx.Data]) -> Callable[..., mjx.Data]:
     @functools.wraps(function)
-    def wrapped(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    def wrapped(model: mjx.Model, data: mjx.Data, **settings: Any) -> mjx.Data:
         if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
             raise ValueError(
                 "model and data must be of MJX's JAX implementation, got "
                 f"{model.impl} and {data.impl}: create them with impl='jax'"
             )
         with jax.default_matmul_precision("highest"):
-            return function(model, data)
+            return function(model, data, **settings)
 
     return wrapped
 
 
+def check_gradient(gradient: str) -> None:
+    """Refuse the name of a gradient that there is not.
+
+    Raises:
+        ValueError: naming those that there are.
+    """
+    if gradient not in get_args(Gradient):
+        raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
+
+
 @_at_full_precision
-def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def step(model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete") -> mjx.Data:
     """Advance the state by one time step.
 
     Args:
         model: any model of MJX's JAX implementation; Euler, implicitfast or RK4.
         data: the present state, controls and applied forces.
+        gradient: "discrete", the exact derivative of the simulated map, or "event", which adds what that one does not
+            see, that the time of a contact's or limit's beginning and end moves; see `dynamics.events`. The step itself
+            is the same.
 
     Returns:
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
         them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX.
+        ValueError: if `model` or `data` belong to another implementation of MJX, or there is no such gradient.
         NotImplementedError: if MJX lacks the integrator.
     """
+    check_gradient(gradient)
     integrator = model.opt.integrator
     if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data)
-    data = forward(model, data)
+        return _runge_kutta(model, data, gradient)
+    data, moving = _forward(model, data, gradient)
     if integrator == _Integrator.mjINT_EULER:
-        return _advance(model, data, _euler_acceleration(model, data), None)
+        return _advance(model, data, _euler_acceleration(model, moving), None)
     if integrator == _Integrator.mjINT_IMPLICITFAST:
-        return _advance(model, data, _implicit_acceleration(model, data), None)
+        return _advance(model, data, _implicit_acceleration(model, moving), None)
     raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>")
 
 
@@ -82,11 +100,22 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX.
     """
-    data = _smooth(model, data)
+    return _forward(model, data, "discrete")[0]
+
+
+def _forward(model: mjx.Model, data: mjx.Data, gradient: Gradient) -> tuple[mjx.Data, mjx.Data]:
+    """Return the data, and the same with the derivatives by which the state is to move.
+
+    They differ only in the tangents of acceleration and constraint force: a reader of either wants the derivative of what
+    he reads, not the impulse by which a moving event acts on the motion.
+    """
+    data, blocks = _smooth(model, data)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     data = solve(model, data)
-    return mjx.sensor_acc(model, data) if model.nsensor else data
+    if model.nsensor:
+        data = mjx.sensor_acc(model, data)
+    return data, events.correct(model, data, blocks) if gradient == "event" else data
 
 
 @_at_full_precision
@@ -131,7 +160,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     )
 
 
-def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     """Run the stages up to the unconstrained acceleration; tendons, cameras and collisions are MJX's."""
     data = smooth.com_pos(model, smooth.kinematics(model, data))
     data = mjx.camlight(model, data)
@@ -142,11 +171,12 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = collide(model, data)
-    data = assembly.make_constraint(model, data)
+    blocks = assembly.gather(model, data)
+    data = assembly.make_constraint(model, data, blocks)
     if model.nu:
         data = forces.transmission(model, data)
     data = forces.fwd_velocity(model, data)
-    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data))
+    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -182,7 +212,7 @@ def _advance(
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _runge_kutta(model: mjx.Model, start: mjx.Data) -> mjx.Data:
+def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient) -> mjx.Data:
     """Advance by the classical fourth-order rule.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
@@ -200,8 +230,8 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data) -> mjx.Data:
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data = forward(model, data)
-        rates = (data.qvel, data.qacc, data.act_dot)
+        data, moving = _forward(model, data, gradient)
+        rates = (data.qvel, moving.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
         return (rates, sums, data.qacc), data
 

@@ -8,11 +8,14 @@ References:
     arXiv:2202.00817, figure 2 (there in closed form).
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjxgrad.dynamics import Gradient, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
@@ -32,12 +35,23 @@ class BallWall(eqx.Module):
         speed: of the throw, in m/s.
         target: where the ball should end, in m from the start.
         horizon: number of steps; long enough for the ball to land and stop.
+        gradient: of each step, "discrete" or "event"; see `mjxgrad.step`.
     """
 
     scene: Scene
     speed: Float[Array, ""]
     target: Float[Array, ""]
     horizon: int = eqx.field(static=True)
+    gradient: Gradient = eqx.field(static=True, default="discrete")
+
+    def with_gradient(self, gradient: Gradient) -> "BallWall":
+        """Give the same throw with another derivative of its steps.
+
+        Raises:
+            ValueError: if there is no such gradient.
+        """
+        check_gradient(gradient)
+        return dataclasses.replace(self, gradient=gradient)
 
     def with_softness(self, softness: Softness) -> "BallWall":
         """Give the same throw with other contact softness."""
@@ -56,7 +70,9 @@ class BallWall(eqx.Module):
         is_free = self.scene.model.nv == 6
         qvel = jnp.concatenate([velocity, jnp.zeros(3)]) if is_free else velocity[jnp.array([0, 2])]
         dtype = self.scene.data.qvel.dtype
-        return rollout(self.scene, initial_state(self.scene, qvel=qvel.astype(dtype)), horizon=self.horizon)
+        return rollout(
+            self.scene, initial_state(self.scene, qvel=qvel.astype(dtype)), horizon=self.horizon, gradient=self.gradient
+        )
 
     def end(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
         """Give how far from the start the ball ends, in m; NaN if the rollout diverged."""
