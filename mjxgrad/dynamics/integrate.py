@@ -1,5 +1,6 @@
 """Positions moved along velocities, joint by joint."""
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,6 +30,23 @@ def integrate_position(
     quaternions = qpos[turning[:, :1] + np.arange(4)]
     turned = rotation.integrate(quaternions, duration * qvel[turning[:, 1:] + np.arange(3)])
     return moved.at[turning[:, :1] + np.arange(4)].set(turned)
+
+
+def position_change(model: mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Return the velocity that moves one position to another in unit time; the inverse of `integrate_position`.
+
+    Args:
+        model: gives the joints.
+        start: a position (m, rad, unit quaternions).
+        end: another; of the two turns between quaternions the shorter is taken.
+    """
+    turning, first, dofs = _addresses(model)
+    if not turning.size:
+        return end - start
+    quaternions = turning[:, :1] + np.arange(4)
+    turned = rotation.logarithm(rotation.multiply(rotation.conjugate(start[quaternions]), end[quaternions]))
+    change = jnp.zeros(model.nv, start.dtype).at[dofs].set((end - start)[first])
+    return change.at[turning[:, 1:] + np.arange(3)].set(turned)
 
 
 def _addresses(model: mjx.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
