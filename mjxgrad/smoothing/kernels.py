@@ -1,0 +1,132 @@
+r"""Noise whose average over a contact has a closed form, and the barrier that each stands for.
+
+A contact pushes like the ramp $\max(-r, 0)$ of its distance $r$. Noise $w$ of density $\rho$ on the distance makes of it
+
+$$S(r) = \mathbb{E} \max(-r - w, 0), \qquad S'(r) = -P(w < -r), \qquad S''(r) = \rho(r),$$
+
+so that a kernel is given as well by its density as by its softened ramp, the profile of its force at a distance.
+
+All three are even and in units of the *length*, the standard deviation of the Gaussian. The others are scaled to its mean $|w|$,
+$\sqrt{2/\pi}$, and with that to the same push at the surface, $S(0) = \mathbb{E}|w| / 2$. Standard deviations could not be
+matched, since that of the log barrier is infinite.
+
+| kernel | softened ramp | density | standard deviation |
+|---|---|---|---|
+| `gaussian` | $\varphi(r) - r\,\Phi(-r)$ | normal | 1 |
+| `logistic` | $b\,\mathrm{softplus}(-r/b)$, $b = 0.576$ | logistic | $\pi b / \sqrt 3 = 1.044$ |
+| `log_barrier` | $(-r + \sqrt{r^2 + 4/\kappa}) / 2$, $\kappa = 2\pi$ | Student's t, 2 degrees of freedom | infinite |
+
+The name of the last: the ramp is the $f$ that minimises $f^2/2 + fr$ over $f \ge 0$, and with the barrier $-\log(f)/\kappa$
+in place of the bound the minimiser is this $S(r)$. Its force falls off as $1/r$: it reaches everything in the scene.
+
+References:
+    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact
+    Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing, and the log barrier as analytic one).
+"""
+
+import abc
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# The mean of |w| that all kernels share.
+_MEAN_SIZE = math.sqrt(2 / math.pi)
+_LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
+# 4/κ, the square of twice the softened ramp at zero.
+_BARRIER_SQUARE = _MEAN_SIZE**2
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel(abc.ABC):
+    """A density of noise with the averages of a contact under it. Distances are in units of the length.
+
+    Static and hashable: which kernel it is shapes the compiled program.
+
+    Attributes:
+        reach: distance beyond which `share` may leave the range of single precision; what is left there is below 1e-14 of
+            a contact.
+        stddev: standard deviation.
+    """
+
+    reach: float
+    stddev: float
+
+    @abc.abstractmethod
+    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        r"""Return the mean push, $\mathbb{E} \max(-r - w, 0)$."""
+
+    @abc.abstractmethod
+    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return the probability of contact, that r + w is negative."""
+
+    @abc.abstractmethod
+    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return the density of the noise, the derivative of `share` but for its sign."""
+
+    def depth(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return the mean penetration, given that there is contact."""
+        near = jnp.minimum(distance, self.reach)
+        return self.ramp(near) / self.share(near)
+
+
+class Gaussian(Kernel):
+    """Normal noise."""
+
+    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return φ(r) - r Φ(-r)."""
+        # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times r².
+        near = jnp.minimum(distance, 4 * self.reach)
+        return self.density(near) - near * self.share(near)
+
+    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return Φ(-r)."""
+        return 0.5 * jax.lax.erfc(distance * math.sqrt(0.5))
+
+    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return φ(w)."""
+        return jnp.exp(-0.5 * noise**2) / math.sqrt(2 * math.pi)
+
+
+class Logistic(Kernel):
+    """Noise with the logistic distribution."""
+
+    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return b softplus(-r/b)."""
+        return _LOGISTIC_SCALE * jax.nn.softplus(-distance / _LOGISTIC_SCALE)
+
+    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return 1 / (1 + exp(r/b))."""
+        return jax.nn.sigmoid(-distance / _LOGISTIC_SCALE)
+
+    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return share (1 - share) / b."""
+        return self.share(noise) * self.share(-noise) / _LOGISTIC_SCALE
+
+
+class LogBarrier(Kernel):
+    """Noise with Student's t distribution of two degrees of freedom, which is what a log barrier averages over."""
+
+    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return (-r + √(r² + 4/κ)) / 2, written so that nothing cancels."""
+        root = jnp.sqrt(distance**2 + _BARRIER_SQUARE)
+        is_far = distance > 0
+        return jnp.where(is_far, 0.5 * _BARRIER_SQUARE / (root + jnp.abs(distance)), 0.5 * (root - distance))
+
+    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return S(r) / √(r² + 4/κ)."""
+        return self.ramp(distance) / jnp.sqrt(distance**2 + _BARRIER_SQUARE)
+
+    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Return 2√κ / (4 + κ w²)^(3/2)."""
+        root = jnp.sqrt(noise**2 + _BARRIER_SQUARE)
+        return 0.5 * _BARRIER_SQUARE / root / root / root
+
+
+KERNELS: dict[str, Kernel] = {
+    "gaussian": Gaussian(reach=7.6, stddev=1.0),
+    "logistic": Logistic(reach=18.0, stddev=math.pi * _LOGISTIC_SCALE / math.sqrt(3)),
+    "log_barrier": LogBarrier(reach=1e7, stddev=math.inf),
+}
