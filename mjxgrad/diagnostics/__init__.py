@@ -5,6 +5,7 @@ from mjxgrad.diagnostics.budget import Rollouts, Seconds
 from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.reference import Landscape
+from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.statistics import (
     bias_interval,
     binomial_bound,
@@ -23,6 +24,7 @@ __all__ = [
     "Landscape",
     "Rollouts",
     "Seconds",
+    "SlopeComparison",
     "VarianceInterval",
     "bias_interval",
     "bias_variance",
@@ -31,9 +33,12 @@ __all__ = [
     "bootstrap_variance_interval",
     "chi_square_variance_interval",
     "compare",
+    "compare_to_slope",
+    "derivative_against_slope",
     "empirical_bias",
     "first_order_samples",
     "mean_interval",
+    "phases",
     "root_mean_square_interval",
     "variance_interval",
 ]

@@ -11,6 +11,7 @@ References:
     arXiv:2202.00817, section 3 and figure 2.
 """
 
+from mjxgrad.tasks.textbook.bounce import Bounce, bounce_scene, integrated_restitution
 from mjxgrad.tasks.textbook.problem import Textbook
 from mjxgrad.tasks.textbook.sine import QuadraticSine, quadratic_sine
 from mjxgrad.tasks.textbook.step import Heaviside, SoftHeaviside, heaviside, soft_heaviside
@@ -18,12 +19,15 @@ from mjxgrad.tasks.textbook.throw import BallOverWall, ball_over_wall
 
 __all__ = [
     "BallOverWall",
+    "Bounce",
     "Heaviside",
     "QuadraticSine",
     "SoftHeaviside",
     "Textbook",
     "ball_over_wall",
+    "bounce_scene",
     "heaviside",
+    "integrated_restitution",
     "quadratic_sine",
     "soft_heaviside",
 ]
