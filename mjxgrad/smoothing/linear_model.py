@@ -4,19 +4,19 @@ Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \oper
 
     E f(x + dx + w_x, u + du + w_u)  ≈  c + A dx + B du.
 
-Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space. Across a
-contact the mean is smooth even where f is not: before a touch, A and B already know what a push will do.
+Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
+Across a contact the mean is smooth even where f is not: before a touch, A and B already know what a push will do.
 
 Three ways to the same model: `first_order` averages Jacobians and misses what they do not see (a jump of f; under
-`gradient="discrete"` the moving time of an impact); `zeroth_order` fits a plane to samples of f and misses nothing, at the price of
-noise; `analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the distance of
-contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it agrees with the
-others as far as a contact's impedance is small against one.
+`gradient="discrete"` the moving time of an impact); `zeroth_order` fits a plane to samples of f and misses nothing, at the
+price of noise; `analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
+distance of contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it
+agrees with the others as far as a contact's impedance is small against one.
 
 References:
-    Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143 (first and zeroth order).
-    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact Models.
-    T-RO 2023, arXiv:2206.10787 (analytic, section III).
+    Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
+    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact
+    Models. T-RO 2023, arXiv:2206.10787 (the analytic way).
 """
 
 import equinox as eqx

@@ -53,7 +53,8 @@ class System(eqx.Module):
             ValueError: if the system has no contacts to smooth.
         """
         raise ValueError(
-            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: take samples, by first_order or zeroth_order"
+            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: "
+            "take samples, by first_order or zeroth_order"
         )
 
 
