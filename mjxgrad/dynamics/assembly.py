@@ -83,7 +83,7 @@ def law(
     """Return Jacobian, a_ref and weight D of rows; those of inactive rows are zero, zero and of no effect."""
     jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
     residual = jnp.where(block.is_active, block.residual, 0.0)
-    stiffness, damping = _stiffness_damping(model, block)
+    stiffness, damping = stiffness_damping(model, block)
     impedance = block.impedance[:, 0]
     weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
     return jacobian, -damping * (jacobian @ qvel) - stiffness * impedance * residual, weight
@@ -116,7 +116,7 @@ def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     return blocks
 
 
-def _stiffness_damping(model: mjx.Model, block: Block) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+def stiffness_damping(model: mjx.Model, block: Block) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
     """Return K and B of each row.
 
     Each format is evaluated on numbers that are its own, so that no infinity of the other enters the derivative. Under

@@ -8,58 +8,93 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, implicit, linear
+from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.constraint import RowLayout
 from mjxgrad.dynamics.newton import Problem
 
 _SLOWEST = 1e-3
 
 
-class _Groups(eqx.Module):
-    """Rows that begin and end together, of all kinds; g counts groups, rows those of the whole problem."""
+class _Situation(eqx.Module):
+    """A state with this step's events all at r = 0, in contact; rows of the whole problem.
 
-    distance: Float[Array, " g"]
-    normal: Float[Array, "g nv"]
-
-
-class _Events(eqx.Module):
-    """All that the derivative needs of this step's events."""
+    Attributes:
+        problem: whose minimum is the acceleration.
+        damping: B of each row (1/s), zero where the row does not act after the event.
+        is_event: whether the row begins or ends in this step.
+        rate: by how much an event comes later per distance, over the time that its force acts for (1/m, or s/m).
+        start: acceleration to start from.
+        tolerance: of the solve.
+    """
 
     problem: Problem
-    rate: Float[Array, " rows"]
+    damping: Float[Array, " rows"]
     is_event: Bool[Array, " rows"]
+    rate: Float[Array, " rows"]
+    start: Float[Array, " nv"]
+    tolerance: Float[Array, ""]
 
 
 def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
-    """Return data whose acceleration has the derivative of this step's events; its value stays."""
+    """Return data whose acceleration and constraint force have the tangent of a semi-implicit step's events."""
     if not any(block.rows_each for block in blocks):
         return data
-    layout = assembly.row_layout(model, data)
-    groups = _groups(blocks)
-    speed = groups.normal @ data.qvel
+    distance, normal = _groups(blocks)
+    speed = normal @ data.qvel
+    moved = model.opt.timestep * speed
+    begins = (distance < 0) & (distance - moved >= 0) & (speed < -_SLOWEST)
+    ends = (distance >= 0) & (distance - moved < 0) & (speed > _SLOWEST)
+    situation = _situation(model, data, data.qvel, blocks, (begins, ends), jnp.abs(moved))
+    change = _saltation(assembly.row_layout(model, data), _limits(model, None), situation, _spread(blocks, distance))
+    return data.replace(qacc=data.qacc + change, qfrc_constraint=data.qfrc_constraint + situation.problem.mass @ change)
+
+
+def impulse(
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
+    """Return a velocity of value zero with the tangent of the events between two states, for Runge-Kutta steps.
+
+    Args:
+        model: gives the time step.
+        data: of the state before.
+        blocks: of the state before.
+        mean_velocity: displacement over the step, divided by the time step.
+    """
+    if not any(block.rows_each for block in blocks):
+        return jnp.zeros_like(data.qvel)
     h = model.opt.timestep
-    before = groups.distance - h * speed
-    begins = (groups.distance < 0) & (before >= 0) & (speed < -_SLOWEST)
-    ends = (groups.distance >= 0) & (before < 0) & (speed > _SLOWEST)
+    distance, normal = _groups(blocks)
+    after = distance + h * (normal @ mean_velocity)
+    velocity = data.qvel + 0.5 * h * data.qacc
+    speed = normal @ velocity
+    begins = (distance >= 0) & (after < 0) & (speed < -_SLOWEST)
+    ends = (distance < 0) & (after >= 0) & (speed > _SLOWEST)
+    situation = _situation(model, data, velocity, blocks, (begins, ends), jnp.abs(speed))
+    layout = assembly.row_layout(model, data)
+    return _saltation(layout, _limits(model, 0.5), situation, _spread(blocks, distance))
+
+
+def _limits(model, share):
+    return int(model.opt.iterations), share
+
+
+def _situation(model, data, velocity, blocks, events, scale) -> _Situation:
+    begins, ends = events
     happens = begins | ends
-    rate = jnp.where(happens, 1 / (h * jnp.where(happens, jnp.abs(speed), 1.0)), 0.0)
-    spread = functools.partial(_spread, blocks)
-    is_event = spread(happens)
+    rate = jnp.where(happens, 1 / jnp.where(happens, scale, 1.0), 0.0)
+    is_event = _spread(blocks, happens)
     touching = _touching(assembly.joined(blocks), is_event)
-    jacobian, reference, weight = assembly.law(model, data.qvel, touching)
-    rows = eqx.tree_at(lambda r: (r.reference, r.weight), assembly.rows_of(model, data, layout), (reference, weight))
+    jacobian, reference, weight = assembly.law(model, velocity, touching)
+    rows = assembly.rows_of(model, data, assembly.row_layout(model, data))
+    rows = eqx.tree_at(lambda r: (r.reference, r.weight), rows, (reference, weight))
     problem = Problem(mjx.full_m(model, data), data.qfrc_smooth, jacobian, rows)
-    events = _Events(problem, spread(rate), is_event)
-    settings = (data.qacc, jnp.asarray(model.opt.tolerance, data.qacc.dtype))
-    still = jax.lax.stop_gradient((events, settings))
-    qacc, force = _attach(
-        layout, int(model.opt.iterations), (data.qacc, data.qfrc_constraint), spread(groups.distance), *still
-    )
-    return data.replace(qacc=qacc, qfrc_constraint=force)
+    damping = jnp.where(_spread(blocks, ends), 0.0, model.opt.timestep * assembly.stiffness_damping(model, touching)[1])
+    tolerance = jnp.asarray(model.opt.tolerance, velocity.dtype)
+    return _Situation(problem, damping, is_event, _spread(blocks, rate), data.qacc, tolerance)
 
 
-def _groups(blocks: list[Block]) -> _Groups:
+def _groups(blocks: list[Block]) -> tuple[Float[Array, " groups"], Float[Array, "groups nv"]]:
+    """Return distance and normal row of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
         if not block.rows_each:
@@ -67,7 +102,7 @@ def _groups(blocks: list[Block]) -> _Groups:
         jacobian = block.jacobian.reshape(-1, block.rows_each, block.jacobian.shape[1])
         distance.append(block.residual[:: block.rows_each])
         normal.append(jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0])
-    return _Groups(jnp.concatenate(distance), jnp.concatenate(normal))
+    return jnp.concatenate(distance), jnp.concatenate(normal)
 
 
 def _spread(blocks: list[Block], values: Array) -> Array:
@@ -98,21 +133,27 @@ def _touching(block: Block, is_event: Bool[Array, " rows"]) -> Block:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _attach(layout: RowLayout, max_iterations: int, motion, distance, events: _Events, settings):
-    return motion
+def _saltation(layout, limits, situation: _Situation, distance: Float[Array, " rows"]) -> Float[Array, " nv"]:
+    """Return zero, whose tangent is the response of the motion to the force that a later event leaves out."""
+    return jnp.zeros_like(situation.start)
 
 
-@_attach.defjvp
-def _attach_jvp(layout, max_iterations, primals, tangents):
-    motion, _, events, (start, tolerance) = primals
-    problem = events.problem
-    acceleration = implicit.solve(layout, max_iterations, problem, start, tolerance)
+@_saltation.defjvp
+def _saltation_jvp(layout, limits, primals, tangents):
+    situation, _ = primals
+    max_iterations, share = limits
+    problem, is_event = situation.problem, situation.is_event
+    acceleration = implicit.solve(layout, max_iterations, problem, situation.start, situation.tolerance)
     point = problem.at(layout, acceleration)
-    quiet = jnp.where(events.is_event, 0.0, problem.rows.weight)
-    others = eqx.tree_at(lambda p: p.rows.weight, problem, quiet)
-    response = others.hessian(layout, point.x)
-    late = jnp.where(events.is_event, point.row_force * events.rate, 0.0)
-    lost = problem.jacobian.T @ (late * tangents[1])
-    change = -linear.solve_positive_definite(response, lost)
-    moved = (tangents[0][0] + change, tangents[0][1] + problem.mass @ change)
-    return motion, moved
+    quiet = eqx.tree_at(lambda p: p.rows.weight, problem, jnp.where(is_event, 0.0, problem.rows.weight))
+    response = quiet.hessian(layout, point.x)
+    late = jnp.where(is_event, point.row_force * situation.rate, 0.0)
+    change = -linear.solve_positive_definite(response, problem.jacobian.T @ (late * tangents[1]))
+    if share is not None:
+        full = problem.hessian(layout, point.x)
+        damped = constraint.curvature_product(
+            layout, problem.rows, point.x, situation.damping[:, None] * problem.jacobian
+        )
+        slowed = full + share * problem.jacobian.T @ damped
+        change = jnp.linalg.solve(slowed, full @ change)
+    return jnp.zeros_like(situation.start), change

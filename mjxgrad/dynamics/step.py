@@ -78,7 +78,8 @@ def step(model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete") -
     integrator = model.opt.integrator
     if integrator == _Integrator.mjINT_RK4:
         return _runge_kutta(model, data, gradient)
-    data, moving = _forward(model, data, gradient)
+    data, blocks = _forward(model, data)
+    moving = events.correct(model, data, blocks) if gradient == "event" else data
     if integrator == _Integrator.mjINT_EULER:
         return _advance(model, data, _euler_acceleration(model, moving), None)
     if integrator == _Integrator.mjINT_IMPLICITFAST:
@@ -100,22 +101,16 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX.
     """
-    return _forward(model, data, "discrete")[0]
+    return _forward(model, data)[0]
 
 
-def _forward(model: mjx.Model, data: mjx.Data, gradient: Gradient) -> tuple[mjx.Data, mjx.Data]:
-    """Return the data, and the same with the derivatives by which the state is to move.
-
-    They differ only in the tangents of acceleration and constraint force: a reader of either wants the derivative of what
-    he reads, not the impulse by which a moving event acts on the motion.
-    """
+def _forward(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
+    """Return the data, and the constraint rows that went into it."""
     data, blocks = _smooth(model, data)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     data = solve(model, data)
-    if model.nsensor:
-        data = mjx.sensor_acc(model, data)
-    return data, events.correct(model, data, blocks) if gradient == "event" else data
+    return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
 @_at_full_precision
@@ -230,15 +225,23 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient) -> mjx.D
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data, moving = _forward(model, data, gradient)
-        rates = (data.qvel, moving.qacc, data.act_dot)
+        data, blocks = _forward(model, data)
+        rates = (data.qvel, data.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
-        return (rates, sums, data.qacc), data
+        return (rates, sums, data.qacc), (data, blocks if gradient == "event" else None)
 
     tableau = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6)
     tableau = jax.tree.map(lambda x: x.astype(start.qvel.dtype), tableau)
-    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
+    (_, (velocity, acceleration, act_dot), _), (stages, blocks) = jax.lax.scan(
+        stage, (rest, rest, start.qacc_warmstart), tableau
+    )
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )
+    if gradient == "event":
+        first, blocks = jax.tree.map(lambda x: x[0], (stages, blocks))
+        change = events.impulse(model, first, blocks, velocity)
+        acceleration = acceleration + change / h
+        # An event falls on average in the middle of the step.
+        velocity = velocity + 0.5 * change
     return _advance(model, last, acceleration, velocity)
