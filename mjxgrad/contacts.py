@@ -5,11 +5,11 @@ MuJoCo derives the parameters of a contact from those of its two geoms (or of an
 sees is brought here to one form, in which pairs can be compared and swept.
 
 With impedance $d(r)$ rising from $d_0$ at the surface to $d_w$ at penetration `width`, the
-reference acceleration of a contact at distance $r < 0$ is
+reference acceleration of a contact at distance $r < 0$, measured from its margin, is
 $a_\text{ref} = -B v - K d(r) r$ with $K = k / d_w^2$ and $B = b / d_w$. Here $k = \omega_0^2$ is
 the stiffness and $b$ the damping, both per unit of the contact's effective mass: at full
 impedance the contact is the oscillator $\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being
-the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$.
+the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$; `mjxgrad.resting` has other profiles.
 
 References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
@@ -21,9 +21,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._mjx import geom_pairs, mjx
+from mjxgrad.resting import rest_depth
 
 _DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
@@ -61,6 +62,7 @@ class ContactParameters(eqx.Module):
         width: penetration over which the impedance rises, in m.
         friction: two sliding, one torsional (m) and two rolling (m) coefficients.
         margin: distance at which contact begins, in m.
+        pyramid: $c$ of `mjxgrad.resting`, by which the normal direction of a pyramid yields more or less; else 1.
         solref: as MuJoCo mixes it, before `refsafe` and before formats are resolved.
         solimp: as MuJoCo mixes it, before it is clamped.
         timestep: of the model, in s.
@@ -72,6 +74,7 @@ class ContactParameters(eqx.Module):
     width: Float[Array, "*batch pairs"]
     friction: Float[Array, "*batch pairs 5"]
     margin: Float[Array, "*batch pairs"]
+    pyramid: Float[Array, "*batch pairs"]
     solref: Float[Array, "*batch pairs 2"]
     solimp: Float[Array, "*batch pairs 5"]
     timestep: Float[Array, "*batch"]
@@ -97,16 +100,25 @@ class ContactParameters(eqx.Module):
         timestep = self.timestep[..., None]
         return timestep**2 * self.stiffness + 2.0 * timestep * self.damping
 
-    def rest_depth(self, acceleration: float) -> Float[Array, "*batch pairs"]:
-        """Penetration at rest, $(1 - d_w) a_0 / k$, exact for constant impedance.
+    def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
+        """Depth at rest below the distance at which contact begins; $(1 - d_w) a_0 / k$ for constant impedance.
 
         Args:
-            acceleration: $a_0$ at which the bodies would approach without contact, in m/s².
+            acceleration: $a_0$ at which the bodies would approach without contact, in m/s²; for one body on the ground
+                gravity's, for a stack of n alike n times that. See `mjxgrad.resting` for when this is exact.
 
         Returns:
             One depth per pair, in m.
         """
-        return (1.0 - self.impedance[..., 1]) * acceleration / self.stiffness
+        return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
+
+    def rest_distance(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
+        """Distance of the geoms at rest, margin less `rest_depth`: positive where they hover (m).
+
+        Args:
+            acceleration: as for `rest_depth`.
+        """
+        return self.margin - self.rest_depth(acceleration)
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -181,6 +193,7 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
         width=jnp.maximum(solimp[:, 2], mujoco.mjMINVAL),
         friction=friction,
         margin=margin,
+        pyramid=_pyramid_factor(model, pairs, friction[:, 0]),
         solref=solref,
         solimp=solimp,
         timestep=jnp.asarray(model.opt.timestep),
@@ -195,6 +208,14 @@ def _condim(model, geom1, geom2, explicit) -> int:
     if priority1 == priority2:
         return int(max(condim1, condim2))
     return int(condim1 if priority1 > priority2 else condim2)
+
+
+def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: Array) -> Array:
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return jnp.ones_like(friction)
+    condim = np.array([pair.condim for pair in pairs], dtype=int)
+    factor = friction**2 * (1 + friction**2) / (np.maximum(condim - 1, 1) * model.opt.impratio)
+    return jnp.where(condim > 1, factor, 1.0)
 
 
 def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:

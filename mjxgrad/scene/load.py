@@ -85,7 +85,7 @@ def load_scene(
     messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in inexact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
-        messages += softness_warnings(softness, scene.model)
+        messages += softness_warnings(softness, scene.model, mj_model)
     for message in messages + scene.warnings():
         warnings.warn(f"{name}: {message}", SceneWarning, stacklevel=2)
     return scene

@@ -66,7 +66,7 @@ class Scene(eqx.Module):
             ValueError: as `Softness.apply`.
         """
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
-        for message in softness_warnings(softness, scene.model) + scene.warnings():
+        for message in softness_warnings(softness, scene.model, self.mj_model) + scene.warnings():
             # Equinox wraps methods, so the caller is one level further up.
             warnings.warn(f"{self.name}: {message}", SceneWarning, stacklevel=3)
         return scene
