@@ -3,7 +3,7 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -105,7 +105,7 @@ class SceneTask(Task):
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
 
-    def with_gradient(self, gradient: Gradient) -> Self:
+    def with_gradient(self, gradient: Gradient) -> "SceneTask":
         """Give the same task with another derivative of its steps.
 
         Raises:
