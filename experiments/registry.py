@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.config import RunSettings
+from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.report import Report
 from experiments.textbook.settings import TextbookSettings
@@ -34,5 +35,6 @@ class Experiment:
 EXPERIMENTS = {
     "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
+    "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

@@ -31,6 +31,7 @@ _FEWEST_PHASES = 32
 _NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
+_ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
@@ -52,6 +53,7 @@ class SlopeComparison(eqx.Module):
         local_slopes: of the outcome over each quarter of the interval.
         num_teeth: how often the outcome crosses its own trend, halved: about the number of teeth in the interval.
         num_finite: phases at which outcome and derivatives are finite; only these count.
+        resolution: what rounding of the outcome leaves of a slope; smaller errors are none.
     """
 
     gradients: tuple[str, ...] = eqx.field(static=True)
@@ -66,6 +68,7 @@ class SlopeComparison(eqx.Module):
     local_slopes: Float[np.ndarray, "windows *outcome"]
     num_teeth: Float[np.ndarray, "*outcome"]
     num_finite: Int[np.ndarray, "*outcome"]
+    resolution: Float[np.ndarray, "*outcome"]
 
     @property
     def error(self) -> Float[np.ndarray, "gradients *outcome"]:
@@ -80,12 +83,14 @@ class SlopeComparison(eqx.Module):
     @property
     def scale(self) -> Float[np.ndarray, "*outcome"]:
         """What errors are measured by: the larger of the slope and the error of the first derivative named."""
-        return np.maximum(np.abs(self.slope), np.abs(self.error[0]))
+        # Where both are nothing but rounding, no error is to look large beside it.
+        return np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution)
 
     @property
     def relative_error(self) -> Float[np.ndarray, "gradients *outcome"]:
-        """Size of `error` over `scale`; zero where both vanish."""
-        return np.abs(self.error) / np.where(self.scale > 0, self.scale, 1)
+        """Size of `error` beyond rounding, over `scale`."""
+        size = np.abs(self.error)
+        return np.where(size > self.resolution, size, 0 * size) / self.scale
 
     @property
     def irregularity(self) -> Float[np.ndarray, "*outcome"]:
@@ -98,7 +103,8 @@ class SlopeComparison(eqx.Module):
         centred = self.local_slopes - self.local_slopes.mean(axis=0)
         tilt = np.tensordot(place, centred, axes=1) / (place**2).sum()
         rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
-        return np.abs(rest).max(axis=0) / np.where(self.scale > 0, self.scale, 1)
+        size = np.abs(rest).max(axis=0)
+        return np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale
 
     def is_resolved(self, tolerance: float = 0.05) -> Bool[np.ndarray, "*outcome"]:
         """Say where the slope is known well enough to judge by: its standard error is below `tolerance` times `scale`.
@@ -111,7 +117,7 @@ class SlopeComparison(eqx.Module):
         Returns:
             One truth value per outcome; False where numbers are not finite.
         """
-        return self.slope_error <= tolerance * self.scale
+        return self.slope_error <= np.maximum(tolerance * self.scale, self.resolution)
 
 
 def derivative_against_slope(
@@ -192,7 +198,8 @@ def compare_to_slope(
     Raises:
         ValueError: if shapes do not fit, parameters do not increase or there are fewer than 32.
     """
-    x, y = np.asarray(parameters, float), np.asarray(outcomes, float)
+    x, y = np.asarray(parameters, float), np.asarray(outcomes)
+    y, epsilon = y.astype(float), np.finfo(y.dtype if np.issubdtype(y.dtype, np.floating) else float).eps
     slopes = np.array([np.asarray(one, float) for one in derivatives])
     if slopes.shape != (len(gradients), *y.shape) or x.shape != y.shape[:1]:
         raise ValueError(
@@ -222,6 +229,7 @@ def compare_to_slope(
         local_slopes=local_slopes * 2 / width,
         num_teeth=num_teeth,
         num_finite=num_finite.astype(int),
+        resolution=_ROUNDINGS * epsilon * np.maximum(np.abs(y).max(axis=0), np.finfo(float).tiny) / width,
     )
 
 

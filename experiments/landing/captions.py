@@ -1,0 +1,27 @@
+"""What each figure shows and how to read it."""
+
+from experiments.landing.outcome import Outcome
+
+
+def captions(outcome: Outcome) -> dict[str, str]:
+    """Write the captions.
+
+    Args:
+        outcome: the numbers, for what they were made with.
+
+    Returns:
+        By the figure's name.
+    """
+    settings = outcome.settings
+    return {
+        "error": (
+            "One dot per time and coordinate after the first impact, where the slope can be judged by; discs are medians. "
+            "Errors below 10⁻⁴ are drawn there. "
+            f"Left of the dotted line an error is at most {settings.tolerance:.0%}."
+        ),
+        "derivative": (
+            f"Black, slope of the simulated position over {settings.num_phases} starts; colours, means of the derivatives "
+            "at the same starts. Positions and starts are in m or rad. Where the discrete gradient leaves the panel it is cut."
+        ),
+        "next": "As the figure before.",
+    }

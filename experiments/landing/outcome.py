@@ -1,0 +1,139 @@
+"""The numbers of an experiment on impacts, and what follows from them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from experiments.landing.settings import LandingSettings
+from mjxgrad.diagnostics import SlopeComparison
+
+DISCRETE, EVENT = "discrete", "event"
+
+# Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
+_IRREGULAR = 0.5
+
+
+@dataclass(frozen=True)
+class Course:
+    """One motion at one time step.
+
+    Attributes:
+        name: of the case.
+        title: of the case.
+        labels: of what was read.
+        timestep: in s.
+        refinement: by what the motion's own time step was divided.
+        times: of the readings, in s.
+        events: when contacts and limits begin, in the middle of the interval, in s.
+        found: derivatives beside the slope, by time and label.
+        tolerance: of the error.
+    """
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    timestep: float
+    refinement: int
+    times: Float[np.ndarray, " times"]
+    events: Float[np.ndarray, " events"]
+    found: SlopeComparison
+    tolerance: float
+
+    @property
+    def can_judge(self) -> Bool[np.ndarray, "times labels"]:
+        """Where the motion is regular and its slope known well enough to judge derivatives by."""
+        return self.found.is_resolved(self.tolerance) & (self.found.irregularity <= _IRREGULAR)
+
+    @property
+    def has_impact(self) -> Bool[np.ndarray, "times labels"]:
+        """Where an event has come before, in the middle of the interval; earlier both derivatives are exact."""
+        first = self.events.min() if len(self.events) else np.inf
+        return np.broadcast_to((self.times > first)[:, None], self.found.slope.shape)
+
+    def holds(self, gradient: str) -> Bool[np.ndarray, "times labels"]:
+        """Say where a derivative is within the tolerance; only where this can be judged.
+
+        Args:
+            gradient: its name.
+        """
+        row = self.found.gradients.index(gradient)
+        return self.can_judge & (self.found.relative_error[row] <= self.tolerance)
+
+    def share(self, gradient: str) -> tuple[int, int]:
+        """Count comparisons after the first impact that can be judged and hold, and those that can be judged.
+
+        Args:
+            gradient: its name.
+        """
+        judged = self.can_judge & self.has_impact
+        return int((self.holds(gradient) & judged).sum()), int(judged.sum())
+
+    def worst(self, gradient: str) -> float:
+        """Give the largest relative error after the first impact, where it can be judged; NaN where it nowhere can.
+
+        Args:
+            gradient: its name.
+        """
+        row = self.found.gradients.index(gradient)
+        judged = self.can_judge & self.has_impact
+        return float(self.found.relative_error[row][judged].max()) if judged.any() else np.nan
+
+    def median(self, gradient: str) -> float:
+        """Give the median relative error after the first impact, where it can be judged; NaN where it nowhere can.
+
+        Args:
+            gradient: its name.
+        """
+        row = self.found.gradients.index(gradient)
+        judged = self.can_judge & self.has_impact
+        return float(np.median(self.found.relative_error[row][judged])) if judged.any() else np.nan
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured.
+
+    Attributes:
+        settings: of the run.
+        courses: by case, and within it by refinement.
+    """
+
+    settings: LandingSettings
+    courses: list[list[Course]]
+
+    @property
+    def all(self) -> list[Course]:
+        """Every course."""
+        return [course for group in self.courses for course in group]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per course, time and label, for metrics.csv."""
+        rows = []
+        for course in self.all:
+            found = course.found
+            for i, j in np.ndindex(found.slope.shape):
+                rows.append(
+                    {
+                        "case": course.name,
+                        "timestep": course.timestep,
+                        "time": float(course.times[i]),
+                        "outcome": course.labels[j],
+                        "slope": float(found.slope[i, j]),
+                        "slope_error": float(found.slope_error[i, j]),
+                        "irregularity": float(found.irregularity[i, j]),
+                        "can_judge": bool(course.can_judge[i, j]),
+                        **{
+                            f"{name}{suffix}": float(values[row, i, j])
+                            for row, name in enumerate(found.gradients)
+                            for suffix, values in (
+                                ("", found.mean),
+                                ("_error", found.mean_error),
+                                ("_spread", found.spread),
+                                ("_relative_error", found.relative_error),
+                            )
+                        },
+                    }
+                )
+        return rows

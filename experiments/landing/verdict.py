@@ -1,0 +1,107 @@
+"""The answer of an experiment on impacts in words, computed from its numbers."""
+
+import numpy as np
+
+from experiments.landing.outcome import DISCRETE, EVENT, Course, Outcome
+from experiments.report import Table
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say where the event gradient is the slope.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        A few sentences.
+    """
+    event, discrete = _total(outcome, EVENT), _total(outcome, DISCRETE)
+    if not event[1]:
+        return "No slope is known well enough to judge a derivative by: take more phases, or a shorter motion."
+    percent = f"{outcome.settings.tolerance:.0%}"
+    sentences = [
+        f"After the first impact the event gradient is within {percent} at {event[0]} of {event[1]} times and coordinates, "
+        f"the discrete one at {discrete[0]}."
+    ]
+    failing = [course for course in outcome.all if course.share(EVENT)[0] < course.share(EVENT)[1]]
+    if not failing:
+        return " ".join([*sentences, "It holds in every motion, at every time step."])
+    listed = [f"{_name(c)} ({c.share(EVENT)[1] - c.share(EVENT)[0]} of {c.share(EVENT)[1]})" for c in failing]
+    return " ".join([*sentences, f"It is farther off in {', '.join(listed)}."])
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Single findings, one sentence each.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        One for each motion at its own time step, and what cannot be judged.
+    """
+    sentences = []
+    for course in outcome.all:
+        found, judged = course.found, course.can_judge & course.has_impact
+        if not judged.any():
+            continue
+        row = found.gradients.index(DISCRETE)
+        ratio = np.where(judged, np.abs(found.error[row]), -1)
+        i, j = np.unravel_index(np.argmax(ratio), ratio.shape)
+        values = found.slope[i, j], *(found.mean[found.gradients.index(name), i, j] for name in (DISCRETE, EVENT))
+        slope, discrete, event = (f"{value:.3g}".replace("-", "−") for value in values)
+        sentences.append(
+            f"{_name(course)}: the discrete gradient is farthest off at {course.times[i]:.2f} s, {course.labels[j]}: "
+            f"{discrete} where the slope is {slope}; the event gradient says {event}."
+        )
+    lost = [course for course in outcome.all if not (course.can_judge | ~course.has_impact).all()]
+    if lost:
+        parts = [f"{_name(c)} ({int((~c.can_judge & c.has_impact).sum())} of {c.has_impact.sum()})" for c in lost]
+        sentences.append(
+            f"Where the slope is too uncertain, by chaos or too few phases, nothing is judged: {', '.join(parts)}."
+        )
+    return sentences
+
+
+def table(outcome: Outcome) -> Table:
+    """Tabulate the errors of both derivatives by motion and time step."""
+    rows, emphasised = [], set()
+    for course in outcome.all:
+        if course.share(EVENT)[0] < course.share(EVENT)[1]:
+            emphasised.add((len(rows), 5))
+        rows.append(
+            [
+                course.title,
+                f"{1e3 * course.timestep:g}",
+                f"{len(course.events)}",
+                *(_errors(course, name) for name in (DISCRETE, EVENT)),
+                "{} of {}".format(*course.share(EVENT)),
+                "{} of {}".format(*course.share(DISCRETE)),
+            ]
+        )
+    percent = f"{outcome.settings.tolerance:.0%}"
+    return Table(
+        (
+            "motion", "time step, ms", "contacts and limits that begin", "error, discrete", "error, event",
+            f"event within {percent}", f"discrete within {percent}",
+        ),
+        rows,
+        "Errors as a share of the larger of the slope and the discrete gradient's own error, after the first impact: median "
+        "and largest over times and coordinates. Counts are of those where the slope can be judged by; bold where the event "
+        "gradient is not always within the tolerance.",
+        frozenset(emphasised),
+    )  # fmt: skip
+
+
+def _total(outcome: Outcome, gradient: str) -> tuple[int, int]:
+    shares = np.array([course.share(gradient) for course in outcome.all])
+    return int(shares[:, 0].sum()), int(shares[:, 1].sum())
+
+
+def _errors(course: Course, gradient: str) -> str:
+    if not course.share(gradient)[1]:
+        return "not judged"
+    return f"{course.median(gradient):.1%}, {course.worst(gradient):.1%}"
+
+
+def _name(course: Course) -> str:
+    return f"{course.title} at {1e3 * course.timestep:g} ms"
