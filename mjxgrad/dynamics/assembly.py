@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import contact, equality, limits
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.constraint import ConeGroup, RowLayout, Rows
+from mjxgrad.dynamics.constraint import ConeGroup, Noise, RowLayout, Rows
 
 _CONDIMS = (1, 3, 4, 6)
 
@@ -89,7 +89,7 @@ def law(
     return jacobian, -damping * (jacobian @ qvel) - stiffness * impedance * residual, weight
 
 
-def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> Rows:
+def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout, noise: Noise | None = None) -> Rows:
     """Return the parameters of the rows' laws from assembled data."""
     impl, scales = data._impl, []
     for group in layout.cones:
@@ -97,7 +97,7 @@ def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> Rows:
         friction = friction[:, : group.dim - 1]
         mu = friction[:, :1] / jnp.sqrt(model.opt.impratio)
         scales.append(jnp.concatenate([mu, friction], axis=1))
-    return Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, tuple(scales))
+    return Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, tuple(scales), noise)
 
 
 def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:

@@ -13,6 +13,7 @@ class Block(eqx.Module):
         jacobian: from joint velocities to the rows, also where the row is inactive.
         residual: r in a_ref (m or rad).
         impedance: d(r), and dw and d0, its values from the width on and at r = 0.
+        solimp: what the impedance follows from.
         inverse_weight: Â, inverse inertia (1/kg).
         solref: stiffness and damping in MuJoCo's formats.
         margin: distance at which the row begins (m or rad).
@@ -20,18 +21,21 @@ class Block(eqx.Module):
         is_active: whether the row takes part.
         rows_each: how many consecutive rows begin and end together, those of a contact or of a limit; 0 if none ever does.
         is_pyramid: whether these are the edges of a pyramid, whose mean is the normal row; otherwise the first one is.
+        is_contact: whether these are contacts.
     """
 
     jacobian: Float[Array, "rows nv"]
     residual: Float[Array, " rows"]
     impedance: Float[Array, "rows 3"]
+    solimp: Float[Array, "rows 5"]
     inverse_weight: Float[Array, " rows"]
     solref: Float[Array, "rows 2"]
     margin: Float[Array, " rows"]
     friction_loss: Float[Array, " rows"]
     is_active: Bool[Array, " rows"]
-    rows_each: int = eqx.field(static=True, default=0)
-    is_pyramid: bool = eqx.field(static=True, default=False)
+    rows_each: int = eqx.field(static=True, default=0, kw_only=True)
+    is_pyramid: bool = eqx.field(static=True, default=False, kw_only=True)
+    is_contact: bool = eqx.field(static=True, default=False, kw_only=True)
 
 
 def impedance(solimp: Float[Array, "n 5"], violation: Float[Array, " n"]) -> Float[Array, "n 3"]:

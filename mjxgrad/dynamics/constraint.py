@@ -1,13 +1,24 @@
 r"""Laws of the constraint rows: cost, force and curvature as functions of x = J a - a_ref.
 
-Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope bounded by the loss), then limits and contacts
-(½D min(x, 0)²), where an elliptic contact couples its rows in three zones. With u = (μx₀, f₁x₁, ...), N = u₀, T = |u₁..|:
+Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope bounded by the loss), then limits and
+contacts (½D min(x, 0)²), where an elliptic contact couples its rows in three zones. With u = (μx₀, f₁x₁, ...), N = u₀,
+T = |u₁..|:
 
 - top, N ≥ μT: no cost;
 - bottom, μN + T ≤ 0: ½ Σ D x²;
 - middle: ½ D₀ (N - μT)² / (μ²(1 + μ²)), whose curvature in u is the sum of two positive parts,
   (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
+
+Rows under noise (see `noise`) have the mean of these costs: of x + c w over noise w on the distance, where it makes
+contact. That of ½ min(x, 0)² is convex in x with the derivative -`_mean_push`. For the cone it is as simple, since its
+three zones are the sum of two such terms,
+
+    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
+
+at the top both vanish, in the middle the second does, at the bottom they add up to ½ Σ D x². Noise shifts N by μcw, so
+each term is the simple one with its own spread: exact, whatever the kernel, and convex. At T = 0 the pulls of both
+along the tangent cancel.
 
 Arrays may carry the batch as trailing axes, see `linear`.
 
@@ -23,6 +34,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad.dynamics.linear import sum_of_few
+from mjxgrad.smoothing.kernels import Kernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +58,8 @@ class RowLayout:
     num_friction: int
     num_rows: int
     cones: tuple[ConeGroup, ...] = ()
+    kernel: Kernel | None = None
+    first_noisy: int = 0
 
     @property
     def friction(self) -> slice:
@@ -56,6 +70,23 @@ class RowLayout:
         """End of the rows that stand for themselves."""
         return self.cones[0].start if self.cones else self.num_rows
 
+    @property
+    def hard_stop(self) -> int:
+        """End of the rows among them that have no noise; those from here on have it, cones included."""
+        return self.simple_stop if self.kernel is None else self.first_noisy
+
+
+class Noise(eqx.Module):
+    """What noise on the distance r does to x of a contact's or limit's rows; of cones the first row counts.
+
+    Attributes:
+        spread: by how much x moves if r does by one length of the kernel (m/s² or rad/s²); positive.
+        gate: x at which contact ends by distance alone and not by acceleration; -inf if it never does (m/s² or rad/s²).
+    """
+
+    spread: Float[Array, "rows *batch"]
+    gate: Float[Array, "rows *batch"]
+
 
 class Rows(eqx.Module):
     """Parameters of the constraint rows of one state.
@@ -65,12 +96,14 @@ class Rows(eqx.Module):
         weight: D, the inverse of the regularisation R (kg or kg m²).
         bound: largest force of a friction loss row (N or N m); elsewhere unused.
         scales: per elliptic group (μ, f₁, ..., f_dim-1) of each contact; μ = f₁/√impratio.
+        noise: of the rows, where the layout has a kernel.
     """
 
     reference: Float[Array, "rows *batch"]
     weight: Float[Array, "rows *batch"]
     bound: Float[Array, "rows *batch"]
     scales: tuple[Float[Array, "_ _ *batch"], ...]
+    noise: Noise | None = None
 
 
 class _Cone(eqx.Module):
@@ -107,7 +140,7 @@ def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "co
 
 def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
     """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
-    stop, friction = layout.simple_stop, layout.friction
+    hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
     linear = -rows.weight * x
     bound = rows.bound[friction]
     limit = jnp.sign(x[friction]) * bound
@@ -115,15 +148,17 @@ def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Floa
     parts = [
         linear[: friction.start],
         jnp.where(jnp.abs(linear[friction]) < bound, linear[friction], -limit),
-        jnp.where(x[friction.stop : stop] < 0, linear[friction.stop : stop], 0.0),
+        jnp.where(x[hard] < 0, linear[hard], 0.0),
     ]
+    if layout.kernel is not None:
+        noisy = slice(layout.hard_stop, layout.simple_stop)
+        parts.append(rows.weight[noisy] * _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
     for group, scale in zip(layout.cones, rows.scales, strict=True):
-        cone = _cone(group, rows, scale, x)
-        press = jnp.where(cone.is_middle, -cone.stiffness * cone.gap, 0.0)
-        slide = -(press * scale[:, 0])[:, None] * cone.tangent
-        middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
-        both = jnp.where(cone.is_bottom[:, None], _blocks(group, linear), middle)
-        parts.append(both.reshape(-1, *x.shape[1:]))
+        if layout.kernel is None:
+            block = _cone_force(group, rows, scale, x, linear)
+        else:
+            block = _noisy_cone(layout.kernel, group, rows, scale, x).force()
+        parts.append(block.reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
@@ -134,26 +169,138 @@ def curvature_product(
     matrix: Float[Array, "rows columns *batch"],
 ) -> Float[Array, "rows columns *batch"]:
     """Return the second derivative of the cost with respect to x, times a matrix."""
-    stop, friction = layout.simple_stop, layout.friction
-    weight = rows.weight[:stop]
-    stuck = jnp.abs(weight[friction] * x[friction]) < rows.bound[friction]
+    hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
+    stuck = jnp.abs(rows.weight[friction] * x[friction]) < rows.bound[friction]
     equality = jnp.ones_like(x[: friction.start], bool)
-    is_curved = jnp.concatenate([equality, stuck, x[friction.stop : stop] < 0])
-    parts = [jnp.where(is_curved, weight, 0.0)[:, None] * matrix[:stop]]
+    is_curved = jnp.concatenate([equality, stuck, x[hard] < 0])
+    curvature = jnp.where(is_curved, rows.weight[: layout.hard_stop], 0.0)
+    if layout.kernel is not None:
+        noisy = slice(layout.hard_stop, layout.simple_stop)
+        share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
+        curvature = jnp.concatenate([curvature, rows.weight[noisy] * share])
+    parts = [curvature[:, None] * matrix[: layout.simple_stop]]
     for group, scale in zip(layout.cones, rows.scales, strict=True):
-        cone = _cone(group, rows, scale, x)
         block = _blocks(group, matrix)
-        scaled = scale[:, :, None] * block
-        mu = scale[:, 0]
-        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * cone.tangent], axis=1)
-        ratio = jnp.where(cone.is_middle, -cone.gap / jnp.where(cone.slip > 0, cone.slip, 1.0), 0.0)
-        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
-        slide = sum_of_few(cone.tangent[:, :, None] * scaled[:, 1:])
-        across = scaled[:, 1:] - cone.tangent[:, :, None] * slide
-        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
-        middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)
-        bottom = _blocks(group, rows.weight)[:, :, None] * block
-        zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)
-        both = jnp.where(cone.is_bottom[:, None, None], bottom, zone)
+        if layout.kernel is None:
+            both = _cone_curvature(group, rows, scale, x, block)
+        else:
+            both = _noisy_cone(layout.kernel, group, rows, scale, x).curvature_product(block)
         parts.append(both.reshape(-1, *matrix.shape[1:]))
     return jnp.concatenate(parts, axis=0)
+
+
+def _cone_force(
+    group: ConeGroup,
+    rows: Rows,
+    scale: Float[Array, "contacts dim *batch"],
+    x: Float[Array, "rows *batch"],
+    linear: Float[Array, "rows *batch"],
+) -> Float[Array, "contacts dim *batch"]:
+    cone = _cone(group, rows, scale, x)
+    press = jnp.where(cone.is_middle, -cone.stiffness * cone.gap, 0.0)
+    slide = -(press * scale[:, 0])[:, None] * cone.tangent
+    middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
+    return jnp.where(cone.is_bottom[:, None], _blocks(group, linear), middle)
+
+
+def _cone_curvature(
+    group: ConeGroup,
+    rows: Rows,
+    scale: Float[Array, "contacts dim *batch"],
+    x: Float[Array, "rows *batch"],
+    block: Float[Array, "contacts dim columns *batch"],
+) -> Float[Array, "contacts dim columns *batch"]:
+    cone = _cone(group, rows, scale, x)
+    scaled = scale[:, :, None] * block
+    mu = scale[:, 0]
+    along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * cone.tangent], axis=1)
+    ratio = jnp.where(cone.is_middle, -cone.gap / jnp.where(cone.slip > 0, cone.slip, 1.0), 0.0)
+    first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
+    slide = sum_of_few(cone.tangent[:, :, None] * scaled[:, 1:])
+    across = scaled[:, 1:] - cone.tangent[:, :, None] * slide
+    second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
+    middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)
+    bottom = _blocks(group, rows.weight)[:, :, None] * block
+    zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)
+    return jnp.where(cone.is_bottom[:, None, None], bottom, zone)
+
+
+def _noise_at(rows: Rows, which: slice) -> Noise:
+    assert rows.noise is not None
+    return Noise(rows.noise.spread[which], rows.noise.gate[which])
+
+
+def _mean_push(
+    kernel: Kernel, x: Float[Array, "n *batch"], noise: Noise
+) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+    """Return the mean of max(-x - c w, 0) where noise makes contact, and the probability of a push, its slope but for the sign.
+
+    Above the gate the acceleration ends the push before the distance does, and the mean is the softened ramp. Below it
+    the distance alone decides, so the probability stays as it is at the gate, and the mean goes on along its tangent.
+    """
+    held = jnp.where(x > noise.gate, x, noise.gate)
+    near = held / noise.spread
+    share = kernel.share(near)
+    return noise.spread * kernel.ramp(near) + share * (held - x), share
+
+
+class _NoisyCone(eqx.Module):
+    """An elliptic group under noise: both terms of its cost in the coordinates u."""
+
+    scale: Float[Array, "contacts dim *batch"]
+    stiffness: Float[Array, "contacts *batch"]
+    tangential: Float[Array, "contacts tangents *batch"]
+    slip: Float[Array, "contacts *batch"]
+    pushes: tuple[Float[Array, "contacts *batch"], Float[Array, "contacts *batch"]]
+    shares: tuple[Float[Array, "contacts *batch"], Float[Array, "contacts *batch"]]
+    hold: Float[Array, "contacts *batch"]
+
+    def force(self) -> Float[Array, "contacts dim *batch"]:
+        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
+        both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
+        return self.stiffness[:, None] * self.scale * both
+
+    def curvature_product(
+        self, block: Float[Array, "contacts dim columns *batch"]
+    ) -> Float[Array, "contacts dim columns *batch"]:
+        scaled = self.scale[:, :, None] * block
+        mu = self.scale[:, :1, None]
+        tangent = (self.tangential / jnp.where(self.slip > 0, self.slip, 1.0)[:, None])[:, :, None]
+        slide = sum_of_few(tangent * scaled[:, 1:])
+        first = self.shares[0][:, None, None] * (scaled[:, :1] - mu * slide)
+        second = self.shares[1][:, None, None] * (mu * scaled[:, :1] + slide)
+        across = self.hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
+        along = tangent * (second - mu * first)
+        both = jnp.concatenate([first + mu * second, along + across], axis=1)
+        return (self.stiffness[:, None] * self.scale)[:, :, None] * both
+
+
+def _noisy_cone(
+    kernel: Kernel,
+    group: ConeGroup,
+    rows: Rows,
+    scale: Float[Array, "contacts dim *batch"],
+    x: Float[Array, "rows *batch"],
+) -> _NoisyCone:
+    u = _blocks(group, x) * scale
+    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
+    slides = square > 0
+    slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
+    mu, normal = scale[:, 0], u[:, 0]
+    noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
+    first = Noise(mu * noise.spread, mu * noise.gate)
+    second = Noise(mu * first.spread, mu * first.gate)
+    push1, share1 = _mean_push(kernel, normal - mu * slip, first)
+    push2, share2 = _mean_push(kernel, mu * normal + slip, second)
+    # The pull along the tangent, per slip. Where slip is small both pushes nearly cancel; there it is the mean over
+    # the slip of its derivative, by the trapezoidal rule, whose error (of second order) meets that of rounding at the
+    # cube root of eps.
+    still = _mean_push(kernel, normal, first)[1]
+    smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
+    is_small = slip < smallest
+    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
+    resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
+    weight = rows.weight[group.start : group.stop : group.dim]
+    stiffness = weight / (mu**2 * (1 + mu**2))
+    hold = jnp.where(is_small, resting, moving)
+    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)

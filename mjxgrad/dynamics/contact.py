@@ -55,6 +55,7 @@ def _pyramids(
         jacobian=edges.reshape(count * each, -1),
         residual=residual,
         impedance=resistance,
+        solimp=spread(contact.solimp),
         inverse_weight=spread(inverse_weight),
         solref=spread(contact.solref),
         margin=spread(contact.includemargin),
@@ -62,6 +63,7 @@ def _pyramids(
         is_active=residual < 0,
         rows_each=each,
         is_pyramid=True,
+        is_contact=True,
     )
 
 
@@ -91,12 +93,14 @@ def _cones(
         jacobian=directions.reshape(count * dim, -1),
         residual=residual.reshape(-1),
         impedance=spread(impedance(contact.solimp, distance)),
+        solimp=spread(contact.solimp),
         inverse_weight=jnp.concatenate(weights, axis=1).reshape(-1),
         solref=jnp.concatenate(solref, axis=1).reshape(-1, 2),
         margin=spread(contact.includemargin),
         friction_loss=jnp.zeros(count * dim, distance.dtype),
         is_active=spread(distance < 0),
         rows_each=dim,
+        is_contact=True,
     )
 
 

@@ -44,6 +44,7 @@ def _block(
         jacobian=jacobian.reshape(count * each, -1),
         residual=flat,
         impedance=spread(impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
+        solimp=spread(model.eq_solimp[ids]),
         inverse_weight=inverse_weight.reshape(-1),
         solref=spread(model.eq_solref[ids]),
         margin=zero,

@@ -24,10 +24,12 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     def join(of_dofs: Any, of_tendons: Any) -> Array:
         return jnp.concatenate([of_dofs[dofs], of_tendons[tendons]])
 
+    solimp = join(model.dof_solimp, model.tendon_solimp_fri)
     return Block(
         jacobian=jacobian,
         residual=zero,
-        impedance=impedance(join(model.dof_solimp, model.tendon_solimp_fri), zero),
+        impedance=impedance(solimp, zero),
+        solimp=solimp,
         inverse_weight=join(model.dof_invweight0, model.tendon_invweight0),
         solref=join(model.dof_solref, model.tendon_solref_fri),
         margin=zero,
@@ -50,6 +52,7 @@ def _limit(
         jacobian,
         residual,
         impedance(solimp, residual),
+        solimp,
         inverse_weight,
         solref,
         margin,

@@ -19,11 +19,13 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, events, forces, implicit, linear, smooth
+from mjxgrad.dynamics import assembly, events, forces, implicit, linear, noise, smooth
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
+from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.newton import Problem
+from mjxgrad.smoothing import Smoothing
 
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
@@ -56,7 +58,9 @@ def check_gradient(gradient: str) -> None:
 
 
 @_at_full_precision
-def step(model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete") -> mjx.Data:
+def step(
+    model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete", smoothing: Smoothing | None = None
+) -> mjx.Data:
     """Advance the state by one time step.
 
     Args:
@@ -65,20 +69,24 @@ def step(model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete") -
         gradient: "discrete", the exact derivative of the simulated map, or "event", which adds what that one does not
             see, that the time of a contact's or limit's beginning and end moves; see `dynamics.events`. The step itself
             is the same.
+        smoothing: averages every contact over noise on its distance, for the motion or for its derivative alone.
 
     Returns:
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
         them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, or there is no such gradient.
+        ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or the smoothing
+            has a leading axis or is to go with the gradient "event".
         NotImplementedError: if MJX lacks the integrator.
     """
     check_gradient(gradient)
+    if smoothing is not None:
+        smoothing.check(gradient)
     integrator = model.opt.integrator
     if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, gradient)
-    data, blocks = _forward(model, data)
+        return _runge_kutta(model, data, gradient, smoothing)
+    data, blocks = _forward(model, data, smoothing)
     moving = events.correct(model, data, blocks) if gradient == "event" else data
     if integrator == _Integrator.mjINT_EULER:
         return _advance(model, data, _euler_acceleration(model, moving), None)
@@ -88,28 +96,32 @@ def step(model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete") -
 
 
 @_at_full_precision
-def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def forward(model: mjx.Model, data: mjx.Data, *, smoothing: Smoothing | None = None) -> mjx.Data:
     """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`.
 
     Args:
         model: any model of MJX's JAX implementation.
         data: the present state, controls and applied forces.
+        smoothing: as for `step`.
 
     Returns:
-        Data with every field that depends on the state filled in.
+        Data with every field that depends on the state filled in. Under forward smoothing the constraint rows (`efc_`) are the
+        smoothed ones, present at any distance.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX.
+        ValueError: if `model` or `data` belong to another implementation of MJX, or the smoothing has a leading axis.
     """
-    return _forward(model, data)[0]
+    if smoothing is not None:
+        smoothing.check("discrete")
+    return _forward(model, data, smoothing)[0]
 
 
-def _forward(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
+def _forward(model: mjx.Model, data: mjx.Data, smoothing: Smoothing | None) -> tuple[mjx.Data, list[Block]]:
     """Return the data, and the constraint rows that went into it."""
     data, blocks = _smooth(model, data)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
-    data = solve(model, data)
+    data = solve(model, data) if smoothing is None else _smoothed_solve(model, data, blocks, smoothing)
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
@@ -132,11 +144,47 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     layout = assembly.row_layout(model, data)
     if not layout.num_rows or not model.nv:
         return data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
-    rows = assembly.rows_of(model, data, layout)
+    return _minimum(model, data, layout, assembly.rows_of(model, data, layout), _start(model, data))
+
+
+def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
+    return data.qacc_smooth if cold else data.qacc_warmstart
+
+
+def _smoothed_solve(model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing) -> mjx.Data:
+    """Solve with rows under noise; in backward mode without it, but for the derivative."""
+    layout = assembly.row_layout(model, data)
+    blocks, uncertain, layout = noise.smoothed(model, data, blocks, smoothing, layout)
+    if uncertain is None or not model.nv:
+        return solve(model, data)
+    soft = assembly.make_constraint(model, data, blocks)
+    rows = assembly.rows_of(model, soft, layout, uncertain)
+    if smoothing.mode == "forward":
+        return _minimum(model, soft, layout, rows, _start(model, data))
+    hard = solve(*jax.lax.stop_gradient((model, data)))
+    soft = _minimum(model, soft, layout, rows, hard.qacc)
+
+    def forces_of(data: mjx.Data) -> dict[str, Array]:
+        return {"qacc": data.qacc, "qfrc_constraint": data.qfrc_constraint, "_impl.efc_force": data._impl.efc_force}
+
+    return data.tree_replace(_with_derivative_of(forces_of(hard), forces_of(soft)))  # pyright: ignore[reportReturnType]
+
+
+@jax.custom_jvp
+def _with_derivative_of(value, other):
+    """Return the first argument to the last bit, with the derivative of the second."""
+    return value
+
+
+@_with_derivative_of.defjvp
+def _with_derivative_of_jvp(primals, tangents):
+    return _with_derivative_of(*primals), tangents[1]
+
+
+def _minimum(model: mjx.Model, data: mjx.Data, layout: RowLayout, rows: Rows, start: Float[Array, " nv"]) -> mjx.Data:
     mass = mjx.full_m(model, data)
     problem = Problem(mass, data.qfrc_smooth, data._impl.efc_J, rows)
-    cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
-    start = data.qacc_smooth if cold else data.qacc_warmstart
     tolerance = jnp.asarray(model.opt.tolerance, mass.dtype)
     acceleration = implicit.solve(
         layout,
@@ -207,7 +255,7 @@ def _advance(
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient) -> mjx.Data:
+def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient, smoothing: Smoothing | None) -> mjx.Data:
     """Advance by the classical fourth-order rule.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
@@ -225,7 +273,7 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient) -> mjx.D
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data, blocks = _forward(model, data)
+        data, blocks = _forward(model, data, smoothing)
         rates = (data.qvel, data.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
         return (rates, sums, data.qacc), (data, blocks if gradient == "event" else None)

@@ -1,6 +1,7 @@
 """Contact averaged over noise on its distance, in closed form, within the solver.
 
-The dynamics build on what is exported here. What builds on the dynamics in turn, `probe` and `linear_model`, are modules to import by name.
+The dynamics build on what is exported here. What builds on the dynamics in turn, `probe` and `linear_model`, are
+modules to import by name.
 """
 
 from mjxgrad.smoothing.kernels import KERNELS, Gaussian, Kernel, LogBarrier, Logistic

@@ -1,14 +1,15 @@
 r"""Noise whose average over a contact has a closed form, and the barrier that each stands for.
 
-A contact pushes like the ramp $\max(-r, 0)$ of its distance $r$. Noise $w$ of density $\rho$ on the distance makes of it
+A contact pushes like the ramp $\max(-r, 0)$ of its distance $r$. Noise $w$ of density $\rho$ on the distance makes of
+it
 
 $$S(r) = \mathbb{E} \max(-r - w, 0), \qquad S'(r) = -P(w < -r), \qquad S''(r) = \rho(r),$$
 
 so that a kernel is given as well by its density as by its softened ramp, the profile of its force at a distance.
 
-All three are even and in units of the *length*, the standard deviation of the Gaussian. The others are scaled to its mean $|w|$,
-$\sqrt{2/\pi}$, and with that to the same push at the surface, $S(0) = \mathbb{E}|w| / 2$. Standard deviations could not be
-matched, since that of the log barrier is infinite.
+All three are even and in units of the *length*, the standard deviation of the Gaussian. The others are scaled to its
+mean $|w|$, $\sqrt{2/\pi}$, and with that to the same push at the surface, $S(0) = \mathbb{E}|w| / 2$. Standard
+deviations could not be matched, since that of the log barrier is infinite.
 
 | kernel | softened ramp | density | standard deviation |
 |---|---|---|---|
@@ -16,12 +17,14 @@ matched, since that of the log barrier is infinite.
 | `logistic` | $b\,\mathrm{softplus}(-r/b)$, $b = 0.576$ | logistic | $\pi b / \sqrt 3 = 1.044$ |
 | `log_barrier` | $(-r + \sqrt{r^2 + 4/\kappa}) / 2$, $\kappa = 2\pi$ | Student's t, 2 degrees of freedom | infinite |
 
-The name of the last: the ramp is the $f$ that minimises $f^2/2 + fr$ over $f \ge 0$, and with the barrier $-\log(f)/\kappa$
-in place of the bound the minimiser is this $S(r)$. Its force falls off as $1/r$: it reaches everything in the scene.
+The name of the last: the ramp is the $f$ that minimises $f^2/2 + fr$ over $f \ge 0$, and with the barrier
+$-\log(f)/\kappa$ in place of the bound the minimiser is this $S(r)$. Its force falls off as $1/r$: it reaches
+everything in the scene.
 
 References:
-    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact
-    Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing, and the log barrier as analytic one).
+    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic
+    Contact Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing, and the log barrier as
+    analytic one).
 """
 
 import abc
@@ -46,7 +49,8 @@ class Kernel(abc.ABC):
     Static and hashable: which kernel it is shapes the compiled program.
 
     Attributes:
-        reach: distance beyond which `share` may leave the range of single precision; what is left there is below 1e-14 of
+        reach: distance beyond which `share` may leave the range of single precision; what is left there is below 1e-14
+        of
             a contact.
         stddev: standard deviation.
     """
@@ -77,7 +81,8 @@ class Gaussian(Kernel):
 
     def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Return φ(r) - r Φ(-r)."""
-        # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times r².
+        # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times
+        # r².
         near = jnp.minimum(distance, 4 * self.reach)
         return self.density(near) - near * self.share(near)
 

@@ -3,12 +3,13 @@ r"""What to average over in the solver: which noise on the distance of every con
 Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
 decides whether there is contact at all, $r + w < 0$. The mean of each row's cost over the noise is again convex and has a closed
 form, so the same solve finds the acceleration (see `dynamics.noise` for the formulas).
-What is averaged is thus the step's contact law and not the motion. Impedance and damping stay at their values at one depth: that of
-the contact as it is on average where there is contact at all.
+What is averaged is thus the step's contact law and not the motion. Impedance and damping stay at their values at one
+depth: that of the contact as it is on average where there is contact at all.
 
-As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters: a row without it (`gated=False`) acts
-wherever $J a - a_\text{ref} + K d w < 0$, touching or not, and its damping brakes bodies that approach from as far as
-$2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact. It is the row that interior-point and barrier methods smooth.
+As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters: a row without it
+(`gated=False`) acts wherever $J a - a_\text{ref} + K d w < 0$, touching or not, and its damping brakes bodies that
+approach from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact. It is the row that
+interior-point and barrier methods smooth.
 """
 
 from typing import Any, Literal, get_args
@@ -42,13 +43,16 @@ class Smoothing(eqx.Module):
     A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
 
     Attributes:
-        length: of the noise (m): the standard deviation of the Gaussian, and for the other kernels the one that gives the same
+        length: of the noise (m): the standard deviation of the Gaussian, and for the other kernels the one that gives
+        the same
             mean absolute value.
         kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach some lengths far, the last
             one falls off as 1/r.
-        mode: "forward" moves by the smoothed contact: force at a distance, and derivatives to match. "backward" moves as without
+        mode: "forward" moves by the smoothed contact: force at a distance, and derivatives to match. "backward" moves
+        as without
             smoothing, and takes the derivative of the smoothed step at each state that is visited.
-        limit_length: likewise for the limits of joints and tendons, in their own units (m or rad); None leaves them as they
+        limit_length: likewise for the limits of joints and tendons, in their own units (m or rad); None leaves them as
+        they
             are. Apart from contacts, since no one length fits metres and radians.
         gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
     """
