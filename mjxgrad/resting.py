@@ -45,7 +45,7 @@ def rest_depth(
     def excess(depth: Array) -> Array:
         return stiffness * static_response(depth, solimp) - acceleration
 
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: ArrayLike, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = (low + high) / 2
         is_shallow = excess(middle) < 0

@@ -4,6 +4,7 @@ from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
 from mjxgrad.diagnostics.budget import Rollouts, Seconds
 from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
+from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.statistics import (
@@ -22,6 +23,7 @@ __all__ = [
     "Comparison",
     "EmpiricalBias",
     "Landscape",
+    "OnsetResolution",
     "Rollouts",
     "Seconds",
     "SlopeComparison",
@@ -38,6 +40,7 @@ __all__ = [
     "empirical_bias",
     "first_order_samples",
     "mean_interval",
+    "onset_resolution",
     "phases",
     "root_mean_square_interval",
     "variance_interval",

@@ -8,6 +8,7 @@ import jax
 import mujoco
 import numpy as np
 
+from mjxgrad.contacts import ContactParameters
 from mjxgrad.scene.contact_check import contact_differences, format_number, name_pairs
 
 if TYPE_CHECKING:
@@ -81,13 +82,18 @@ def _contacts(scene: "Scene") -> str:
     for pair, cells in zip(scene.pairs, _contact_cells(scene), strict=True):
         groups.setdefault(cells, []).append(pair)
     rows = [(name_pairs(pairs), *cells) for cells, pairs in groups.items()]
+    has_rest = len(rows[0]) > len(_COLUMNS[0])
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
     legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
         "; stable while h²k + 2hb < 4" if is_euler else ""
     )
-    return _table(title, [*_COLUMNS, *rows], is_numeric=True) + f"\n  {legend}"
+    columns = _COLUMNS
+    if has_rest:
+        columns = tuple((*column, cell) for column, cell in zip(_COLUMNS, ("at rest", "mm"), strict=True))
+        legend += "\n  at rest: distance under gravity, negative for a depth"
+    return _table(title, [*columns, *rows], is_numeric=True) + f"\n  {legend}"
 
 
 def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
@@ -107,8 +113,17 @@ def _contact_cells(scene: "Scene") -> list[tuple[str, ...]]:
         [_friction(pair.condim, row)
          for pair, row in zip(scene.pairs, np.asarray(parameters.friction).tolist(), strict=True)],
         _numbers(1e3 * parameters.margin),
+        *_rest_column(scene, parameters),
     )  # fmt: skip
     return list(zip(*columns, strict=True))
+
+
+def _rest_column(scene: "Scene", parameters: ContactParameters) -> list[list[str]]:
+    """Where bodies rest under gravity, if some margin makes it worth a column."""
+    gravity = float(np.linalg.norm(np.asarray(scene.model.opt.gravity)))
+    if gravity == 0 or not np.any(parameters.margin) or not np.all(parameters.stiffness > 0):
+        return []
+    return [_numbers(1e3 * parameters.rest_distance(gravity))]
 
 
 def _numbers(values) -> list[str]:
