@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, tasks
+from mjxgrad import baselines, diagnostics, estimators, smoothing, tasks
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
@@ -24,6 +24,7 @@ from mjxgrad.rollout import (
     rollout,
 )
 from mjxgrad.scene import Scene, load_scene
+from mjxgrad.smoothing import Smoothing
 from mjxgrad.softness import Softness
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Plateau",
     "Progress",
     "Scene",
+    "Smoothing",
     "Softness",
     "State",
     "Stopped",
@@ -55,6 +57,7 @@ __all__ = [
     "optimise",
     "parameter_noise",
     "rollout",
+    "smoothing",
     "solve",
     "step",
     "tasks",

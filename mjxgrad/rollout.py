@@ -1,5 +1,6 @@
 """Many steps: a scan with a lean carry, checkpointed, that says when it has gone wrong."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import Gradient, check_gradient, forward, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
+from mjxgrad.smoothing import Smoothing, smoothing_warnings
 
 Policy = Callable[[PyTree, "State"], Float[Array, " nu"]]
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
@@ -100,6 +102,7 @@ def rollout(
     observe: Observe | None = None,
     checkpoint: bool = True,
     gradient: Gradient = "discrete",
+    smoothing: Smoothing | None = None,
     velocity_limit: float | None = 1e4,
 ) -> Trajectory:
     """Step a scene many times.
@@ -119,17 +122,23 @@ def rollout(
         checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
             a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
         gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same.
+        smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
+            `SceneWarning` what of the scene it has no effect on.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
 
     Returns:
         The trajectory, with `horizon + 1` states.
 
     Raises:
-        ValueError: if there is no such gradient, shapes do not fit the scene, the horizon is missing or contradicted, or
-            controls or noise hold numbers that are not finite (checked where values are known, that is outside `jax.jit`;
-            inside, the rollout is flagged as diverged at that step).
+        ValueError: if there is no such gradient, it does not go with the smoothing, shapes do not fit the scene, the
+            horizon is missing or contradicted, or controls or noise hold numbers that are not finite (checked where
+            values are known, that is outside `jax.jit`; inside, the rollout is flagged as diverged at that step).
     """
     check_gradient(gradient)
+    if smoothing is not None:
+        smoothing.check(gradient)
+        for message in smoothing_warnings(smoothing, scene.model):
+            warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     nu = scene.model.nu
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
@@ -147,12 +156,12 @@ def rollout(
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
         data = _data(scene, state, ctrl)
-        stepped = step(scene.model, data, gradient=gradient)
+        stepped = step(scene.model, data, gradient=gradient, smoothing=smoothing)
         moved = _state(stepped)
         is_bad = ~_is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
-        seen = None if observe is None else _observed(scene, observe, data, stepped)
+        seen = None if observe is None else _observed(scene, observe, data, stepped, smoothing)
         return (kept, first_bad), (state.qpos, state.qvel, ctrl, seen)
 
     if checkpoint:
@@ -167,7 +176,7 @@ def rollout(
     )
     if observe is not None:
         data = _data(scene, final, ctrl[-1])
-        last = observe(scene.model, forward(scene.model, data))
+        last = observe(scene.model, forward(scene.model, data, smoothing=smoothing))
         seen = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, last)
     return Trajectory(
         qpos=jnp.concatenate([qpos, final.qpos[None]]),
@@ -219,10 +228,11 @@ def _is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
 
 
-def _observed(scene: Scene, observe: Observe, data: mjx.Data, stepped: mjx.Data) -> PyTree:
+def _observed(scene: Scene, observe: Observe, data: mjx.Data, stepped: mjx.Data, smoothing: Smoothing | None) -> PyTree:
     """Call `observe` with the data of the state before the step."""
     if scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return observe(scene.model, forward(scene.model, data))  # the step's own are of its last stage
+        # The step's own are of its last stage.
+        return observe(scene.model, forward(scene.model, data, smoothing=smoothing))
     before = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
     return observe(scene.model, stepped.replace(**before))
 

@@ -14,6 +14,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import Gradient, check_gradient
 from mjxgrad.rollout import State, Trajectory, rollout
 from mjxgrad.scene import Scene
+from mjxgrad.smoothing import Smoothing
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 
@@ -96,6 +97,7 @@ class SceneTask(Task):
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
         gradient: of each step, "discrete" or "event"; see `step`.
+        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
     scene: Scene
@@ -104,6 +106,7 @@ class SceneTask(Task):
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
+    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self, gradient: Gradient) -> "SceneTask":
         """Give the same task with another derivative of its steps.
@@ -150,6 +153,7 @@ class SceneTask(Task):
             horizon=self.horizon,
             observe=_activations if has_activations else None,
             gradient=self.gradient,
+            smoothing=self.smoothing,
         )
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
         activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))
