@@ -65,18 +65,12 @@ def analytic(
     Returns:
         The model, without sampling error.
     """
-    n = system.num_changes
-    nominal = system.step(state, control)
-
-    def moved(change: Float[Array, " n"], control: Float[Array, " m"]) -> Float[Array, " n"]:
-        return system.difference(system.step(system.retract(state, change), control), nominal)
-
-    # One call with respect to both would compute A even where nobody reads it.
-    B = jax.jacfwd(moved, argnums=1)(jnp.zeros(n, state.dtype), control)
-    A = jax.jacfwd(moved)(jnp.zeros(n, state.dtype), control) if wrt_state else jnp.zeros((n, 0), B.dtype)
-    is_finite = jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(B)) & jnp.all(jnp.isfinite(nominal))
-    none = jnp.zeros(n, B.dtype)
-    return LinearModel(A, B, nominal, jnp.zeros_like(A), jnp.zeros_like(B), none, is_finite.astype(B.dtype))
+    noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
+    jacobian, ends = _linearised(system, state, control, noise, wrt_state)
+    change, jacobian = _changes(system, ends, ends[0], jacobian)
+    is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
+    exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
+    return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1, num_controls=control.size)
 
 
 def first_order(
@@ -111,29 +105,21 @@ def first_order(
     Raises:
         ValueError: if a standard deviation is negative or does not fit, or there are too few samples.
     """
-    n = system.num_changes
     stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
     _check_count(num_samples, 2)
     noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    nominal = system.step(state, control)
-    columns = jnp.arange(n if not wrt_state else 0, stddev.size)
-
-    def sample(noise: Float[Array, " both"]) -> tuple[Float[Array, "n columns"], Float[Array, " n"]]:
-        def moved(change: Float[Array, " columns"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-            value = _perturbed(system, state, control, nominal, noise.at[columns].add(change))
-            return value, value
-
-        return jax.jacfwd(moved, has_aux=True)(jnp.zeros(columns.size, state.dtype))
-
-    jacobian, value = jax.vmap(sample)(noise)
+    # The step without noise runs in the same batch: a call of its own would be compiled a second time.
+    jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
+    value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
     is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
     jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
     value = jnp.where(is_finite[:, None], value, 0.0)
     count = is_finite.sum()
     mean, error = _mean(jacobian, is_finite)
     others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
-    rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, noise[:, columns]), is_finite)
-    return _model(system, nominal, mean, error, rest, rest_error, is_finite, least=2, num_controls=control.size)
+    seen = noise[:, -jacobian.shape[2] :]
+    rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
+    return _model(system, ends[0], mean, error, rest, rest_error, is_finite, least=2, num_controls=control.size)
 
 
 def zeroth_order(
@@ -172,8 +158,7 @@ def zeroth_order(
     least = stddev.size + 2
     _check_count(num_samples, least)
     unit = jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    nominal = system.step(state, control)
-    value = jax.vmap(lambda w: _perturbed(system, state, control, nominal, w))(stddev * unit)
+    nominal, value = _sampled(system, state, control, stddev * unit)
     is_finite = jnp.all(jnp.isfinite(value), axis=1)
     value = jnp.where(is_finite[:, None], value, 0.0)
     # In units of the noise the normal equations are well conditioned whatever the units of the coordinates.
@@ -225,24 +210,63 @@ def mean_step(
     stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
     _check_count(num_samples, 1)
     noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    nominal = system.step(state, control)
-    both = jnp.concatenate([noise, -noise])
-    value = jax.vmap(lambda w: _perturbed(system, state, control, nominal, w))(both)
+    nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
     is_finite = jnp.all(jnp.isfinite(value), axis=1)
     mean, _ = _mean(jnp.where(is_finite[:, None], value, 0.0), is_finite)
     return system.retract(nominal, mean)
 
 
 def _perturbed(
+    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, " both"]
+) -> Float[Array, " state"]:
+    """Return the next state under noise on state and control."""
+    n = system.num_changes
+    return system.step(system.retract(state, noise[:n]), control + noise[n:])
+
+
+def _sampled(
+    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, "N both"]
+) -> tuple[Float[Array, " state"], Float[Array, "N n"]]:
+    """Return the next state without noise, and how far from it those with noise are."""
+    ends = jax.vmap(lambda w: _perturbed(system, state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
+    return ends[0], jax.vmap(lambda end: system.difference(end, ends[0]))(ends[1:])
+
+
+def _linearised(
     system: System,
     state: Float[Array, " state"],
     control: Float[Array, " m"],
+    noise: Float[Array, "N both"],
+    wrt_state: bool,
+) -> tuple[Float[Array, "N state columns"], Float[Array, "N state"]]:
+    """Return, for each sample of noise, the derivative of the next state, and that state."""
+    columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
+
+    def sample(noise: Float[Array, " both"]) -> tuple[Float[Array, "state columns"], Float[Array, " state"]]:
+        def moved(change: Float[Array, " columns"]) -> tuple[Float[Array, " state"], Float[Array, " state"]]:
+            end = _perturbed(system, state, control, noise.at[columns].add(change))
+            return end, end
+
+        return jax.jacfwd(moved, has_aux=True)(jnp.zeros(columns.size, state.dtype))
+
+    return jax.vmap(sample)(noise)
+
+
+def _changes(
+    system: System,
+    ends: Float[Array, "N state"],
     nominal: Float[Array, " state"],
-    noise: Float[Array, " both"],
-) -> Float[Array, " n"]:
-    """Return how far from the nominal next state the step ends under noise on state and control."""
-    n = system.num_changes
-    return system.difference(system.step(system.retract(state, noise[:n]), control + noise[n:]), nominal)
+    jacobian: Float[Array, "N state columns"],
+) -> tuple[Float[Array, "N n"], Float[Array, "N n columns"]]:
+    """Return states and their derivatives as changes of the nominal one."""
+
+    def one(end: Float[Array, " state"], jacobian: Float[Array, "state columns"]):
+        def change(end: Float[Array, " state"]) -> Float[Array, " n"]:
+            return system.difference(end, nominal)
+
+        return change(end), jax.jacfwd(change)(end) @ jacobian
+
+    return jax.vmap(one)(ends, jacobian)
 
 
 def _mean(

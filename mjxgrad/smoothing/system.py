@@ -6,7 +6,7 @@ linearises, samples or plans moves states by `retract` and compares them by `dif
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from mjxgrad.dynamics.integrate import integrate_position, position_change
 from mjxgrad.dynamics.step import step
 from mjxgrad.rollout import State
 from mjxgrad.scene import Scene
+from mjxgrad.smoothing.smoothing import Smoothing
 from mjxgrad.task import as_pytree
 
 
@@ -46,7 +47,7 @@ class System(eqx.Module):
         """Return the change that moves `start` to `end`; the inverse of `retract`."""
         return end - start
 
-    def with_smoothing(self, smoothing: Any) -> "System":
+    def with_smoothing(self, smoothing: Smoothing | None) -> "System":
         """Give the system with another analytic smoothing of its contacts.
 
         Raises:
@@ -95,7 +96,7 @@ class SceneSystem(System):
     scene: Scene
     num_substeps: int = eqx.field(static=True, default=1)
     gradient: Literal["discrete", "event"] = eqx.field(static=True, default="discrete")
-    smoothing: Any = None
+    smoothing: Smoothing | None = None
 
     def __check_init__(self):
         if self.num_substeps < 1:
@@ -154,13 +155,12 @@ class SceneSystem(System):
         moved = position_change(self.scene.model, start[:nq], end[:nq])
         return jnp.concatenate([moved, end[nq:] - start[nq:]])
 
-    def with_smoothing(self, smoothing: Any) -> "SceneSystem":
+    def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
         """Give the system with another smoothing; None takes it away."""
-        return SceneSystem(self.scene, self.num_substeps, self.gradient, smoothing)
+        return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
 
     def _advance(self, data: mjx.Data) -> mjx.Data:
-        settings = {} if self.smoothing is None else {"smoothing": self.smoothing}
-        return step(self.scene.model, data, gradient=self.gradient, **settings)
+        return step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
 
     def _data(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> mjx.Data:
         nq, nv = self.scene.model.nq, self.scene.model.nv

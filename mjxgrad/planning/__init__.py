@@ -1,0 +1,27 @@
+"""Plans through contact: trajectory optimisation and search trees, both on smoothed linear models."""
+
+from mjxgrad.planning.cost import Cost, GoalCost
+from mjxgrad.planning.search import Path, Sampling, Search, path, search
+from mjxgrad.planning.smoothers import Analytic, Exact, Sampled, Smoother
+from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
+from mjxgrad.smoothing.system import FunctionSystem, SceneSystem, System
+
+__all__ = [
+    "Analytic",
+    "Cost",
+    "Exact",
+    "FunctionSystem",
+    "GoalCost",
+    "Iterations",
+    "Path",
+    "Plan",
+    "Sampled",
+    "Sampling",
+    "SceneSystem",
+    "Search",
+    "Smoother",
+    "System",
+    "optimise_trajectory",
+    "path",
+    "search",
+]
