@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.bounce.settings import BounceSettings
 from experiments.config import RunSettings
 from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
@@ -35,6 +36,7 @@ class Experiment:
 EXPERIMENTS = {
     "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
+    "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

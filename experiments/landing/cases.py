@@ -1,8 +1,8 @@
 """The motions: where they start, what is changed of the start, and what is read."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import gymnasium
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from experiments.motion import Read
 
-_ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
+_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def _arm(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, "
 
 
 def _gymnasium(file: str) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(os.path.join(_ASSETS, file))
+    return mujoco.MjModel.from_xml_path(str(_ASSETS / file))
 
 
 def _hopper() -> Case:
@@ -126,11 +126,11 @@ def _ant() -> Case:
         "Ant",
         _gymnasium("ant.xml"),
         moved=2,
-        interval=(0.0, 0.1),
+        interval=(0.0, 0.08),
         labels=("x", "z", "pitch (sine)"),
         read=_free,
         duration=0.5,
-        qpos={2: 0.6, 3: 0.9962, 4: 0.05, 5: 0.07, 7: 0.2, 8: 0.9, 10: -0.9, 12: -0.8, 14: 0.8},
+        qpos={2: 0.72, 3: 0.9962, 4: 0.05, 5: 0.07, 7: 0.2, 8: 0.9, 10: -0.9, 12: -0.8, 14: 0.8},
         qvel={0: 0.3},
     )
 

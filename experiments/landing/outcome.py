@@ -52,23 +52,18 @@ class Course:
         first = self.events.min() if len(self.events) else np.inf
         return np.broadcast_to((self.times > first)[:, None], self.found.slope.shape)
 
-    def holds(self, gradient: str) -> Bool[np.ndarray, "times labels"]:
-        """Say where a derivative is within the tolerance; only where this can be judged.
+    def share(self, gradient: str) -> tuple[int, int, int]:
+        """Count, after the first impact, where a derivative is within the tolerance, where beyond it, and what is judged.
+
+        The last count is larger than the sum of the first two where more phases would be needed to tell.
 
         Args:
             gradient: its name.
         """
         row = self.found.gradients.index(gradient)
-        return self.can_judge & (self.found.relative_error[row] <= self.tolerance)
-
-    def share(self, gradient: str) -> tuple[int, int]:
-        """Count comparisons after the first impact that can be judged and hold, and those that can be judged.
-
-        Args:
-            gradient: its name.
-        """
         judged = self.can_judge & self.has_impact
-        return int((self.holds(gradient) & judged).sum()), int(judged.sum())
+        close, off = self.found.is_close(self.tolerance)[row], self.found.is_off(self.tolerance)[row]
+        return int((close & judged).sum()), int((off & judged).sum()), int(judged.sum())
 
     def worst(self, gradient: str) -> float:
         """Give the largest relative error after the first impact, where it can be judged; NaN where it nowhere can.

@@ -16,18 +16,18 @@ def verdict(outcome: Outcome) -> str:
         A few sentences.
     """
     event, discrete = _total(outcome, EVENT), _total(outcome, DISCRETE)
-    if not event[1]:
+    if not event[2]:
         return "No slope is known well enough to judge a derivative by: take more phases, or a shorter motion."
     percent = f"{outcome.settings.tolerance:.0%}"
     sentences = [
-        f"After the first impact the event gradient is within {percent} at {event[0]} of {event[1]} times and coordinates, "
+        f"After the first impact the event gradient is within {percent} at {event[0]} of {event[2]} times and coordinates, "
         f"the discrete one at {discrete[0]}."
     ]
-    failing = [course for course in outcome.all if course.share(EVENT)[0] < course.share(EVENT)[1]]
+    failing = [course for course in outcome.all if course.share(EVENT)[1]]
     if not failing:
-        return " ".join([*sentences, "It holds in every motion, at every time step."])
-    listed = [f"{_name(c)} ({c.share(EVENT)[1] - c.share(EVENT)[0]} of {c.share(EVENT)[1]})" for c in failing]
-    return " ".join([*sentences, f"It is farther off in {', '.join(listed)}."])
+        return " ".join([*sentences, "Nowhere is it farther off beyond chance."])
+    listed = [f"{_name(c)} ({c.share(EVENT)[1]} of {c.share(EVENT)[2]})" for c in failing]
+    return " ".join([*sentences, f"It is farther off beyond chance in {_join(listed)}."])
 
 
 def findings(outcome: Outcome) -> list[str]:
@@ -57,7 +57,7 @@ def findings(outcome: Outcome) -> list[str]:
     if lost:
         parts = [f"{_name(c)} ({int((~c.can_judge & c.has_impact).sum())} of {c.has_impact.sum()})" for c in lost]
         sentences.append(
-            f"Where the slope is too uncertain, by chaos or too few phases, nothing is judged: {', '.join(parts)}."
+            f"Where the slope is too uncertain, by chaos or too few phases, nothing is judged: {_join(parts)}."
         )
     return sentences
 
@@ -66,7 +66,7 @@ def table(outcome: Outcome) -> Table:
     """Tabulate the errors of both derivatives by motion and time step."""
     rows, emphasised = [], set()
     for course in outcome.all:
-        if course.share(EVENT)[0] < course.share(EVENT)[1]:
+        if course.share(EVENT)[1]:
             emphasised.add((len(rows), 5))
         rows.append(
             [
@@ -74,8 +74,7 @@ def table(outcome: Outcome) -> Table:
                 f"{1e3 * course.timestep:g}",
                 f"{len(course.events)}",
                 *(_errors(course, name) for name in (DISCRETE, EVENT)),
-                "{} of {}".format(*course.share(EVENT)),
-                "{} of {}".format(*course.share(DISCRETE)),
+                *(_counts(course, name) for name in (EVENT, DISCRETE)),
             ]
         )
     percent = f"{outcome.settings.tolerance:.0%}"
@@ -87,21 +86,29 @@ def table(outcome: Outcome) -> Table:
         rows,
         "Errors as a share of the larger of the slope and the discrete gradient's own error, after the first impact: median "
         "and largest over times and coordinates. Counts are of those where the slope can be judged by; bold where the event "
-        "gradient is not always within the tolerance.",
+        "gradient is somewhere beyond the tolerance by more than two standard errors.",
         frozenset(emphasised),
     )  # fmt: skip
 
 
-def _total(outcome: Outcome, gradient: str) -> tuple[int, int]:
-    shares = np.array([course.share(gradient) for course in outcome.all])
-    return int(shares[:, 0].sum()), int(shares[:, 1].sum())
+def _total(outcome: Outcome, gradient: str) -> tuple[int, ...]:
+    return tuple(np.sum([course.share(gradient) for course in outcome.all], axis=0).tolist())
+
+
+def _counts(course: Course, gradient: str) -> str:
+    close, _, judged = course.share(gradient)
+    return f"{close} of {judged}"
 
 
 def _errors(course: Course, gradient: str) -> str:
-    if not course.share(gradient)[1]:
+    if not course.share(gradient)[2]:
         return "not judged"
     return f"{course.median(gradient):.1%}, {course.worst(gradient):.1%}"
 
 
 def _name(course: Course) -> str:
     return f"{course.title} at {1e3 * course.timestep:g} ms"
+
+
+def _join(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -106,6 +106,28 @@ class SlopeComparison(eqx.Module):
         size = np.abs(rest).max(axis=0)
         return np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale
 
+    def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
+        """Say where the mean of a derivative is the slope to within `tolerance` times `scale`.
+
+        Args:
+            tolerance: as a share of `scale`.
+
+        Returns:
+            One truth value per derivative and outcome; False where numbers are not finite.
+        """
+        return self.relative_error <= tolerance
+
+    def is_off(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
+        """Say where it is not, beyond two standard errors. What is neither close nor off needs more phases.
+
+        Args:
+            tolerance: as a share of `scale`.
+
+        Returns:
+            One truth value per derivative and outcome; False where numbers are not finite.
+        """
+        return np.abs(self.error) - 2 * self.standard_error > np.maximum(tolerance * self.scale, self.resolution)
+
     def is_resolved(self, tolerance: float = 0.05) -> Bool[np.ndarray, "*outcome"]:
         """Say where the slope is known well enough to judge by: its standard error is below `tolerance` times `scale`.
 

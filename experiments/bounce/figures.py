@@ -1,0 +1,130 @@
+"""The pictures of an experiment on bounces."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.ticker import FuncFormatter
+
+from experiments.bounce.outcome import DISCRETE, EVENT, Outcome
+from experiments.report import Figure
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+
+_WIDE = "#009e73"
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw all figures.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by name: derivative, error, steps.
+
+    Returns:
+        The figures in order of reading.
+    """
+    pictures = {
+        "derivative": ("Derivative against time step", derivative),
+        "steps": ("Error against steps in contact", steps),
+        "error": ("Error over all contacts", error),
+    }
+    return [
+        Figure(save(drawing(outcome), folder, name), title, captions[name])
+        for name, (title, drawing) in pictures.items()
+    ]
+
+
+def derivative(outcome: Outcome):
+    """Means and spreads of all derivatives against the time step, for each damping ratio at one contact."""
+    settings = outcome.settings
+    # MuJoCo's own time constant and impedance, or what comes nearest.
+    constant = min(settings.time_constants, key=lambda value: abs(value - 0.02))
+    impedance = min(settings.impedances, key=lambda one: abs(one.first - 0.9) + abs(one.last - 0.95))
+    shown = [
+        j for j, cell in enumerate(outcome.cells) if cell.time_constant == constant and cell.impedance == impedance
+    ]
+    shown = shown[:: -(-len(shown) // 4)] if len(shown) > 4 else shown
+    figure, axes = subplots(1, len(shown), height=3.6, sharey=True)
+    h = 1e3 * outcome.timesteps
+    for axis, j in zip(axes[0], shown, strict=True):
+        axis.axhline(outcome.cells[j].truth, color=REFERENCE, lw=1, ls=(0, (2, 2)), label="truth")
+        axis.plot(h, outcome.slope[:, j], color=REFERENCE, lw=2.6, label="slope of the simulated height")
+        looks = (
+            (outcome.mean(DISCRETE), outcome.spread(DISCRETE), FIRST, "o", "discrete gradient", 0.96),
+            (outcome.mean(EVENT), outcome.spread(EVENT), ZEROTH, "s", "event gradient", 1.0),
+            (outcome.wide, outcome.wide_spread, _WIDE, "^", "difference over one step's flight", 1.04),
+        )
+        for mean, spread, colour, marker, label, shift in looks:
+            axis.errorbar(
+                h * shift, mean[:, j], spread[:, j], color=colour, marker=marker, ms=4, lw=1, elinewidth=1, capsize=2,
+                label=label,
+            )  # fmt: skip
+        axis.set_xscale("log")
+        axis.set_yscale("symlog", linthresh=0.1)
+        axis.set(title=f"damping ratio {outcome.cells[j].damping_ratio:g}", xlabel="time step, ms")
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
+    axes[0, 0].set_ylabel("derivative")
+    figure.suptitle(f"Time constant {1e3 * constant:g} ms, impedance {impedance.label}", fontsize=10)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8.5)
+    return figure
+
+
+def error(outcome: Outcome):
+    """A map per impedance and time step: damping ratio across, time constant up."""
+    settings = outcome.settings
+    rows, columns = len(settings.impedances), len(settings.timesteps)
+    figure, axes = subplots(rows, columns, height=0.9 + 1.35 * rows, sharex=True, sharey=True)
+    shape = (len(settings.damping_ratios), len(settings.time_constants), rows)
+    errors = outcome.error(EVENT).reshape(-1, *shape)
+    judged = outcome.can_judge.reshape(-1, *shape)
+    image = None
+    for i, j in np.ndindex(rows, columns):
+        axis = axes[i, j]
+        shown = np.clip(errors[j, :, :, i].T, 1e-3, 1)
+        image = axis.imshow(shown, norm=LogNorm(1e-3, 1), cmap="RdYlBu_r", origin="lower", aspect="auto")
+        for ratio, constant in np.argwhere(~judged[j, :, :, i]):
+            axis.plot(ratio, constant, "x", color=REFERENCE, ms=6)
+        axis.grid(visible=False)
+        axis.set_xticks(range(shape[0]), [f"{value:g}" for value in settings.damping_ratios])
+        axis.set_yticks(range(shape[1]), [f"{1e3 * value:g}" for value in settings.time_constants])
+        if i == 0:
+            axis.set_title(f"{1e3 * settings.timesteps[j]:g} ms")
+        if i == rows - 1:
+            axis.set_xlabel("damping ratio")
+        if j == 0:
+            axis.set_ylabel(f"{settings.impedances[i].label}\ntime constant, ms", fontsize=8)
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.01)
+    bar.set_ticks(
+        [1e-3, 1e-2, settings.tolerance, 0.3, 1],
+        labels=["≤ 0.1 %", "1 %", f"{settings.tolerance:.0%}", "30 %", "≥ 100 %"],
+    )
+    bar.ax.minorticks_off()
+    return figure
+
+
+def steps(outcome: Outcome):
+    """Errors of both gradients against how many steps a contact lasts; contacts that set in with a jump apart."""
+    figure, axes = subplots(1, 2, height=3.6, sharey=True, sharex=True)
+    has_jump = np.array([cell.impedance.first > 0 for cell in outcome.cells])
+    titles = ("Contact sets in with a jump of force", "Contact sets in gently")
+    for axis, chosen, title in zip(axes[0], (has_jump, ~has_jump), titles, strict=True):
+        judged = outcome.can_judge & chosen
+        for name, colour, marker in ((DISCRETE, FIRST, "o"), (EVENT, ZEROTH, "s")):
+            errors = np.maximum(outcome.error(name)[judged], 1e-4)
+            axis.plot(
+                outcome.steps_in_contact[judged], errors, marker, color=colour, ms=3.5, mec="none", alpha=0.6,
+                label=f"{name} gradient",
+            )  # fmt: skip
+        axis.axhline(outcome.settings.tolerance, color=MUTED, lw=1, ls=(0, (2, 3)))
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.set(title=title, xlabel="time steps that the contact lasts")
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
+    axes[0, 0].set_ylabel("error")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8.5)
+    return figure

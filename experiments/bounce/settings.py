@@ -1,0 +1,66 @@
+"""What an experiment on bounces can be told; imports nothing heavy."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from experiments.config import Positive, RunSettings, Settings
+
+Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+class ImpedanceSettings(Settings):
+    """The first three numbers of `solimp`."""
+
+    first: Share
+    """At the surface."""
+    last: Annotated[float, Field(gt=0, lt=1)]
+    """At depth `width`."""
+    width: Positive = 0.001
+    """Over which it rises, in m."""
+
+    @property
+    def label(self) -> str:
+        """Give a name for headings."""
+        if self.first == self.last:
+            return f"{self.first:g} throughout"
+        return f"{self.first:g} to {self.last:g} in {1e3 * self.width:g} mm"
+
+
+class BounceSettings(RunSettings):
+    """Derivatives of a bounce over contact parameters and time steps, with the closed form."""
+
+    damping_ratios: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=8)]
+    """Second number of `solref`."""
+    time_constants: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=8)]
+    """First number of `solref`, in s."""
+    impedances: Annotated[tuple[ImpedanceSettings, ...], Field(min_length=1, max_length=8)]
+    """Of `solimp`."""
+    timesteps: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=10)]
+    """In s, increasing."""
+    num_phases: Annotated[int, Field(ge=32)] = 64
+    """Start heights over which the slope and the means are taken."""
+    heights: tuple[Positive, Positive] = (0.01, 0.05)
+    """Between which the ball starts, in m above the floor."""
+    speed: Positive = 1.0
+    """Of the ball towards the floor, in m/s."""
+    duration: Positive = 0.2
+    """After which its height is read, in s."""
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """Error that a derivative may have, as a share of the larger of the slope and the discrete gradient's own error."""
+    coarse_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.3
+    """Error that it may have at the time step `coarse_timestep`, as a share of the slope."""
+    coarse_timestep: Positive = 2e-3
+    """In s; errors below `fine_timestep` are measured by `tolerance`."""
+    fine_timestep: Positive = 5e-4
+    """Largest time step at which `tolerance` is asked for, in s."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "BounceSettings":
+        if list(self.timesteps) != sorted(set(self.timesteps)):
+            raise ValueError(f"timesteps must increase, got {list(self.timesteps)}")
+        if not self.heights[0] < self.heights[1]:
+            raise ValueError(f"heights must be two numbers, the smaller one first, got {list(self.heights)}")
+        if self.heights[1] / self.speed >= self.duration:
+            raise ValueError("duration must be longer than heights[1] / speed, when the last ball lands")
+        return self
