@@ -4,8 +4,12 @@ The force of a contact rises with the impedance, from $d_0$ at the first touch t
 derivative of the discrete step knows of this rise only what the steps see of it. Two things hide it.
 
 *A jump.* The part $d_0$ is there at once, and its derivative is nowhere: that the time of impact moves goes unseen, at
-every time step. Each bounce adds about $-6 d_0$ to what should be minus the restitution (slide joint, critically damped or
-ζ = 0.3, $d_w = 0.95$).
+every time step. The derivative of the speed after a bounce by where it starts, which is zero, becomes $-d_0 / d_w$ of
+
+$$2 \zeta \omega_0 e,$$
+
+$e$ the restitution ($2 \zeta \omega_0 = b$ is what the dashpot gives a body of unit speed at the first touch, $e$ what the bounce
+leaves of it), and the place it reaches is off by that times the time since. With MuJoCo's default, 12.8 1/s.
 
 *A rise within a step.* With $d_0 = 0$ the simulated outcome is continuous, so the mean of the discrete derivative over
 where within a step the contact falls is right, however long the step. Its spread is not. With
@@ -13,14 +17,14 @@ where within a step the contact falls is right, however long the step. Its sprea
 $$n = \text{width} / (\text{approach speed} \times \text{time step}),$$
 
 the steps across the rise, a share $1 - n$ of all phases does not meet it at all if $n < 1$, and has the derivative of a
-jump; the rest make up for it with huge ones. The derivative of where a bounce ends by where it starts is −0.14 to −0.6, its
-standard deviation over phases ($h \omega_0$ from 0.02 to 0.1, MuJoCo's default at 2 ms being 0.1; ζ of 0.3 and 1)
+jump; the rest make up for it. The standard deviation over phases, in the unit above ($h \omega_0$ of 0.02 and of 0.1, MuJoCo's
+default at 2 ms; ζ of 0.3 and 1):
 
-| n | 0.03 | 0.3 | 1 | 2 | 3 | 10 |
-|---|---|---|---|---|---|---|
-| standard deviation | 36–40 | 10–11 | 3.2–3.6 | 0.02–0.28 | 0.34–0.39 | 0.03–0.44 |
+| n | 0.03 | 0.3 | 1 | 1.5 | 2 | 3 | 5 | 10 |
+|---|---|---|---|---|---|---|---|---|
+| standard deviation | 6.6–6.8 | 1.9 | 0.6 | 0.14–0.18 | 0.004–0.05 | 0.06 | 0.02–0.08 | 0.01–0.06 |
 
-Beyond `STEPS_NEEDED` it hardly falls: what remains comes from the spring, itself followed in few steps.
+From `STEPS_NEEDED` on, where both halves of the rise (MuJoCo's two parabolas) are met, it falls no further.
 
 So a first-order estimate from fewer samples than 1/n is biased as if $d_0$ were large, and nothing in the samples says
 so; then `gradient="event"`, shorter steps or a wider rise are called for.
@@ -38,10 +42,10 @@ from mjxgrad.dynamics.contact import contact_jacobian
 from mjxgrad.rollout import Trajectory
 from mjxgrad.scene import Scene
 
-STEPS_NEEDED = 3.0
+STEPS_NEEDED = 2.0
 """Steps across the rise of the impedance from which an onset is resolved."""
 LARGEST_JUMP = 0.01
-"""Impedance at the first touch up to which the force counts as continuous: it costs a derivative of 1 about 0.06."""
+"""Impedance at the first touch up to which the force counts as continuous."""
 
 
 class OnsetResolution(eqx.Module):

@@ -91,10 +91,11 @@ def _smaller_size(model: mjx.Model, pair: ContactPair) -> float:
     """Give the least half extent of two geoms, planes left out (m)."""
     sizes = []
     for geom in (pair.geom1, pair.geom2):
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
-            size = np.asarray(model.geom_size[geom], float)
-            is_round = model.geom_type[geom] in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE)
-            sizes.append(size[0] if is_round else size[size > 0].min(initial=np.inf))
+        kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), np.asarray(model.geom_size[geom], float)
+        if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+            sizes.append(size[0])
+        elif kind != mujoco.mjtGeom.mjGEOM_PLANE:
+            sizes.append(size[size > 0].min(initial=np.inf))
     return float(min(sizes, default=np.inf))
 
 

@@ -9,7 +9,8 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contacts import ContactPair, contact_pairs, deciding_geoms
 
 Selected = tuple[ContactPair, ...]
-_WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)
+# As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
+_WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
 _ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
 
 
