@@ -1,6 +1,7 @@
 """A rapidly exploring random tree whose metric is what a smoothed step can reach."""
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -9,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad.planning.smoothers import Smoother
-from mjxgrad.planning.tree import Nodes, lineage, planted, reach
+from mjxgrad.planning.tree import Nodes, Reach, lineage, planted, reach
 from mjxgrad.smoothing.system import System
+from mjxgrad.task import as_pytree
 
 # Kinds of samples: a pose of what the goal is about, wherever the rest may be; or all positions.
 _POSE, _EVERYTHING = 0, 1
@@ -46,6 +48,10 @@ class Path(eqx.Module):
     controls: Float[np.ndarray, "horizon m"]
 
 
+def _optional_pytree(function: Callable | None) -> Callable | None:
+    return None if function is None else as_pytree(function)
+
+
 class Sampling(eqx.Module):
     """Where samples fall, and how the tree grows towards them.
 
@@ -56,6 +62,8 @@ class Sampling(eqx.Module):
         goal_share: share of the samples that are the goal.
         transit_share: share that moves only what the goal is not about, from the pose of some node: to let go and begin
             elsewhere. As often as the goal is sampled, that node is the one nearest to it.
+        transit: where to begin elsewhere, from a key and that node's state to a state, such as next to the object; None is
+            anywhere between the bounds.
         batch: samples per turn.
         max_extension: steps towards one sample.
     """
@@ -65,6 +73,9 @@ class Sampling(eqx.Module):
     resolution: Float[Array, " p"] = eqx.field(converter=jnp.asarray)
     goal_share: float = 0.2
     transit_share: float = 0.3
+    transit: Callable[[PRNGKeyArray, Float[Array, " state"]], Float[Array, " state"]] | None = eqx.field(
+        converter=_optional_pytree, default=None
+    )
     batch: int = eqx.field(static=True, default=16)
     max_extension: int = eqx.field(static=True, default=8)
 
@@ -122,8 +133,7 @@ def search(
     weight = 1 / sampling.resolution**2
     weights = jnp.stack([jnp.where(matters, weight, 0.0), weight])
     grower = _Grower(system, smoother, sampling, start, goal, jnp.asarray(tolerance), weights, low, high)
-    root_key, key = jax.random.split(key)
-    root = planted(grower.node(start, jnp.zeros_like(low), jnp.asarray(-1), root_key), capacity)
+    root = planted(grower.root(), capacity)
 
     def may_go_on(carry: tuple) -> Bool[Array, ""]:
         nodes, _, turn, _ = carry
@@ -168,6 +178,17 @@ class _Grower(eqx.Module):
         error = jnp.max(jnp.abs(self.system.difference(state, self.goal)) / self.tolerance)
         return Nodes(state, control, parent, error, reach(model, radius, self.weights), jnp.asarray(1))
 
+    def root(self) -> Nodes:
+        """Return the start as a node that reaches nothing but itself.
+
+        A model of its own would be compiled a second time; the first extension of all stays where it is and makes one.
+        """
+        p, m, kinds = self.system.num_positions, self.lower.size, len(self.weights)
+        dtype = self.start.dtype
+        here = Reach(self.start, jnp.zeros((p, m), dtype), jnp.broadcast_to(jnp.eye(m, dtype=dtype), (kinds, m, m)))
+        error = jnp.max(jnp.abs(self.system.difference(self.start, self.goal)) / self.tolerance)
+        return Nodes(self.start, jnp.zeros(m, dtype), jnp.asarray(-1), error, here, jnp.asarray(1))
+
     def grow(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Nodes, Int[Array, ""]]:
         """Extend the tree towards a batch of samples; return it and the number of steps tried."""
         draw_key, model_key = jax.random.split(key)
@@ -189,12 +210,19 @@ class _Grower(eqx.Module):
         place = jax.random.uniform(place_key, (p,), self.start.dtype, settings.lower, settings.upper)
         any_node = jax.random.randint(node_key, (), 0, nodes.size)
         base = jnp.where(jax.random.uniform(best_key) < settings.goal_share, nodes.best, any_node)
-        held = self.system.difference(nodes.states[base], self.start)[:p]
-        matters = self.weights[_POSE] > 0
-        place = jnp.where(is_transit & matters, held, place)
-        change = jnp.zeros(self.system.num_changes, place.dtype).at[:p].set(place)
-        sample = jnp.where(is_goal, self.goal, self.system.retract(self.start, change))
+        anywhere = self._moved(place)
+        if settings.transit is None:
+            held = self.system.difference(nodes.states[base], self.start)[:p]
+            elsewhere = self._moved(jnp.where(self.weights[_POSE] > 0, held, place))
+        else:
+            elsewhere = settings.transit(place_key, nodes.states[base])
+        sample = jnp.where(is_goal, self.goal, jnp.where(is_transit, elsewhere, anywhere))
         return sample, jnp.where(is_transit, _EVERYTHING, _POSE)
+
+    def _moved(self, place: Float[Array, " p"]) -> Float[Array, " state"]:
+        """Return the start with its positions changed."""
+        change = jnp.zeros(self.system.num_changes, place.dtype).at[: place.size].set(place)
+        return self.system.retract(self.start, change)
 
     def extend(
         self,
@@ -218,7 +246,8 @@ class _Grower(eqx.Module):
             parent = jnp.where(step == 0, nearest, -2 - (number * most + step - 1))
             node = self.node(moved, control, parent, jax.random.fold_in(jax.random.fold_in(key, number), step))
             after, _ = node.reaches.distance(self.system, sample, self.weights, kind)
-            is_on &= jnp.all(jnp.isfinite(moved)) & (after < (1 - _PROGRESS) * distance)
+            is_first_of_all = (nodes.size == 1) & (number == 0) & (step == 0)
+            is_on &= jnp.all(jnp.isfinite(moved)) & ((after < (1 - _PROGRESS) * distance) | is_first_of_all)
             return (moved, node.reaches, is_on), (node, is_on)
 
         at = jax.tree.map(lambda x: x[nearest], (nodes.states, nodes.reaches))
