@@ -5,8 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.billiards.settings import BilliardsSettings
 from experiments.bounce.settings import BounceSettings
 from experiments.config import RunSettings
+from experiments.cube_toss.settings import CubeTossSettings
 from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.report import Report
@@ -34,6 +36,8 @@ class Experiment:
 
 
 EXPERIMENTS = {
+    "billiards": Experiment(BilliardsSettings, "experiments.billiards.run:run"),
+    "cube_toss": Experiment(CubeTossSettings, "experiments.cube_toss.run:run"),
     "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),

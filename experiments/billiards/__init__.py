@@ -1,0 +1,1 @@
+"""Optimal control of a stroke from balls that do not touch, by several methods."""

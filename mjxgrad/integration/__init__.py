@@ -15,6 +15,13 @@ box (`make cube_toss`), in the order of what to try first:
 
 from mjxgrad.integration.adaptive import AdaptiveTrajectory, adaptive_rollout
 from mjxgrad.integration.phase import phase_average, shifted_rollout
-from mjxgrad.integration.substeps import substepped_rollout
+from mjxgrad.integration.substeps import substepped_rollout, substepped_step
 
-__all__ = ["AdaptiveTrajectory", "adaptive_rollout", "phase_average", "shifted_rollout", "substepped_rollout"]
+__all__ = [
+    "AdaptiveTrajectory",
+    "adaptive_rollout",
+    "phase_average",
+    "shifted_rollout",
+    "substepped_rollout",
+    "substepped_step",
+]

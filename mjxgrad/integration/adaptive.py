@@ -59,7 +59,7 @@ def adaptive_rollout(
     times: Float[ArrayLike, " times"],
     controls: Callable[[Float[Array, ""]], Float[Array, " nu"]] | None = None,
     *,
-    tolerance: float = 1e-6,
+    tolerance: Float[ArrayLike, ""] = 1e-6,
     solver: Any = None,
     max_steps: int = 16384,
 ) -> AdaptiveTrajectory:
@@ -83,7 +83,8 @@ def adaptive_rollout(
         ValueError: if the tolerance or `max_steps` is not positive, or the times do not increase from zero on (where they are known).
         ImportError: if diffrax is not installed.
     """
-    if not tolerance > 0 or max_steps < 1:
+    is_known = not isinstance(tolerance, jax.core.Tracer)
+    if (is_known and not tolerance > 0) or max_steps < 1:
         raise ValueError(f"tolerance and max_steps must be positive, got {tolerance} and {max_steps}")
     diffrax = _diffrax()
     moments = jnp.asarray(times, state.qpos.dtype)

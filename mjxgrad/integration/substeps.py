@@ -45,21 +45,38 @@ def substepped_rollout(
     if num_substeps < 2:
         raise ValueError(f"num_substeps must be at least 2, got {num_substeps}: use rollout")
     rows = control_rows(scene, controls, horizon)
-    short = scene.model.tree_replace({"opt.timestep": scene.model.opt.timestep / num_substeps})
 
     def advance(state: State, control: Float[Array, " nu"], _: Float[Array, ""]) -> State:
-        before = data_of(scene, state, control)
-        after = step(scene.model, before, gradient=gradient)
-
-        def refine(start: State) -> State:
-            def substep(state: State, _: None) -> tuple[State, None]:
-                return state_of(step(short, data_of(scene, state, control), gradient=gradient)), None  # pyright: ignore[reportArgumentType]
-
-            return jax.lax.scan(substep, start, length=num_substeps)[0]
-
-        return jax.lax.cond(_holds_event(scene.model, before, after), refine, lambda _: state_of(after), state)
+        data = data_of(scene, state, control)
+        return state_of(substepped_step(scene.model, data, num_substeps=num_substeps, gradient=gradient))
 
     return march(scene, state, rows, jnp.full(len(rows), scene.model.opt.timestep), advance)
+
+
+def substepped_step(
+    model: mjx.Model, data: mjx.Data, *, num_substeps: int, gradient: Gradient = "discrete"
+) -> mjx.Data:
+    """Advance by one time step, in short steps if a contact or limit begins or ends in it; see `substepped_rollout`.
+
+    Args:
+        model: as for `step`.
+        data: the present state.
+        num_substeps: short steps in a step that holds an event.
+        gradient: as for `step`.
+
+    Returns:
+        Data whose state is one time step later. Its other fields are those of the last step taken, long or short.
+    """
+    after = step(model, data, gradient=gradient)
+    short = model.tree_replace({"opt.timestep": model.opt.timestep / num_substeps})
+
+    def refine(data: mjx.Data) -> mjx.Data:
+        def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            return step(short, data, gradient=gradient), None  # pyright: ignore[reportArgumentType]
+
+        return jax.lax.scan(substep, data, length=num_substeps)[0]
+
+    return jax.lax.cond(_holds_event(model, data, after), refine, lambda _: after, data)
 
 
 def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:

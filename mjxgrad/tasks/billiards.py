@@ -1,7 +1,8 @@
 r"""A driven ball has to knock another, which it does not touch, to a target.
 
-The cost is $|x_2(T)|^2 + \epsilon \int |u|^2 dt$. Standing still costs 2. The derivative knows nothing of the second ball as long as the balls
-do not touch: what solves the task is a force that acts from a distance, or noise under which some rollouts do touch.
+The cost is $|x_2(T)|^2 + \epsilon \int |u|^2 dt$. Standing still costs 2. The derivative knows nothing of the second ball as
+long as the balls do not touch: what solves the task is a force that acts from a distance, or noise under which some rollouts
+do touch.
 
 References:
     Zhong, Han, Brikis. Differentiable Physics Simulations with Contacts: Do They Have Correct Gradients w.r.t. Position,
@@ -14,9 +15,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjxgrad.dynamics import Gradient, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
+from mjxgrad.smoothing.smoothing import Smoothing
 from mjxgrad.softness import Softness
 from mjxgrad.task import finite_cost
 from mjxgrad.tasks.files import scene_path
@@ -26,15 +29,16 @@ _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)
 
 
 class Billiards(eqx.Module):
-    """The stroke; see `billiards`.
+    r"""The stroke; see `billiards`.
 
     Attributes:
         scene: both balls.
         target: where the knocked ball should be in the end, in m.
-        effort: $\\epsilon$, price of the squared force, in m²/(N² s).
+        effort: $\epsilon$, price of the squared force, in m²/(N² s).
         num_pieces: the force is constant over as many pieces of the time.
         horizon: number of steps, a multiple of `num_pieces`.
         gradient: "discrete" or "event", as for `rollout`.
+        smoothing: as for `rollout`.
     """
 
     scene: Scene
@@ -42,7 +46,8 @@ class Billiards(eqx.Module):
     effort: Float[Array, ""]
     num_pieces: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
-    gradient: str = eqx.field(static=True, default="discrete")
+    gradient: Gradient = eqx.field(static=True, default="discrete")
+    smoothing: Smoothing | None = None
 
     def start(self, force: float = 1.0) -> Float[Array, " dim"]:
         """Give a constant force towards the other ball; below 1.43 N per axis the balls do not touch."""
@@ -54,7 +59,8 @@ class Billiards(eqx.Module):
 
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
         """Play once."""
-        return rollout(self.scene, initial_state(self.scene), self.controls(params), gradient=self.gradient)
+        start = initial_state(self.scene)
+        return rollout(self.scene, start, self.controls(params), gradient=self.gradient, smoothing=self.smoothing)
 
     def cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
         """Give the squared distance to the target plus the price of the effort, in m²; NaN if the rollout diverged."""
@@ -74,9 +80,18 @@ class Billiards(eqx.Module):
         """Give the same stroke with other contact softness."""
         return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
 
-    def with_gradient(self, gradient: str) -> "Billiards":
-        """Give the same stroke with another derivative; see `rollout`."""
+    def with_gradient(self, gradient: Gradient) -> "Billiards":
+        """Give the same stroke with another derivative; see `rollout`.
+
+        Raises:
+            ValueError: if there is no such gradient.
+        """
+        check_gradient(gradient)
         return dataclasses.replace(self, gradient=gradient)
+
+    def with_smoothing(self, smoothing: Smoothing | None) -> "Billiards":
+        """Give the same stroke with its contact averaged over noise on the distance; see `rollout`."""
+        return dataclasses.replace(self, smoothing=smoothing)
 
     def objective(self, stddev: float | Float[Array, ""]) -> ParameterNoise:
         """Give the cost as a function of the forces, with noise on each of them.
@@ -90,14 +105,13 @@ class Billiards(eqx.Module):
         return parameter_noise(self.cost, stddev, dim=2 * self.num_pieces)
 
 
-def billiards(*, num_pieces: int = 20, timestep: float | None = None, gradient: str = "discrete") -> Billiards:
+def billiards(*, num_pieces: int = 20, timestep: float | None = None) -> Billiards:
     """Load the stroke: the balls are 1.01 m apart, the target is 1.41 m behind the second, and there is one second of time.
 
     Args:
         num_pieces: the force is constant over as many pieces of the second; with 20 the optimum is dearer by 0.0005 than
             that of a force that may change at any time.
         timestep: in s; None takes the scene's, 1/960 s. It must divide a piece.
-        gradient: "discrete" or "event", as for `rollout`.
 
     Returns:
         The task; its parameters are the forces, in N.
@@ -109,4 +123,4 @@ def billiards(*, num_pieces: int = 20, timestep: float | None = None, gradient: 
     horizon = round(1 / scene.mj_model.opt.timestep)
     if num_pieces < 1 or horizon % num_pieces:
         raise ValueError(f"num_pieces must divide the {horizon} steps of a second, got {num_pieces}")
-    return Billiards(scene, jnp.zeros(2), jnp.asarray(0.1), num_pieces, horizon, gradient)
+    return Billiards(scene, jnp.zeros(2), jnp.asarray(0.1), num_pieces, horizon)

@@ -1,0 +1,175 @@
+"""From settings to numbers: derivatives of the throw, their error and their time."""
+
+import functools
+import time
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import mjxgrad as mg
+from experiments.cube_toss.outcome import Course, Outcome, Point
+from experiments.cube_toss.settings import CubeTossSettings
+from experiments.failure import ExperimentError
+from experiments.workspace import Workspace
+from mjxgrad._mjx import mjx
+from mjxgrad.integration import adaptive_rollout, substepped_step
+from mjxgrad.integration.march import data_of
+from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
+
+# Half the step of the reference's difference quotient (m/s), and its tolerance: what rounding and truncation leave are below 1e-4.
+_STEP, _TOLERANCE = 1e-4, 1e-10
+_REPEATS = 3
+
+Program = Callable[..., Float[Array, " throws"]]
+_STATE = ("qpos", "qvel", "time", "qacc_warmstart")
+
+
+def measure(settings: CubeTossSettings, workspace: Workspace) -> Outcome:
+    """Take the derivative of every throw by every method.
+
+    Args:
+        settings: of the run.
+        workspace: for the clock.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        ExperimentError: if a time step does not divide the throw, or the reference fails.
+    """
+    for timestep in (*settings.timesteps, *settings.refined_timesteps):
+        if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
+            raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
+    speeds = PUBLISHED_SPEED + settings.interval * (jnp.arange(settings.num_throws) / settings.num_throws - 0.5)
+    jobs = _jobs(settings)
+    courses = []
+    with workspace.stage("derivatives", "points", len(settings.contacts) * (1 + len(jobs))) as advance_to:
+        programs = _programs(settings)
+        for contact in settings.contacts:
+            task = cube_toss(contact)
+            reference, _, failed = programs["reference"](task, speeds, jnp.asarray(_TOLERANCE))
+            if bool(np.any(failed)):
+                raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")
+            points = []
+            for name, setting in jobs:
+                points.append(_point(programs, name, task, setting, speeds, np.asarray(reference)))
+                advance_to(len(courses) * (1 + len(jobs)) + 1 + len(points))
+            courses.append(Course(contact, np.asarray(speeds), np.asarray(reference), tuple(points)))
+    return Outcome(settings, tuple(courses))
+
+
+def _jobs(settings: CubeTossSettings) -> list[tuple[str, float]]:
+    fixed = [(name, h) for name in ("discrete", "event") for h in settings.timesteps]
+    refined = [(name, h) for name in ("phases", "substeps") for h in settings.refined_timesteps]
+    adaptive = [(name, tol) for name in ("adaptive", "quotient") for tol in settings.tolerances]
+    return fixed + refined + adaptive
+
+
+def _point(
+    programs: dict[str, Program], name: str, task: CubeToss, setting: float, speeds: Array, reference: np.ndarray
+) -> Point:
+    def call():
+        return jax.block_until_ready(programs[name](task, speeds, jnp.asarray(setting)))
+
+    started = time.perf_counter()
+    derivative, num_steps, failed = call()
+    first = time.perf_counter() - started
+    # Processor time: what else runs on the machine does not count.
+    spent = []
+    for _ in range(_REPEATS):
+        begun = time.process_time()
+        call()
+        spent.append(time.process_time() - begun)
+    return Point(
+        method=name,
+        setting=setting,
+        derivative=np.asarray(derivative),
+        error=np.asarray(derivative) - reference,
+        seconds=float(np.median(spent)) / len(speeds),
+        first_seconds=first,
+        num_steps=float(np.mean(num_steps)),
+        has_failed=bool(np.any(failed)),
+    )
+
+
+def _programs(settings: CubeTossSettings) -> dict[str, Program]:
+    """One program per method, whatever the contact and the time step; each takes the throws one after the other."""
+    centred = (jnp.arange(settings.num_phases) + 0.5) / settings.num_phases
+
+    def fixed(gradient: str, phases: Array):
+        def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+            return mg.step(model, data, gradient=gradient)  # pyright: ignore[reportArgumentType]
+
+        return _marching(step, phases)
+
+    def short(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        return substepped_step(model, data, num_substeps=settings.num_substeps, gradient="event")
+
+    return {
+        "discrete": fixed("discrete", jnp.ones(1)),
+        "event": fixed("event", jnp.ones(1)),
+        "phases": fixed("event", centred),
+        "substeps": _marching(short, jnp.ones(1)),
+        "adaptive": _one_by_one(_adaptive_derivative),
+        "quotient": _one_by_one(_adaptive_quotient),
+        "reference": _one_by_one(_adaptive_quotient),
+    }
+
+
+def _one_by_one(derivative: Callable) -> Program:
+    @eqx.filter_jit
+    def program(task: CubeToss, speeds: Array, setting: Array):
+        return jax.lax.map(lambda speed: derivative(task, speed, setting), speeds)
+
+    return program
+
+
+def _marching(step: Callable[[mjx.Model, mjx.Data], mjx.Data], phases: Array) -> Program:
+    """Forward mode through steps whose length and number are traced; the mean over phases (1 is no shift)."""
+
+    def derivative(task: CubeToss, speed: Array, timestep: Array):
+        def at(phase: Array) -> Array:
+            end = functools.partial(_end, task, timestep=timestep, phase=phase, step=step)
+            return jax.jvp(end, (speed,), (jnp.ones_like(speed),))[1]
+
+        return jnp.mean(jax.vmap(at)(phases)), DURATION / timestep, jnp.zeros((), bool)
+
+    return _one_by_one(derivative)
+
+
+def _end(task: CubeToss, speed: Array, timestep: Array, phase: Array, step: Callable) -> Array:
+    scene = task.scene
+    start = data_of(scene, task.start(speed), scene.data.ctrl)
+    whole = jnp.round(DURATION / timestep).astype(int)
+
+    def advance(i: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        duration = timestep * jnp.where(i == 0, phase, jnp.where(i == whole, 1 - phase, 1.0))
+        model = scene.model.tree_replace({"opt.timestep": duration})
+        moved = step(model, start.replace(**dict(zip(_STATE, state, strict=True))))
+        return tuple(getattr(moved, name) for name in _STATE)
+
+    # A whole grid has no last, short step.
+    count = jnp.where(phase == 1, whole, whole + 1)
+    final = jax.lax.fori_loop(0, count, advance, tuple(getattr(start, name) for name in _STATE))
+    return task.outcome(final[0])
+
+
+def _adaptive_end(task: CubeToss, speed: Array, tolerance: Array):
+    found = adaptive_rollout(task.scene, task.start(speed), jnp.array([DURATION]), tolerance=tolerance, max_steps=2**16)
+    return task.outcome(found.qpos[-1]), (found.num_steps, found.has_failed)
+
+
+def _adaptive_derivative(task: CubeToss, speed: Array, tolerance: Array):
+    derivative, (num_steps, failed) = jax.grad(_adaptive_end, argnums=1, has_aux=True)(task, speed, tolerance)
+    return derivative, num_steps.astype(float), failed
+
+
+def _adaptive_quotient(task: CubeToss, speed: Array, tolerance: Array):
+    ends, (num_steps, failed) = jax.lax.map(
+        lambda at: _adaptive_end(task, at, tolerance), jnp.stack([speed - _STEP, speed + _STEP])
+    )
+    return (ends[1] - ends[0]) / (2 * _STEP), jnp.sum(num_steps).astype(float), jnp.any(failed)

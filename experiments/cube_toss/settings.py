@@ -1,0 +1,30 @@
+"""What the experiment on the thrown cube can be told; imports nothing heavy."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from experiments.config import Positive, RunSettings
+
+
+class CubeTossSettings(RunSettings):
+    """Error of a derivative against processor time, for time steps and methods."""
+
+    contacts: Annotated[tuple[Literal["published", "default"], ...], Field(min_length=1)] = ("published", "default")
+    """Of the cube with the floor: as DiffMJX published it, whose force begins continuously, or MuJoCo's default."""
+    timesteps: Annotated[tuple[Positive, ...], Field(min_length=2)]
+    """For plain and event-corrected derivatives, in s; each must divide a second."""
+    refined_timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    """For averages over the phase and for short steps at events, in s."""
+    tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    """Of the adaptive integration."""
+    num_phases: Annotated[int, Field(ge=2)] = 8
+    """Over which an average is taken."""
+    num_substeps: Annotated[int, Field(ge=2)] = 8
+    """In a step that holds an event."""
+    num_throws: Annotated[int, Field(ge=3)] = 6
+    """Throws at slightly different speed, over which the error is taken; single derivatives depend on chance."""
+    interval: Positive = 0.005
+    """That the speeds of these throws span, in m/s."""
+    target_error: Positive = 0.02
+    """Share of the derivative that the verdict asks for."""

@@ -1,0 +1,77 @@
+"""A cube is thrown down on a plane; where does it end, and how does that depend on the throw?
+
+References:
+    Paulus, Geist, Schumacher, Musil, Rappenecker, Martius. Hard Contacts with Soft Gradients: Refining Differentiable
+    Simulators for Learning and Control (DiffMJX). arXiv:2506.14186; the cube of its timing experiment.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from mjxgrad.rollout import State, initial_state
+from mjxgrad.scene import Scene, load_scene
+from mjxgrad.tasks.files import scene_path
+
+DURATION = 1.0  # s
+PUBLISHED_SPEED = -2.0  # m/s, upwards
+PUBLISHED_DERIVATIVE = 0.17267  # m per m/s
+_DRIFT = -0.1  # m/s, sideways
+
+# (solref, solimp): what DiffMJX was timed on, and what MuJoCo takes if nothing is said.
+_CONTACTS = {
+    "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
+    "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),
+}
+
+Contact = Literal["published", "default"]
+
+
+class CubeToss(eqx.Module):
+    """The throw; see `cube_toss`.
+
+    Attributes:
+        scene: the cube and the floor.
+    """
+
+    scene: Scene
+
+    def start(self, speed: Float[ArrayLike, ""]) -> State:
+        """Give the state at the throw.
+
+        Args:
+            speed: upwards, in m/s.
+        """
+        qvel = jnp.zeros_like(self.scene.data.qvel).at[1].set(_DRIFT).at[2].set(speed)
+        return initial_state(self.scene, qvel=qvel)
+
+    def outcome(self, qpos: Float[Array, "*states 7"]) -> Float[Array, "*states"]:
+        """Give how far sideways the cube is, in m."""
+        return qpos[..., 1]
+
+
+def cube_toss(contact: Contact = "published", *, timestep: float | None = None) -> CubeToss:
+    """Load the throw.
+
+    Args:
+        contact: "published", which begins without a jump of force, or "default", MuJoCo's own, which jumps.
+        timestep: in s; None takes the scene's, 1 ms.
+
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: if there is no such contact.
+    """
+    if contact not in _CONTACTS:
+        raise ValueError(f"contact must be one of {', '.join(map(repr, _CONTACTS))}, got {contact!r}")
+    scene = load_scene(scene_path("cube_toss"), timestep=timestep)
+    solref, solimp = _CONTACTS[contact]
+    model = scene.model
+    model = model.replace(
+        pair_solref=jnp.broadcast_to(jnp.array(solref, model.pair_solref.dtype), model.pair_solref.shape),
+        pair_solimp=jnp.broadcast_to(jnp.array(solimp, model.pair_solimp.dtype), model.pair_solimp.shape),
+    )
+    return CubeToss(eqx.tree_at(lambda s: s.model, scene, model))
