@@ -82,6 +82,15 @@ def smoothed(
     return rows, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=first)
 
 
+def noisy_rows(
+    model: mjx.Model, block: Block, smoothing: Smoothing, layout: RowLayout
+) -> tuple[Block, Noise, RowLayout]:
+    """Return contact rows under noise that are a whole problem's, as `smoothed` does; all at a known distance."""
+    known = jnp.ones(len(block.residual) // block.rows_each, bool)
+    block, noise = _noisy(model, block, known, smoothing.length.astype(block.residual.dtype), smoothing)
+    return block, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=0)
+
+
 def _noisy(
     model: mjx.Model, block: Block, known: Bool[Array, " groups"], length: Float[Array, ""], smoothing: Smoothing
 ) -> tuple[Block, Noise]:

@@ -71,7 +71,7 @@ class Kernel(abc.ABC):
         """Return the density of the noise, the derivative of `share` but for its sign."""
 
     def depth(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return the mean penetration, given that there is contact."""
+        """Return the mean penetration, given that there is contact; held beyond `reach`, where there is next to none."""
         near = jnp.minimum(distance, self.reach)
         return self.ramp(near) / self.share(near)
 
@@ -131,7 +131,7 @@ class LogBarrier(Kernel):
 
 
 KERNELS: dict[str, Kernel] = {
-    "gaussian": Gaussian(reach=7.6, stddev=1.0),
-    "logistic": Logistic(reach=18.0, stddev=math.pi * _LOGISTIC_SCALE / math.sqrt(3)),
-    "log_barrier": LogBarrier(reach=1e7, stddev=math.inf),
+    "gaussian": Gaussian(reach=6.0, stddev=1.0),
+    "logistic": Logistic(reach=11.0, stddev=math.pi * _LOGISTIC_SCALE / math.sqrt(3)),
+    "log_barrier": LogBarrier(reach=1e4, stddev=math.inf),
 }

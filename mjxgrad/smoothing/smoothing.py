@@ -58,8 +58,9 @@ class Smoothing(eqx.Module):
     """
 
     length: Float[Array, "..."] = eqx.field(converter=_as_length)
-    kernel: KernelName = eqx.field(static=True, default="gaussian")
-    mode: Mode = eqx.field(static=True, default="forward")
+    # Plain strings, so that a name that there is not meets the check below, which knows the choices.
+    kernel: str = eqx.field(static=True, default="gaussian")
+    mode: str = eqx.field(static=True, default="forward")
     limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_optional_length, default=None, kw_only=True)
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
@@ -95,10 +96,9 @@ class Smoothing(eqx.Module):
             ValueError: if a length has a leading axis, or the event correction is asked for, too.
         """
         for name in ("length", "limit_length"):
-            if jnp.ndim(getattr(self, name)) and getattr(self, name) is not None:
-                raise ValueError(
-                    f"{name} must be one value for a step, got shape {getattr(self, name).shape}: sweep under jax.vmap"
-                )
+            value = getattr(self, name)
+            if value is not None and value.ndim:
+                raise ValueError(f"{name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap")
         if gradient == "event":
             raise ValueError(
                 "gradient must be 'discrete' with smoothing, got 'event': the derivative of a smoothed contact already knows "
