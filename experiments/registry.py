@@ -11,6 +11,7 @@ from experiments.config import RunSettings
 from experiments.cube_toss.settings import CubeTossSettings
 from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
+from experiments.planning.settings import PlanningSettings
 from experiments.report import Report
 from experiments.textbook.settings import TextbookSettings
 from experiments.workspace import Workspace
@@ -42,5 +43,6 @@ EXPERIMENTS = {
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
+    "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

@@ -1,0 +1,1 @@
+"""Plans through contact on smoothed linear models."""

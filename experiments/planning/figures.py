@@ -1,0 +1,146 @@
+"""The pictures of a planning experiment."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from experiments.planning.outcome import Attempt, Outcome
+from experiments.report import Figure
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+
+_COLOURS = {"analytic": ZEROTH, "mean_jacobian": FIRST, "least_squares": "#009e73", "none": DEFAULT}
+_HALF_LENGTH, _RADIUS = 0.1, 0.02  # m, of the rod's axis; of rod and finger
+_EVERY = 3  # decisions between the poses drawn
+_DECISION = 0.1  # s
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw all figures.
+
+    Args:
+        outcome: the plans.
+        folder: of the run.
+        captions: of the figures, by name.
+
+    Returns:
+        The figures in order of reading.
+    """
+    pictures = {"plane": ("The plan, seen from above", plane), "pose": ("Where the rod is", pose)}
+    if outcome.settings.method == "trajectory":
+        pictures = {"cost": ("Cost against iterations", cost)} | pictures
+    else:
+        pictures = {"tree": ("The tree", tree)} | pictures
+    return [
+        Figure(save(drawing(outcome), folder, name), title, captions[name])
+        for name, (title, drawing) in pictures.items()
+    ]
+
+
+def cost(outcome: Outcome):
+    """True and smoothed cost against iterations, beside the smoothing length."""
+    figure, axes = subplots(1, 2, height=3.6, width_ratios=[2, 1])
+    left, right = axes[0]
+    for attempt in outcome.attempts:
+        colour = _COLOURS[attempt.model]
+        true, smoothed = attempt.course["cost"], attempt.course["smoothed_cost"]
+        left.plot(np.arange(len(true)), true, color=colour, lw=2, label=attempt.label)
+        if attempt.model != "none":
+            left.plot(1 + np.arange(len(smoothed)), smoothed, color=colour, lw=0.9)
+            right.plot(1 + np.arange(len(smoothed)), 1e3 * attempt.course["length"], color=REFERENCE)
+    left.set_yscale("log")
+    left.set(title="Cost", xlabel="iteration")
+    left.legend(loc="upper right")
+    right.set_yscale("log")
+    right.set(title="Smoothing length in mm", xlabel="iteration")
+    return figure
+
+
+def tree(outcome: Outcome):
+    """The rod's places in the tree, and the nearest to the goal against nodes."""
+    figure, axes = subplots(1, 2, height=4.6)
+    left, right = axes[0]
+    best = outcome.shortest(outcome.settings.models[0])
+    assert best.nodes is not None and best.parents is not None  # noqa: PT018
+    places = best.nodes[:, 2:4]
+    joined = np.stack([places[best.parents[1:]], places[1:]], axis=1)
+    left.add_collection(LineCollection(list(joined), colors=MUTED, linewidths=0.5, alpha=0.6))
+    left.plot(*places.T, ".", ms=1.5, color=MUTED)
+    left.plot(*best.states[:, 2:4].T, color=ZEROTH, lw=2.2, label="way found")
+    left.plot(*best.states[0, 2:4], "o", color=REFERENCE, ms=5, label="start")
+    left.plot(*outcome.goal[:2], "*", color=FIRST, ms=11, label="goal", zorder=4)
+    left.set(title="Rod's centre in the nodes", xlabel="x in m", ylabel="y in m", aspect="equal")
+    left.margins(0.08)
+    left.legend(loc="upper left")
+    seen = set()
+    for attempt in outcome.attempts:
+        error = attempt.course["error"]
+        label = None if attempt.model in seen else attempt.label
+        seen.add(attempt.model)
+        colour = _COLOURS[attempt.model]
+        right.step(1 + np.arange(len(error)), error, where="post", color=colour, lw=1.4, label=label)
+        right.plot(len(error), error[-1], "o" if error[-1] <= 1 else "x", color=colour, ms=5)
+    right.axhline(1, color=REFERENCE, lw=0.9, ls=(0, (2, 3)))
+    right.set_xscale("log")
+    right.set_yscale("log")
+    right.set(title="Nearest to the goal, in tolerances", xlabel="nodes")
+    right.legend(loc="lower left")
+    return figure
+
+
+def plane(outcome: Outcome):
+    """Rod and finger along the plan."""
+    best = outcome.best
+    shown = list(range(0, len(best.states), _EVERY))
+    parts = _stages(best, shown)
+    figure, axes = subplots(1, len(parts), height=4.4, sharex=True, sharey=True)
+    for axis, part in zip(axes[0], parts, strict=True):
+        for number, colour in zip(part, shades(len(part)), strict=True):
+            _rod(axis, best.states[number, 2:5], color=colour, alpha=0.55)
+            axis.add_patch(_disc(best.states[number, :2], color=colour))
+        axis.plot(*best.states[part[0] : part[-1] + 1, :2].T, color=FIRST, lw=1.2)
+        _rod(axis, outcome.goal, facecolor="none", edgecolor=REFERENCE, ls="--", lw=1.2)
+        axis.add_patch(_disc(best.states[part[0], :2], facecolor="none", edgecolor=FIRST, lw=1.5))
+        axis.set(title=f"{part[0] * _DECISION:.1f} to {part[-1] * _DECISION:.1f} s", xlabel="x in m", aspect="equal")
+    axes[0, 0].set_ylabel("y in m")
+    axes[0, 0].autoscale_view()
+    return figure
+
+
+def pose(outcome: Outcome):
+    """The rod's coordinates against time."""
+    figure, axes = subplots(1, 3, height=2.9)
+    best = outcome.best
+    time = _DECISION * np.arange(len(best.states))
+    for i, (axis, title) in enumerate(zip(axes[0], ("x in m", "y in m", "turn in rad"), strict=True)):
+        axis.axhline(outcome.goal[i], color=REFERENCE, lw=1, ls=(0, (4, 3)))
+        axis.plot(time, best.states[:, 2 + i], color=_COLOURS[best.model])
+        axis.set(title=title, xlabel="time in s")
+        axis.margins(y=0.15)
+    return figure
+
+
+def _stages(attempt: Attempt, shown: list[int], most: int = 9) -> list[list[int]]:
+    """Split the poses to be drawn into panels that overlap in one pose: too many on one another hide what happens."""
+    count = max(1, -(-(len(shown) - 1) // (most - 1)))
+    ends = np.linspace(0, len(shown) - 1, count + 1).round().astype(int)
+    return [shown[a : b + 1] for a, b in zip(ends, ends[1:], strict=False)]
+
+
+def _rod(axis: Axes, pose: np.ndarray, **look) -> None:
+    """Draw a capsule as the outline of two half circles."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 20)
+    right = np.stack([_HALF_LENGTH + _RADIUS * np.cos(angle), _RADIUS * np.sin(angle)])
+    outline = np.concatenate([right, -right], axis=1)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = np.array([[cos, -sin], [sin, cos]]) @ outline + pose[:2, None]
+    axis.fill(x, y, **({"lw": 0} | look))
+    # The end that the scene paints in another colour tells one half turn from the other.
+    axis.plot(pose[0] + cos * _HALF_LENGTH, pose[1] + sin * _HALF_LENGTH, ".", color=REFERENCE, ms=3)
+
+
+def _disc(centre: np.ndarray, **look):
+    from matplotlib.patches import Circle
+
+    return Circle((float(centre[0]), float(centre[1])), _RADIUS, **look)

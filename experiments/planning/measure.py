@@ -1,0 +1,184 @@
+"""From settings to plans."""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mjxgrad as mg
+from experiments.planning.outcome import Attempt, Outcome
+from experiments.planning.settings import PlanningSettings
+from experiments.workspace import Workspace
+from mjxgrad.planning import (
+    Analytic,
+    Exact,
+    GoalCost,
+    Plan,
+    Sampled,
+    Sampling,
+    Smoother,
+    optimise_trajectory,
+    path,
+    search,
+)
+from mjxgrad.smoothing import Smoothing
+from mjxgrad.tasks.planar_pusher import PlanarPusher, beside_rod, planar_pusher
+
+# Weights of the rod's x, y and turn; a turn of 0.17 rad counts as much as 0.03 m.
+_ROD = (0.0, 0.0, 1.0, 1.0, 0.03, 0.0, 0.0, 0.0, 0.0, 0.0)
+_STAGE, _TERMINAL = 0.3, 100.0
+# Where the tree samples, around the start (m, rad): the rod's pose, and the finger where `beside_rod` does not say.
+_RANGE = (0.3, 0.3, 0.25, 0.25, 3.3)
+
+
+def measure(settings: PlanningSettings, workspace: Workspace) -> Outcome:
+    """Plan in every way that is asked for.
+
+    Args:
+        settings: of the run.
+        workspace: for the clock.
+
+    Returns:
+        The plans.
+    """
+    task = planar_pusher(finger=settings.finger, goal=settings.goal)
+    attempts, polished = [], None
+    num_seeds = settings.tree.num_seeds if settings.method == "tree" else 1
+    with workspace.stage("planning", "attempts", len(settings.models) * num_seeds) as advance_to:
+        for model in settings.models:
+            run = _tree(task, settings, model) if settings.method == "tree" else _trajectory(task, settings, model)
+            for seed in range(num_seeds):
+                attempts.append(run(seed))
+                advance_to(len(attempts))
+    found = Outcome(settings, attempts, None, np.zeros((1, 5)), 0.0)
+    if settings.method == "tree" and settings.tree.polish_iterations:
+        shortest = found.shortest(settings.models[0])
+        if found.is_solved(shortest):
+            with workspace.stage("polishing", "ways", 1) as advance_to:
+                polished = _polish(task, settings, shortest)
+                advance_to(1)
+    best = polished or found.best
+    with workspace.stage("rollout", "rollouts", 1):
+        shown, timestep = _shown(task, best)
+    return Outcome(settings, attempts, polished, shown, timestep)
+
+
+def _smoother(model: str, settings: PlanningSettings, length: float) -> Smoother:
+    """Give the linear models; sampled ones have noise of the same length on positions, less on velocities."""
+    if model == "none":
+        return Exact()
+    if model == "analytic":
+        return Analytic(Smoothing(length))
+    rod_turn = length / 0.1  # as far at the rod's end
+    state = jnp.array([length] * 4 + [rod_turn] + [0.1 * length] * 5)
+    return Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
+
+
+def _cost(task: PlanarPusher, settings: PlanningSettings) -> GoalCost:
+    weight = jnp.array(_ROD)
+    return GoalCost(task.goal, _STAGE * weight, _TERMINAL * weight, settings.control_weight)
+
+
+def _trajectory(task: PlanarPusher, settings: PlanningSettings, model: str):
+    """Give the function that optimises a trajectory from resting controls."""
+    count = settings.num_iterations
+    last = settings.last_length / settings.length
+    schedule = np.concatenate([np.ones(count // 6), np.geomspace(1, last, count - 2 * (count // 6))])
+    schedule = np.append(schedule, np.full(count // 6, last))
+
+    def run(seed: int) -> Attempt:
+        begin = time.perf_counter()
+        controls = jnp.zeros((settings.horizon, 2))
+        plan = _optimised(task, settings, controls, _smoother(model, settings, settings.length), schedule, seed)
+        return _planned(plan, model, seed, time.perf_counter() - begin, settings.length)
+
+    return run
+
+
+def _polish(task: PlanarPusher, settings: PlanningSettings, way: Attempt) -> Attempt:
+    """Optimise a way that was found."""
+    begin, length = time.perf_counter(), settings.tree.polish_length
+    schedule = np.geomspace(1, min(1, settings.last_length / length), settings.tree.polish_iterations)
+    smoother = _smoother(way.model, settings, length)
+    plan = _optimised(task, settings, jnp.asarray(way.controls), smoother, schedule, way.seed)
+    return _planned(plan, way.model, way.seed, time.perf_counter() - begin, length)
+
+
+@eqx.filter_jit
+def _optimised(
+    task: PlanarPusher,
+    settings: PlanningSettings,
+    controls: jax.Array,
+    smoother: Smoother,
+    schedule: np.ndarray,
+    seed: int,
+) -> Plan:
+    limit = task.speed_limit
+    return optimise_trajectory(
+        task.system,
+        _cost(task, settings),
+        task.start,
+        controls,
+        jax.random.key(settings.seed + seed),
+        smoother=smoother,
+        schedule=schedule,
+        lower=-limit,
+        upper=limit,
+    )
+
+
+def _planned(plan: Plan, model: str, seed: int, seconds: float, length: float) -> Attempt:
+    rows = plan.iterations
+    course = {
+        "length": length * np.asarray(rows.factor),
+        "smoothed_cost": np.asarray(rows.smoothed_cost),
+        "cost": np.append(plan.start_cost, rows.cost),
+        "step": np.asarray(rows.step),
+    }
+    return Attempt(model, seed, seconds, np.asarray(plan.states), np.asarray(plan.controls), course)
+
+
+def _tree(task: PlanarPusher, settings: PlanningSettings, model: str):
+    """Give the function that grows a tree from a seed; all seeds share one program."""
+    tree, width = settings.tree, jnp.array(_RANGE)
+    free = [np.inf] * 2
+    tolerance = np.array([*free, *[tree.position_tolerance] * 2, tree.angle_tolerance, *[np.inf] * 5])
+    resolution = jnp.array([tree.position_resolution] * 4 + [tree.angle_resolution])
+    sampling = Sampling(-width, width, resolution, transit=beside_rod)
+
+    @eqx.filter_jit
+    def grow(key):
+        return search(
+            task.system,
+            task.start,
+            task.goal,
+            tolerance,
+            key,
+            smoother=_smoother(model, settings, settings.length),
+            sampling=sampling,
+            lower=-task.speed_limit,
+            upper=task.speed_limit,
+            capacity=tree.capacity,
+            max_turns=tree.max_turns,
+        )
+
+    def run(seed: int) -> Attempt:
+        begin = time.perf_counter()
+        found = jax.block_until_ready(grow(jax.random.fold_in(jax.random.key(settings.seed), seed)))
+        seconds, way, size = time.perf_counter() - begin, path(found), int(found.nodes.size)
+        course = {"error": np.minimum.accumulate(np.asarray(found.nodes.errors)[:size])}
+        nodes, parents = np.asarray(found.nodes.states)[:size], np.asarray(found.nodes.parents)[:size]
+        return Attempt(model, seed, seconds, way.states, way.controls, course, nodes, parents)
+
+    return run
+
+
+def _shown(task: PlanarPusher, attempt: Attempt) -> tuple[np.ndarray, float]:
+    """Roll the scene itself out under the controls of a plan, every time step kept."""
+    system = task.system
+    state = mg.initial_state(system.scene, qpos=system.positions(task.start))
+    controls = jnp.repeat(jnp.asarray(attempt.controls), system.num_substeps, axis=0)
+    trajectory = eqx.filter_jit(mg.rollout)(system.scene, state, controls)
+    return np.asarray(trajectory.qpos), float(system.scene.model.opt.timestep)

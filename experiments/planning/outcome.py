@@ -1,0 +1,117 @@
+"""The numbers of a planning experiment, and what follows from them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from experiments.planning.settings import NAMES, PlanningSettings
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way of planning.
+
+    Attributes:
+        model: which linear models it used.
+        seed: of its random numbers.
+        seconds: wall time, compilation included where it was the first of its kind.
+        states: that the system goes through under the controls that it found.
+        controls: finger speeds.
+        course: numbers by name along its iterations or nodes.
+        nodes: the states of a tree, none for a trajectory.
+        parents: of these nodes.
+    """
+
+    model: str
+    seed: int
+    seconds: float
+    states: Float[np.ndarray, "states state"]
+    controls: Float[np.ndarray, "horizon 2"]
+    course: dict[str, Float[np.ndarray, " count"]]
+    nodes: Float[np.ndarray, "nodes state"] | None = None
+    parents: Int[np.ndarray, " nodes"] | None = None
+
+    @property
+    def label(self) -> str:
+        """Give a name for legends."""
+        return NAMES[self.model]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was found.
+
+    Attributes:
+        settings: of the run.
+        attempts: in the order of the settings, seeds last.
+        polished: the shortest way of the first kind after trajectory optimisation, if it was asked for and there is one.
+        shown: positions of the best plan at every time step, from a rollout of its own.
+        timestep: between these (s).
+    """
+
+    settings: PlanningSettings
+    attempts: list[Attempt]
+    polished: Attempt | None
+    shown: Float[np.ndarray, "steps 5"]
+    timestep: float
+
+    @property
+    def goal(self) -> Float[np.ndarray, " 3"]:
+        """Where the rod is to be."""
+        return np.asarray(self.settings.goal)
+
+    def distance(self, attempt: Attempt) -> float:
+        """Give the distance of the rod from its goal in the end (m)."""
+        return float(np.hypot(*(attempt.states[-1, 2:4] - self.goal[:2])))
+
+    def angle(self, attempt: Attempt) -> float:
+        """Give the angle between the rod and its goal in the end (rad)."""
+        return float(abs(attempt.states[-1, 4] - self.goal[2]))
+
+    def is_solved(self, attempt: Attempt) -> bool:
+        """Say whether the rod is at its goal, as near as the settings ask for."""
+        tree = self.settings.tree
+        off = np.abs(attempt.states[-1, 2:4] - self.goal[:2])
+        return bool((off <= tree.position_tolerance).all() and self.angle(attempt) <= tree.angle_tolerance)
+
+    def moved(self, attempt: Attempt) -> float:
+        """Give which share of the way to the goal was made good, in units of the tolerances."""
+        tree = self.settings.tree
+        units = np.array([tree.position_tolerance, tree.position_tolerance, tree.angle_tolerance])
+        before, after = (np.max(np.abs(attempt.states[i, 2:5] - self.goal) / units) for i in (0, -1))
+        return float(1 - after / before)
+
+    def of(self, model: str) -> list[Attempt]:
+        """Give all attempts with one kind of linear model."""
+        return [attempt for attempt in self.attempts if attempt.model == model]
+
+    @property
+    def best(self) -> Attempt:
+        """Give what figures and video show: the polished way, else the shortest solved one of the first kind."""
+        return self.polished or self.shortest(self.settings.models[0])
+
+    def shortest(self, model: str) -> Attempt:
+        """Give the solved attempt of fewest steps, or the one that came nearest."""
+        attempts = self.of(model)
+        solved = [attempt for attempt in attempts if self.is_solved(attempt)]
+        return min(solved, key=lambda one: len(one.controls)) if solved else max(attempts, key=self.moved)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give one row per attempt for the table of metrics."""
+        named = [("", attempt) for attempt in self.attempts] + ([(" polished", self.polished)] if self.polished else [])
+        return [
+            {
+                "model": attempt.model + suffix,
+                "seed": attempt.seed,
+                "is_solved": self.is_solved(attempt),
+                "distance_m": self.distance(attempt),
+                "angle_rad": self.angle(attempt),
+                "num_steps": len(attempt.controls),
+                "num_nodes": 0 if attempt.nodes is None else len(attempt.nodes),
+                "final_cost": float(attempt.course["cost"].min()) if "cost" in attempt.course else float("nan"),
+                "seconds": attempt.seconds,
+            }
+            for suffix, attempt in named
+        ]

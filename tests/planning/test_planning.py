@@ -1,0 +1,242 @@
+"""Plans on smoothed models: against dense least squares where they are exact, and where contact must be made."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from mjxgrad.planning import (
+    Analytic,
+    Exact,
+    FunctionSystem,
+    GoalCost,
+    Sampled,
+    Sampling,
+    optimise_trajectory,
+    path,
+    search,
+)
+from mjxgrad.planning.box import minimise_in_box
+from mjxgrad.planning.tree import reach
+from mjxgrad.smoothing import Smoothing
+from mjxgrad.smoothing.linear_model import LinearModel
+
+A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.02, 0.0], [0.1, 0.05]])
+HORIZON, START, GOAL = 6, jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3])
+STAGE, TERMINAL, CONTROL = jnp.array([1.0, 0.3]), jnp.array([20.0, 5.0]), 0.01
+GAP = 0.3
+
+
+def affine(state, control):
+    return A @ state + B @ control
+
+
+def pushed(state, control):
+    """A finger and a block on a rail; the block gives way to the finger, and does not come along."""
+    finger = state[0] + control[0]
+    return jnp.stack([finger, jnp.maximum(state[1], finger)])
+
+
+def dense():
+    """The same problem as one least-squares problem ½ |G u − r|² in all controls."""
+    powers = [np.linalg.matrix_power(A, i) for i in range(HORIZON + 1)]
+    rows, right = [], []
+    for t in range(HORIZON + 1):
+        weight = np.sqrt(np.asarray(TERMINAL if t == HORIZON else STAGE))
+        blocks = [powers[t - 1 - i] @ B if i < t else np.zeros((2, 2)) for i in range(HORIZON)]
+        rows.append(weight[:, None] * np.concatenate(blocks, axis=1))
+        right.append(weight * (np.asarray(GOAL) - powers[t] @ np.asarray(START)))
+    rows.append(np.sqrt(CONTROL) * np.eye(2 * HORIZON))
+    right.append(np.zeros(2 * HORIZON))
+    return np.concatenate(rows), np.concatenate(right)
+
+
+@pytest.fixture(scope="module")
+def planned():
+    """From a limit to the plan of the linear problem."""
+    cost = GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
+
+    @eqx.filter_jit
+    def run(limit):
+        system = FunctionSystem(affine, 2, 2)
+        return optimise_trajectory(
+            system, cost, START, jnp.zeros((HORIZON, 2)), jax.random.key(0), smoother=Exact(),
+            schedule=np.ones(25), lower=-limit, upper=limit,
+        )  # fmt: skip
+
+    return run
+
+
+@pytest.mark.parametrize("limit", [1e3, 2.0])
+def test_a_linear_plan_is_the_optimum_of_dense_least_squares(planned, limit):
+    G, r = dense()
+    expected = lsq_linear(G, r, (-limit, limit), tol=1e-13)
+    plan = planned(jnp.array(limit))
+    if limit < 10:
+        assert (np.abs(expected.x) > 0.999 * limit).sum() > 2
+    # The step's regularisation of 1e-6 leaves a share of that of the way in each iteration.
+    np.testing.assert_allclose(plan.controls.ravel(), expected.x, atol=1e-5)
+    np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-8)
+    assert plan.converged
+
+
+def test_one_step_on_a_linear_problem_falls_by_what_it_promised(planned):
+    plan = planned(jnp.array(1e3))
+    np.testing.assert_allclose(plan.iterations.promised[0], plan.start_cost - plan.iterations.cost[0], rtol=1e-6)
+    assert plan.iterations.step[0] == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_program_in_a_box_has_the_minimum_of_bounded_least_squares(seed):
+    rng = np.random.default_rng(seed)
+    root, gradient = np.tril(rng.normal(size=(4, 4))) + 2 * np.eye(4), 4 * rng.normal(size=4)
+    low, high = -rng.uniform(0, 1, 4), rng.uniform(0, 1, 4)
+    found = minimise_in_box(*map(jnp.asarray, (root @ root.T, gradient, low, high)))
+    expected = lsq_linear(root.T, -np.linalg.solve(root, gradient), (low, high), tol=1e-14)
+    np.testing.assert_allclose(found.value, expected.x, atol=1e-7)
+    assert found.is_sound
+
+
+def test_the_distance_from_a_reach_is_that_of_its_inverse_covariance():
+    rng = np.random.default_rng(1)
+    J, radius, resolution = rng.normal(size=(3, 2)), np.array([0.5, 2.0]), np.array([0.1, 0.2, 0.3])
+    none = jnp.zeros((3, 0))
+    model = LinearModel(none, jnp.array(J), jnp.zeros(3), none, jnp.zeros((3, 2)), jnp.zeros(3), jnp.ones(()))
+    weights = jnp.stack([jnp.array(resolution**-2.0) * jnp.array([1, 1, 0]), jnp.array(resolution**-2.0)])
+    away, system = rng.normal(size=3), FunctionSystem(affine, 3, 2)
+    for kind, counts in ((0, [0, 1]), (1, [0, 1, 2])):
+        covariance = (J * radius**2 @ J.T + np.diag(resolution**2))[np.ix_(counts, counts)]
+        expected = away[counts] @ np.linalg.solve(covariance, away[counts])
+        found, control = reach(model, jnp.array(radius), weights).distance(
+            system, jnp.array(away), weights, jnp.array(kind)
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-10)
+        # The ridge solution of the same problem, in units of the reach.
+        scaled = (J * radius / resolution[:, None])[counts]
+        ridge = np.linalg.solve(scaled.T @ scaled + np.eye(2), scaled.T @ (away / resolution)[counts])
+        np.testing.assert_allclose(control, ridge, rtol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def pushing():
+    """From a smoother to the plan that brings the block from 0 to 1; the finger starts short of it."""
+
+    def run(smoother):
+        cost = GoalCost(jnp.array([0.0, 1.0]), jnp.zeros(2), jnp.array([0.0, 10.0]), 0.01)
+
+        @eqx.filter_jit
+        def plan(smoother):
+            return optimise_trajectory(
+                FunctionSystem(pushed, 2, 1), cost, jnp.array([-GAP, 0.0]), jnp.zeros((8, 1)), jax.random.key(0),
+                smoother=smoother, schedule=np.geomspace(1, 0.01, 25), lower=-0.4, upper=0.4,
+            )  # fmt: skip
+
+        return plan(smoother)
+
+    return run
+
+
+@pytest.mark.parametrize("order", ["first", "zeroth"])
+def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(pushing, order):
+    plan = pushing(Sampled(0.3, 0.05, 30, order))
+    # The finger's way is GAP + 1 in eight steps: (1 + GAP)² / 8 squared controls, half of it at a weight of 0.01.
+    assert plan.cost < 1.1 * 0.5 * 0.01 * (1 + GAP) ** 2 / 8
+    assert plan.start_cost == 5.0
+    np.testing.assert_allclose(plan.states[-1, 1], 1.0, atol=0.01)
+    assert np.all(np.abs(plan.controls) <= 0.4)
+
+
+def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves(pushing):
+    plan = pushing(Exact())
+    assert plan.cost == plan.start_cost
+    np.testing.assert_array_equal(plan.controls, 0)
+
+
+def test_a_plan_is_the_rollout_of_its_controls(pushing):
+    plan = pushing(Sampled(0.3, 0.05, 30, "first"))
+    state = plan.states[0]
+    for control, expected in zip(plan.controls, plan.states[1:], strict=True):
+        state = pushed(state, control)
+        np.testing.assert_allclose(state, expected, atol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def searched():
+    """From a smoother to the search for a way of the block from 0 to 1; the finger starts behind it."""
+    sampling = Sampling(-2 * jnp.ones(2), 2 * jnp.ones(2), 0.01 * jnp.ones(2), batch=4, max_extension=4)
+
+    @eqx.filter_jit
+    def run(smoother):
+        return search(
+            FunctionSystem(pushed, 2, 1), jnp.array([-GAP, 0.0]), jnp.array([0.0, 1.0]), np.array([np.inf, 0.02]),
+            jax.random.key(0), smoother=smoother, sampling=sampling, lower=-0.1, upper=0.1, capacity=500, max_turns=30,
+        )  # fmt: skip
+
+    return run
+
+
+def test_a_tree_by_smoothed_reach_finds_a_way_that_is_a_rollout(searched):
+    found = searched(Sampled(0.2, 0.02, 20, "zeroth"))
+    assert found.is_solved
+    way = path(found)
+    np.testing.assert_array_equal(way.states[0], [-GAP, 0.0])
+    np.testing.assert_allclose(way.states[-1, 1], 1.0, atol=0.02)
+    assert np.all(np.abs(way.controls) <= 0.1 + 1e-12)
+    for before, control, after in zip(way.states, way.controls, way.states[1:], strict=False):
+        np.testing.assert_allclose(pushed(before, control), after, atol=1e-12)
+
+
+def test_a_tree_knows_the_parent_of_every_node(searched):
+    nodes = jax.tree.map(np.asarray, searched(Sampled(0.2, 0.02, 20, "zeroth")).nodes)
+    for i in range(1, int(nodes.size)):
+        assert 0 <= nodes.parents[i] < i
+        np.testing.assert_allclose(
+            pushed(nodes.states[nodes.parents[i]], nodes.controls[i]), nodes.states[i], atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"schedule": []}, "schedule must be one factor per iteration"),
+        ({"schedule": [1.0, 0.0]}, r"schedule must be positive, got 0: for no smoothing take Exact\(\)"),
+        ({"lower": 1.0, "upper": 0.0}, "lower must be at most upper"),
+        ({"controls": np.zeros((3, 1))}, r"controls must have shape \(horizon, 2\)"),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused_in_a_sentence(settings, sentence):
+    settings = {"controls": np.zeros((3, 2)), "smoother": Exact(), "schedule": [1.0]} | settings
+    cost = GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
+    with pytest.raises(ValueError, match=sentence):
+        optimise_trajectory(FunctionSystem(affine, 2, 2), cost, START, key=jax.random.key(0), **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"tolerance": np.full(2, np.inf)}, "tolerance must be finite for at least one position"),
+        ({"tolerance": np.zeros(2)}, "tolerance must be positive"),
+        ({"upper": np.inf}, "limits of the controls must be finite"),
+        ({"capacity": 10}, "capacity must be at least 129"),
+        ({"sampling": Sampling(-jnp.ones(3), jnp.ones(3), jnp.ones(3))}, r"sampling.lower must have shape \(2,\)"),
+    ],
+)
+def test_a_search_that_cannot_be_is_refused_in_a_sentence(settings, sentence):
+    sampling = Sampling(-jnp.ones(2), jnp.ones(2), jnp.ones(2))
+    settings = {"tolerance": np.ones(2), "lower": -1.0, "upper": 1.0, "sampling": sampling} | settings
+    with pytest.raises(ValueError, match=sentence):
+        search(FunctionSystem(affine, 2, 2), START, GOAL, key=jax.random.key(0), smoother=Exact(), **settings)
+
+
+def test_a_smoother_scales_all_that_has_a_length():
+    analytic = Analytic(Smoothing(0.2, "logistic", limit_length=0.4)).scaled(0.5)
+    assert (analytic.smoothing.length, analytic.smoothing.limit_length, analytic.smoothing.kernel) == (
+        0.1,
+        0.2,
+        "logistic",
+    )
+    sampled = Sampled(jnp.array([0.2, 0.4]), 0.6, 3).scaled(0.5)
+    np.testing.assert_allclose(sampled.stddev_state, [0.1, 0.2])
+    np.testing.assert_allclose(sampled.stddev_control, 0.3)
