@@ -1,5 +1,6 @@
 r"""Contacts that MuJoCo alters without a word, or that the time step cannot follow."""
 
+import jax
 import mujoco
 import numpy as np
 
@@ -53,7 +54,9 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     """
     if not pairs:
         return []
-    parameters = contact_parameters(model, pairs)
+    # Inside jit, operations on known values would be traced, too.
+    with jax.ensure_compile_time_eval():
+        parameters = contact_parameters(model, pairs)
     solref, stiffness, damping = (
         np.asarray(x, dtype=float) for x in (parameters.solref, parameters.stiffness, parameters.damping)
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import jax
 import mujoco
 import numpy as np
 
@@ -35,11 +36,14 @@ def softness_warnings(softness: Softness, model: mjx.Model, mj_model: mujoco.MjM
                     f"impedance {value:g} has the effect of {np.clip(value, low, high):g}: "
                     f"MuJoCo keeps it between {low:g} and {high:g}"
                 )
-    if is_known(softness.margin) and is_known(model.geom_margin):
+    leaves = (softness.margin, model.geom_margin, model.pair_margin, model.geom_solref, model.opt.gravity)
+    if all(is_known(leaf) for leaf in leaves):
         pairs = softness.selected(model)
-        messages += _grouped(_resting_otherwise(softness, model, pairs))
-        if mj_model is not None:
-            messages += _grouped(_pushed_apart(model, mj_model, pairs))
+        # Inside jit, operations on known values would be traced, too.
+        with jax.ensure_compile_time_eval():
+            messages += _grouped(_resting_otherwise(softness, model, pairs))
+            if mj_model is not None:
+                messages += _grouped(_pushed_apart(model, mj_model, pairs))
     return messages
 
 
