@@ -13,6 +13,7 @@ from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.planning.settings import PlanningSettings
 from experiments.report import Report
+from experiments.rolling_pin.settings import RollingPinSettings
 from experiments.textbook.settings import TextbookSettings
 from experiments.workspace import Workspace
 
@@ -44,5 +45,6 @@ EXPERIMENTS = {
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
+    "rolling_pin": Experiment(RollingPinSettings, "experiments.rolling_pin.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

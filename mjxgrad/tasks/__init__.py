@@ -6,12 +6,14 @@ from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
 from mjxgrad.tasks.friction import friction
 from mjxgrad.tasks.motion_planning import motion_planning
 from mjxgrad.tasks.push import push, push_softness
+from mjxgrad.tasks.rolling_pin import RollingPin, rolling_pin
 from mjxgrad.tasks.story import StoryTask
 from mjxgrad.tasks.tennis import tennis
 
 __all__ = [
     "BallWall",
     "Outcome",
+    "RollingPin",
     "SceneTask",
     "StoryTask",
     "Task",
@@ -21,6 +23,7 @@ __all__ = [
     "published",
     "push",
     "push_softness",
+    "rolling_pin",
     "tennis",
     "textbook",
     "wall_softness",

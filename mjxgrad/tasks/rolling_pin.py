@@ -32,6 +32,7 @@ from mjxgrad.tasks.files import scene_path
 NUM_PILLARS = 8
 DENT = (2, 3, 4, 5)
 DEPTH = 0.015  # m
+STIFFNESS = 1e4  # 1/s², of the scene's contact, which is critically damped
 
 
 class DentCost(eqx.Module):
@@ -67,6 +68,11 @@ class DentCost(eqx.Module):
 
 class RollingPin(SceneTask):
     """The pin and its bed; see `rolling_pin`. Every remedy gives another task, of the same controls."""
+
+    @property
+    def target(self) -> Float[Array, " pillars"]:
+        """Heights wished for, less those at rest (m)."""
+        return self.cost.target  # pyright: ignore[reportFunctionMemberAccess]
 
     def with_softness(self, softness: Softness) -> "RollingPin":
         """Give the task with other contact, such as a margin."""
