@@ -1,8 +1,8 @@
 r"""The same stroke with hard balls: closed forms that share no code with the simulation.
 
-A driven ball from rest, accelerated by $u$, has to cover the vector $d$ in the time $s$ and arrive at velocity $v$. The least
-$\int |u|^2$ for that is $12 |d|^2/s^3 - 12\, d \cdot v/s^2 + 4 |v|^2/s$ (a force linear in time). Then both balls, of equal mass, exchange
-what is along the line of centres.
+A driven ball from rest, accelerated by $u$, has to cover the vector $d$ in the time $s$ and arrive at velocity $v$. The
+least $\int |u|^2$ for that is $12 |d|^2/s^3 - 12\, d \cdot v/s^2 + 4 |v|^2/s$ (a force linear in time). Then both balls, of
+equal mass, exchange what is along the line of centres.
 """
 
 import numpy as np
@@ -56,7 +56,8 @@ def cost(forces: np.ndarray, restitution: float = 1.0) -> float:
         times = np.linspace(0, piece, 200)
         inside = np.flatnonzero([distance(t) < 0 for t in times])
         if inside.size:
-            time = brentq(distance, times[inside[0] - 1], times[inside[0]]) if inside[0] else 0.0
+            bracket = times[inside[0] - 1], times[inside[0]]
+            time = float(brentq(distance, *bracket)) if inside[0] else 0.0  # pyright: ignore[reportArgumentType]
             normal = KNOCKED - (position + time * velocity + time**2 / 2 * force)
             normal /= np.linalg.norm(normal)
             speed = (velocity + time * force) @ normal * (1 + restitution) / 2

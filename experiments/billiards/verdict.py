@@ -47,7 +47,8 @@ def findings(outcome: Outcome) -> list[str]:
     return [
         f"Played on balls that collide in no time (another program: closed forms and root finding), the forces of "
         f"{best.method.label} cost {best.hard_cost:.4f}; the optimum over all forces is {outcome.optimum[0]:.6f}, as published.",
-        "The simulated cost may lie below that by half a per cent: a soft collision takes time, in which the driven ball goes on pushing.",
+        "The simulated cost may lie below that by half a per cent: a soft collision takes time, in which the driven ball "
+        "goes on pushing.",
     ]
 
 

@@ -20,7 +20,7 @@ from mjxgrad.integration import adaptive_rollout, substepped_step
 from mjxgrad.integration.march import data_of
 from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 
-# Half the step of the reference's difference quotient (m/s), and its tolerance: what rounding and truncation leave are below 1e-4.
+# Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10
 _REPEATS = 3
 

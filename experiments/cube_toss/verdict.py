@@ -34,9 +34,10 @@ def findings(outcome: Outcome) -> list[str]:
     published = [course for course in outcome.courses if course.contact == "published"]
     if published:
         found.append(
-            f"DiffMJX published the derivative {PUBLISHED_DERIVATIVE:g} for these measures and 1.9 % error in 9.2 s after 67 s of "
-            f"compilation; here it is {quantity(published[0].scale)} (C MuJoCo's steps of 10 µs give 0.571). That simulator has other "
-            "contacts (they act from a distance, with a softened collision), so its times are beside ours, not of the same problem."
+            f"DiffMJX published the derivative {PUBLISHED_DERIVATIVE:g} for these measures, and 1.9 % error in 9.2 s after 67 s "
+            f"of compilation; here it is {quantity(published[0].scale)} (C MuJoCo's steps of 10 µs give 0.571). That simulator "
+            "softens collisions and lets contacts act from a distance, and ran on other hardware: its times stand beside "
+            "ours, not for the same problem."
         )
     slowest = {
         method: max(p.first_seconds for c in outcome.courses for p in c.of(method))
@@ -126,8 +127,8 @@ def _choice(course: Course) -> str | None:
     names = ", ".join(f"{METHODS[p.method]} at {p.setting:g} s" for p in won)
     tail = f" ({names})" if won else ""
     return (
-        f"{_CONTACTS[course.contact]} averaging over phases or short steps at events beat an event-corrected derivative that takes no "
-        f"longer in {len(won)} of {total} settings{tail}."
+        f"{_CONTACTS[course.contact]} averaging over phases or short steps at events beat an event-corrected derivative that "
+        f"takes no longer in {len(won)} of {total} settings{tail}."
     )
 
 

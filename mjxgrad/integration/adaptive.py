@@ -1,18 +1,18 @@
 r"""Adaptive integration with diffrax: the motion to any accuracy, as a reference for steps of fixed length.
 
-The state moves by $\dot v = $ `forward`'s acceleration and $\dot q = $ the velocity carried to the coordinates: a quaternion turns by
-$\tfrac12 q \otimes (0, \omega)$, whose norm the integration keeps to its tolerance, and every use normalises it. A force that jumps makes the
-error control reject steps until one is short enough that the jump does no harm.
+The state moves by $\dot v = $ `forward`'s acceleration and $\dot q = $ the velocity carried to the coordinates: a quaternion
+turns by $\tfrac12 q \otimes (0, \omega)$, whose norm the integration keeps to its tolerance, and every use normalises it. A
+force that jumps makes the error control reject steps until one is short enough that the jump does no harm.
 
-**Its derivative.** Reverse mode goes through the accepted steps. Where contact forces begin continuously ($d_0 = 0$) it converges
-to the derivative of the motion. Where they jump (MuJoCo's default, $d_0 = 0.9$) it does not, at any tolerance: the jump falls into some step and
-stays there, as in steps of fixed length. A reference for the derivative is then the difference quotient of two adaptive
-rollouts, whose motion is accurate either way.
+**Its derivative.** Reverse mode goes through the accepted steps. Where contact forces begin continuously ($d_0 = 0$) it
+converges to the derivative of the motion. Where they jump (MuJoCo's default, $d_0 = 0.9$) it does not, at any tolerance: the
+jump falls into some step and stays there, as in steps of fixed length. A reference for the derivative is then the difference
+quotient of two adaptive rollouts, whose motion is accurate either way.
 
 References:
     Kidger. On Neural Differential Equations. PhD thesis, Oxford 2021 (diffrax).
-    Paulus, Geist, Schumacher, Musil, Rappenecker, Martius. Hard Contacts with Soft Gradients: Refining Differentiable Simulators for Learning and
-    Control (DiffMJX). arXiv:2506.14186, whose adaptive integration this follows, without its contact from a distance.
+    Paulus, Geist, Schumacher, Musil, Rappenecker, Martius. Hard Contacts with Soft Gradients: Refining Differentiable
+    Simulators for Learning and Control (DiffMJX). arXiv:2506.14186, which integrates so, too, with contact from a distance.
 """
 
 from collections.abc import Callable
@@ -65,7 +65,8 @@ def adaptive_rollout(
 ) -> AdaptiveTrajectory:
     """Integrate a scene with error control.
 
-    Differentiable in reverse mode; see the module for what the derivative misses. Needs diffrax (`pip install 'mjxgrad[adaptive]'`).
+    Differentiable in reverse mode; see the module for what the derivative misses. Needs diffrax
+    (`pip install 'mjxgrad[adaptive]'`).
 
     Args:
         scene: from `load_scene`. Its integrator is not used; its time step only where `refsafe` clamps contact parameters.
@@ -80,11 +81,12 @@ def adaptive_rollout(
         The states, and what they cost.
 
     Raises:
-        ValueError: if the tolerance or `max_steps` is not positive, or the times do not increase from zero on (where they are known).
+        ValueError: if the tolerance or `max_steps` is not positive, or the times do not increase from zero on (where they are
+            known).
         ImportError: if diffrax is not installed.
     """
     is_known = not isinstance(tolerance, jax.core.Tracer)
-    if (is_known and not tolerance > 0) or max_steps < 1:
+    if (is_known and not np.all(np.asarray(tolerance) > 0)) or max_steps < 1:
         raise ValueError(f"tolerance and max_steps must be positive, got {tolerance} and {max_steps}")
     diffrax = _diffrax()
     moments = jnp.asarray(times, state.qpos.dtype)

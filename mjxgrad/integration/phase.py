@@ -32,8 +32,8 @@ def shifted_rollout(
     """Roll out over the same time on a grid that is shifted by a fraction of a step.
 
     A control acts over the same interval as in `rollout`: a shifted step that holds the end of one interval gets the mean of both
-    controls, weighted by time. Differentiable both ways, traceable in the phase. Contact parameters that `refsafe` clamps at two time
-    steps are clamped less in the two short steps.
+    controls, weighted by time. Differentiable both ways, traceable in the phase. Contact parameters that `refsafe` clamps at
+    two time steps are clamped less in the two short steps.
 
     Args:
         scene: from `load_scene`.
@@ -69,14 +69,17 @@ def phase_average(
 ) -> Callable[..., PyTree]:
     """Average a function of arguments and a phase over the phase.
 
-        outcome = lambda height, phase: mg.integration.shifted_rollout(scene, start(height), phase=phase, horizon=500).qpos[-1, 2]
-        slope = jax.grad(mg.integration.phase_average(outcome, 16))(0.3)
+        def outcome(height, phase):
+            return shifted_rollout(scene, start(height), phase=phase, horizon=500).qpos[-1, 2]
+
+        slope = jax.grad(phase_average(outcome, 16))(0.3)
 
     Args:
         function: called as `function(*args, phase)`, under `jax.vmap`.
-        num_phases: N, at least 1. The phases are (i + ½)/N: where the outcome is a sawtooth in the phase their mean is off by 1/N of
-            its height at most, that of N random ones by 1/√N.
-        key: moves all phases by the same random amount up to 1/N, so that the mean over keys is that over all phases.
+        num_phases: N, at least 1. The phases are (i + ½)/N: where the outcome is a sawtooth in the phase their mean is off
+            by 1/N of its height at most, that of N random ones by 1/√N.
+        key: moves all phases by the same random amount up to 1/N, so that the mean over keys is that over all phases. None
+            leaves them where they are.
 
     Returns:
         A function of the arguments alone.
