@@ -9,6 +9,7 @@ from experiments.billiards.settings import BilliardsSettings
 from experiments.bounce.settings import BounceSettings
 from experiments.config import RunSettings
 from experiments.cube_toss.settings import CubeTossSettings
+from experiments.kernels.settings import KernelsSettings
 from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.planning.settings import PlanningSettings
@@ -43,6 +44,7 @@ EXPERIMENTS = {
     "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
+    "kernels": Experiment(KernelsSettings, "experiments.kernels.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
     "rolling_pin": Experiment(RollingPinSettings, "experiments.rolling_pin.run:run"),

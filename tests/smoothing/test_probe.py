@@ -1,5 +1,7 @@
 """What noise a contact's profile stands for."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,8 +16,13 @@ LENGTH, REACH = 2e-3, 0.05
 CONSTANT, RISING = ".9 .9 .001", ".9 .95 .001"
 
 
+@functools.cache
+def _scene(solimp, margin):
+    return mg.load_scene(SCENE.format(solimp, margin))
+
+
 def _probe(solimp=CONSTANT, margin=0.0, **settings):
-    return probe(contact_profile(mg.load_scene(SCENE.format(solimp, margin)), **settings), reach=REACH)
+    return probe(contact_profile(_scene(solimp, margin), **settings), reach=REACH)
 
 
 @pytest.mark.parametrize("name", list(DISTRIBUTIONS))

@@ -1,0 +1,165 @@
+"""From settings to numbers."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import mjxgrad as mg
+from experiments.kernels.outcome import Linear, Motion, Outcome, Profile
+from experiments.kernels.settings import KernelsSettings
+from experiments.workspace import Workspace
+from mjxgrad.smoothing import KERNELS
+from mjxgrad.smoothing.probe import contact_profile, probe
+
+# A ball on a slide joint over a plane, without gravity, driven by a force.
+_SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" tolerance="1e-12"/>
+<default><geom condim="1" solref="{time_constant} 1" solimp="{first} {last} .002" margin="{margin}"/></default><worldbody>
+<geom type="plane" size="1 1 .1"/><body pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
+</worldbody><actuator><motor joint="z"/></actuator></mujoco>"""
+
+# Noise on velocity and force (m/s, N), for derivatives by them; so little that it smooths nothing.
+_LITTLE = 1e-3
+
+
+def measure(settings: KernelsSettings, workspace: Workspace) -> Outcome:
+    """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise.
+
+    Args:
+        settings: of the run.
+        workspace: for the clock.
+
+    Returns:
+        The numbers.
+    """
+    scene = _scene(settings, settings.impedance, settings.impedance)
+    profiles = _profiles(settings)
+    motions, linear = {}, {}
+    hard, hard_slope = _smoothed_motion(scene, settings, None)
+    with workspace.stage("kernels", "kernels", len(settings.kernels)) as advance_to:
+        for i, name in enumerate(settings.kernels):
+            motion_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), i))
+            height, slope = _smoothed_motion(scene, settings, mg.Smoothing(settings.length, name))
+            motions[name] = Motion(height, slope, *_sampled_motion(scene, settings, name, motion_key))
+            linear[name] = [_linear(scene, settings, name, v, step_key) for v in (0.0, -settings.speed)]
+            advance_to(i + 1)
+    time = settings.timestep * np.arange(settings.horizon + 1)
+    return Outcome(settings, profiles, time, hard, hard_slope, motions, linear)
+
+
+def _scene(settings: KernelsSettings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
+    text = _SCENE.format(
+        timestep=settings.timestep, time_constant=settings.time_constant, first=first, last=last, margin=margin
+    )
+    return mg.load_scene(text)
+
+
+def _profiles(settings: KernelsSettings) -> list[Profile]:
+    """Probe each kernel on a constant impedance, and what MuJoCo has of its own."""
+    plain = _scene(settings, 0.9, 0.9)
+    cases = {name: contact_profile(plain, smoothing=mg.Smoothing(settings.length, name)) for name in settings.kernels}
+    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=settings.length))
+    cases["impedance"] = contact_profile(_scene(settings, 0.2, 0.9))
+    grid = np.linspace(-4 * settings.length, 4 * settings.length, 401)
+    return [
+        Profile(name, grid, np.asarray(profile(jnp.asarray(grid))), probe(profile, reach=25 * settings.length))
+        for name, profile in cases.items()
+    ]
+
+
+def _draw(name: str, key: Array, shape: tuple[int, ...]) -> Array:
+    """Draw noise in units of the length."""
+    uniform = jax.random.uniform(key, shape, minval=1e-12, maxval=1.0)
+    if name == "gaussian":
+        return jax.scipy.stats.norm.ppf(uniform)
+    size = np.sqrt(2 / np.pi)  # the mean size that all kernels share
+    if name == "logistic":
+        return size / (2 * np.log(2)) * (jnp.log(uniform) - jnp.log1p(-uniform))
+    # Student's t with two degrees of freedom.
+    return size * (uniform - 0.5) / jnp.sqrt(uniform * (1 - uniform))
+
+
+def _move(scene, smoothing, height, velocity, force, noise=0.0):
+    """Step once with the contact's distance shifted by the noise."""
+    data = scene.data.replace(qpos=(height + noise)[None], qvel=velocity[None], ctrl=force[None])
+    moved = mg.step(scene.model, data, smoothing=smoothing)
+    return moved.qpos[0] - noise, moved.qvel[0]
+
+
+@eqx.filter_jit
+def _heights(scene, smoothing, start, speed, noise):
+    def advance(state, w):
+        moved = _move(scene, smoothing, *state, jnp.zeros(()), w)
+        return moved, moved[0]
+
+    _, heights = jax.lax.scan(advance, (start, -speed), noise)
+    return jnp.concatenate([start[None], heights])
+
+
+def _smoothed_motion(scene, settings: KernelsSettings, smoothing) -> tuple[np.ndarray, np.ndarray]:
+    noise = jnp.zeros(settings.horizon)
+
+    def heights(start: Float[Array, ""]) -> Float[Array, " steps"]:
+        return _heights(scene, smoothing, start, jnp.array(settings.speed), noise)
+
+    height, slope = jax.jvp(heights, (jnp.array(settings.start),), (jnp.array(1.0),))
+    return np.asarray(height), np.asarray(slope)
+
+
+def _sampled_motion(scene, settings: KernelsSettings, name: str, key: Array) -> list[np.ndarray]:
+    """Average rollouts whose contact has other noise in each step, from three start heights with the same noise."""
+    noise = settings.length * _draw(name, key, (settings.num_rollouts, settings.horizon))
+    width = 0.25 * settings.length
+    starts = settings.start + width * jnp.array([-1.0, 0.0, 1.0])
+    each = jax.vmap(_heights, in_axes=(None, None, None, None, 0))
+    low, middle, high = jax.vmap(each, in_axes=(None, None, 0, None, None))(
+        scene, None, starts, jnp.array(settings.speed), noise
+    )
+    return [*_mean(middle), *_mean((high - low) / (2 * width))]
+
+
+def _mean(samples: Float[Array, "samples *rest"]) -> tuple[np.ndarray, np.ndarray]:
+    values = np.asarray(samples)
+    return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+
+
+@eqx.filter_jit
+def _slope(scene, smoothing, point, noise):
+    """Return the velocity after a step, and its derivative by height, velocity and force."""
+    return jax.value_and_grad(lambda p: _move(scene, smoothing, *p, noise)[1])(point)
+
+
+@eqx.filter_jit
+def _samples(scene, point, noise, score, little):
+    """Return samples of the derivative by first and by zeroth order; the latter by score, and by pairs on both sides."""
+    still = _move(scene, None, *point)[1]
+
+    def value(shift, w):
+        return _move(scene, None, *(point + shift), w)[1]
+
+    def sample(w, score, little):
+        middle, first = _slope(scene, None, point, w)
+        pushes = little * jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        ends = jax.vmap(value, in_axes=(0, None))(jnp.concatenate([pushes, -pushes]), w)
+        others = (ends[:2] - ends[2:]) / 2 * little / _LITTLE**2
+        return first, jnp.concatenate([((middle - still) * score)[None], others])
+
+    return jax.vmap(sample)(noise, score, little)
+
+
+def _linear(scene, settings: KernelsSettings, name: str, velocity: float, key: Array) -> Linear:
+    """Differentiate the velocity after one step, half a length above the plane, in three ways."""
+    smoothing, length = mg.Smoothing(settings.length, name), settings.length
+    point = jnp.array([0.5 * length, velocity, 0.0])
+
+    noise_key, little_key = jax.random.split(key)
+    noise = length * _draw(name, noise_key, (settings.num_samples,))
+    # The noise on height moves the height itself, so the derivative of the mean is minus that by the noise, whose score is known.
+    density = KERNELS[name].density
+    score = -jax.vmap(jax.grad(lambda w: jnp.log(density(w))))(noise / length) / length
+    little = _LITTLE * jax.random.normal(little_key, (settings.num_samples,))
+    first, zeroth = (_mean(samples) for samples in _samples(scene, point, noise, score, little))
+    exact = np.asarray(_slope(scene, smoothing, point, jnp.zeros(()))[1])
+    value = np.stack([exact, first[0], zeroth[0]], axis=1)
+    return Linear(velocity, value, np.stack([0 * exact, first[1], zeroth[1]], axis=1))
