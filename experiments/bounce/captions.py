@@ -22,12 +22,12 @@ def captions(outcome: Outcome) -> dict[str, str]:
         ),
         "error": (
             "Error of the event gradient as a share of the larger of the slope and the discrete gradient's own error, one "
-            "square per contact. Crossed squares are not judged: the step is unstable there, or the slope is not known well "
-            "enough."
+            "square per contact. A dot: beyond the tolerance, but not beyond two standard errors of the means. Crossed squares "
+            "are not judged: the step is unstable there, or the slope is not known well enough."
         ),
         "steps": (
             "The same errors, of both gradients, against the number of time steps that the contact lasts: one dot per contact "
-            f"and time step. Dotted, {settings.tolerance:.0%}. By definition the discrete gradient lies at 100 % where its "
+            f"and time step. Dotted, {settings.tolerance:.0%}. By definition the discrete gradient lies at 100% where its "
             "error exceeds the slope. Errors below 10⁻⁴ are drawn there."
         ),
     }

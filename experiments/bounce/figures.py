@@ -44,7 +44,7 @@ def derivative(outcome: Outcome):
     shown = [
         j for j, cell in enumerate(outcome.cells) if cell.time_constant == constant and cell.impedance == impedance
     ]
-    shown = shown[:: -(-len(shown) // 4)] if len(shown) > 4 else shown
+    shown = shown[:: -(-len(shown) // 5)]
     figure, axes = subplots(1, len(shown), height=3.6, sharey=True)
     h = 1e3 * outcome.timesteps
     for axis, j in zip(axes[0], shown, strict=True):
@@ -80,6 +80,7 @@ def error(outcome: Outcome):
     shape = (len(settings.damping_ratios), len(settings.time_constants), rows)
     errors = outcome.error(EVENT).reshape(-1, *shape)
     judged = outcome.can_judge.reshape(-1, *shape)
+    unsure = (outcome.can_judge & ~outcome.holds & ~outcome.fails).reshape(-1, *shape)
     image = None
     for i, j in np.ndindex(rows, columns):
         axis = axes[i, j]
@@ -87,6 +88,8 @@ def error(outcome: Outcome):
         image = axis.imshow(shown, norm=LogNorm(1e-3, 1), cmap="RdYlBu_r", origin="lower", aspect="auto")
         for ratio, constant in np.argwhere(~judged[j, :, :, i]):
             axis.plot(ratio, constant, "x", color=REFERENCE, ms=6)
+        for ratio, constant in np.argwhere(unsure[j, :, :, i]):
+            axis.plot(ratio, constant, ".", color=REFERENCE, ms=4)
         axis.grid(visible=False)
         axis.set_xticks(range(shape[0]), [f"{value:g}" for value in settings.damping_ratios])
         axis.set_yticks(range(shape[1]), [f"{1e3 * value:g}" for value in settings.time_constants])
@@ -99,7 +102,7 @@ def error(outcome: Outcome):
     bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.01)
     bar.set_ticks(
         [1e-3, 1e-2, settings.tolerance, 0.3, 1],
-        labels=["≤ 0.1 %", "1 %", f"{settings.tolerance:.0%}", "30 %", "≥ 100 %"],
+        labels=["≤ 0.1%", "1%", f"{settings.tolerance:.0%}", "30%", "≥ 100%"],
     )
     bar.ax.minorticks_off()
     return figure
@@ -123,7 +126,7 @@ def steps(outcome: Outcome):
         axis.set_yscale("log")
         axis.set(title=title, xlabel="time steps that the contact lasts")
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g}%"))
     axes[0, 0].set_ylabel("error")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8.5)

@@ -1,11 +1,14 @@
 """The answer of an experiment on bounces in words, computed from its numbers."""
 
+import itertools
+
 import numpy as np
 
 from experiments.bounce.outcome import DISCRETE, EVENT, Outcome
 from experiments.report import Table
 
 # Steps in contact by which the outcome is told apart.
+_MANY_STEPS = 10
 _STEPS = (0, 3, 6, 10, 20, np.inf)
 
 
@@ -27,7 +30,7 @@ def verdict(outcome: Outcome) -> str:
     ratio = np.abs(outcome.mean(DISCRETE) / outcome.slope)[outcome.can_judge & has_jump]
     sentences = [
         f"Up to {1e3 * settings.fine_timestep:g} ms the event gradient is within {settings.tolerance:.0%} at {holds.sum()} of "
-        f"{judged.sum()} contacts and time steps."
+        f"{judged.sum()} contacts and time steps, and farther off beyond chance at {outcome.fails[fine].sum()}."
     ]
     if (coarse := _coarse(outcome)) is not None:
         sentences.append(coarse)
@@ -76,15 +79,13 @@ def _coarse(outcome: Outcome) -> str | None:
 
 def _failures(outcome: Outcome) -> str | None:
     """Say what the failures have in common: few steps in contact."""
-    fails, count = outcome.fails, outcome.steps_in_contact
+    fails, judged, is_long = outcome.fails, outcome.can_judge, outcome.steps_in_contact >= _MANY_STEPS
     if not fails.any():
         return None
-    longest = count[fails].max()
-    beyond = outcome.can_judge & (count > longest)
     return (
-        f"The event gradient is beyond {outcome.settings.tolerance:.0%}, and beyond chance, at {fails.sum()} of "
-        f"{outcome.can_judge.sum()}; there the contact lasts {np.median(count[fails]):.2g} steps in the median and "
-        f"{longest:.2g} at most. It is so at none of the {beyond.sum()} where it lasts longer."
+        f"Beyond {outcome.settings.tolerance:.0%}, and beyond chance, it is at {(fails & ~is_long).sum()} of "
+        f"{(judged & ~is_long).sum()} contacts that last fewer than {_MANY_STEPS} time steps and at {(fails & is_long).sum()} of "
+        f"{(judged & is_long).sum()} that last longer."
     )
 
 
@@ -124,7 +125,7 @@ def _closed_form(outcome: Outcome) -> str | None:
 
 def _by_steps(outcome: Outcome) -> Table:
     count, rows = outcome.steps_in_contact, []
-    for low, high in zip(_STEPS[:-1], _STEPS[1:], strict=True):
+    for low, high in itertools.pairwise(_STEPS):
         inside = outcome.can_judge & (count >= low) & (count < high)
         if not inside.any():
             continue
@@ -139,13 +140,13 @@ def _by_steps(outcome: Outcome) -> Table:
                 f"{outcome.fails[inside].sum()}",
                 f"{np.median(errors[0]):.1%}, {errors[0].max():.0%}",
                 f"{np.median(errors[1]):.0%}",
-                f"{np.median(spread):.1%}",
+                f"{np.median(spread):.2g}",
             ]
         )
     percent = f"{outcome.settings.tolerance:.0%}"
     return Table(
         (
-            "steps in contact", "judged", f"within {percent}", "beyond, beyond chance", "error of event: median, largest",
+            "steps in contact", "judged", f"within {percent}", "beyond it and chance", "error of event: median, largest",
             "error of discrete: median", "spread of event over slope",
         ),
         rows,

@@ -32,7 +32,6 @@ _NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
 _ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
-_GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 class SlopeComparison(eqx.Module):
@@ -84,7 +83,7 @@ class SlopeComparison(eqx.Module):
     def scale(self) -> Float[np.ndarray, "*outcome"]:
         """What errors are measured by: the larger of the slope and the error of the first derivative named."""
         # Where both are nothing but rounding, no error is to look large beside it.
-        return np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution)
+        return np.asarray(np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution))
 
     @property
     def relative_error(self) -> Float[np.ndarray, "gradients *outcome"]:
@@ -104,7 +103,7 @@ class SlopeComparison(eqx.Module):
         tilt = np.tensordot(place, centred, axes=1) / (place**2).sum()
         rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
         size = np.abs(rest).max(axis=0)
-        return np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale
+        return np.asarray(np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale)
 
     def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
         """Say where the mean of a derivative is the slope to within `tolerance` times `scale`.
@@ -139,7 +138,7 @@ class SlopeComparison(eqx.Module):
         Returns:
             One truth value per outcome; False where numbers are not finite.
         """
-        return self.slope_error <= np.maximum(tolerance * self.scale, self.resolution)
+        return np.asarray(self.slope_error <= np.maximum(tolerance * self.scale, self.resolution))
 
 
 def derivative_against_slope(
@@ -176,10 +175,10 @@ def derivative_against_slope(
 
 
 def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, " phases"]:
-    """Give parameters spread over an interval, one in each of equal parts, at a place in it that never repeats.
+    """Give parameters spread over an interval, one in each of equal parts, at a random place in it.
 
-    Evenly spaced ones might all meet the same phase of the time step. The places are the multiples of the golden ratio,
-    modulo one, which fill the unit interval evenly.
+    Evenly spaced ones might all meet the same phase of the time step, and so do regular displacements (multiples of the
+    golden ratio) for some lengths of tooth. The places are the same in every call.
 
     Args:
         interval: of the parameter.
@@ -196,8 +195,8 @@ def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, 
         raise ValueError(f"interval must be two finite numbers, the smaller one first, got {interval}")
     if num_phases < _FEWEST_PHASES:
         raise ValueError(f"num_phases must be at least {_FEWEST_PHASES}, got {num_phases}: fewer give no error bar")
-    index = np.arange(num_phases)
-    return low + (high - low) * (index + (0.5 + index * _GOLDEN) % 1) / num_phases
+    places = np.random.default_rng(0).uniform(size=num_phases)
+    return low + (high - low) * (np.arange(num_phases) + places) / num_phases
 
 
 def compare_to_slope(
@@ -238,20 +237,22 @@ def compare_to_slope(
     slope, slope_error, local_slopes, num_teeth, mean, mean_error, spread, num_finite = (
         np.moveaxis(part, 0, -1).reshape((*part.shape[1:], *y.shape[1:])) for part in parts
     )
+    # Of an outcome that is zero throughout: not zero, for errors are divided by it.
+    size = np.maximum(np.nanmax(np.abs(y), axis=0, initial=0), np.finfo(float).tiny)
     return SlopeComparison(
         gradients=tuple(gradients),
         parameters=x,
         outcomes=y,
         derivatives=slopes,
-        slope=slope * 2 / width,
-        slope_error=slope_error * 2 / width,
+        slope=np.asarray(slope * 2 / width),
+        slope_error=np.asarray(slope_error * 2 / width),
         mean=mean,
         mean_error=mean_error,
         spread=spread,
         local_slopes=local_slopes * 2 / width,
         num_teeth=num_teeth,
         num_finite=num_finite.astype(int),
-        resolution=_ROUNDINGS * epsilon * np.maximum(np.abs(y).max(axis=0), np.finfo(float).tiny) / width,
+        resolution=np.asarray(_ROUNDINGS * epsilon * size / width),
     )
 
 
@@ -274,12 +275,11 @@ def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients p
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
     lever = _lever(u, weight)
-    rest = y - _trend(u, y, weight, 3)
-    # A trend of degree 3 takes four numbers off the residuals; what it cannot take is no error of its slope.
-    slope_error = _clustered(lever * rest, 4)
+    # A trend of degree 3, for curvature is no error of the slope.
+    rest = _residuals(u, y, weight, 3)
+    slope_error = _clustered(lever * rest)
     kernel = weight**2 / (weight**2).sum()
-    residuals = np.array([one - _trend(u, one, weight**2, 1) for one in slopes])
-    errors = np.array([_clustered(kernel * one, 2) for one in residuals])
+    errors = np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes])
     teeth = np.count_nonzero(np.diff(np.signbit(rest))) / 2
     return (
         lever @ y,
@@ -299,20 +299,27 @@ def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return weight * centred / (weight @ centred**2)
 
 
-def _trend(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
+def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
+    """Return what a polynomial trend leaves, each as if its own point had not been fitted."""
     root = np.sqrt(np.maximum(weight, 0))
-    basis = np.polynomial.legendre.legvander(u, degree)
-    return basis @ np.linalg.lstsq(root[:, None] * basis, root * y, rcond=None)[0]
+    basis, _ = np.linalg.qr(root[:, None] * np.polynomial.legendre.legvander(u, degree))
+    leverage = (basis**2).sum(axis=1)
+    fitted = basis @ (basis.T @ (root * y))
+    return (y - fitted / np.where(root > 0, root, 1)) / (1 - leverage)
 
 
-def _clustered(terms: np.ndarray, num_fitted: int) -> float:
+def _clustered(terms: np.ndarray) -> float:
     """Give the standard error of a sum of weighted residuals, those of a block of neighbours taken as one.
 
     Neighbours on one tooth err together, so single residuals would understate the error.
+
+    References:
+        Bell, McCaffrey. Bias reduction in standard errors for linear regression with multi-stage samples. Survey
+        Methodology 28, 2002 (the jackknifed residuals).
     """
     blocks = np.array_split(terms, min(_MOST_BLOCKS, len(terms) // _POINTS_PER_BLOCK))
     sums = np.array([block.sum() for block in blocks])
-    return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - num_fitted)))
+    return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)))
 
 
 def _local_slopes(u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " windows"]:

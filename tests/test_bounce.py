@@ -1,0 +1,76 @@
+"""A ball that bounces once: closed form, quadrature, simulation and both derivatives against one another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.tasks.textbook import Bounce, bounce_scene, integrated_restitution
+
+DURATION = 0.1
+TIMESTEP = 5e-4
+
+
+@pytest.fixture(scope="module")
+def found():
+    """MuJoCo's default contact but for its impedance, which is constant, so that there is a closed form."""
+    scene = bounce_scene(TIMESTEP)
+    model = scene.model.tree_replace({"geom_solimp": scene.model.geom_solimp.at[:, :2].set(0.9)})
+    scene = mg.Scene(**{**vars(scene), "model": model})
+
+    def height(start, gradient):
+        state = mg.initial_state(scene, qpos=start[None], qvel=jnp.array([-1.0]))
+        return mg.rollout(scene, state, horizon=round(DURATION / TIMESTEP), gradient=gradient).qpos[-1, 0]
+
+    return mg.diagnostics.derivative_against_slope(height, (0.005, 0.025), num_phases=64)
+
+
+@pytest.mark.parametrize("damping_ratio", [0.1, 0.6, 1.0, 1.00003, 2.0])
+def test_quadrature_of_the_contact_agrees_with_the_closed_form(damping_ratio):
+    """Its tolerance is 1e-10 per step; errors of a few hundred steps add up."""
+    bounce = Bounce(0.02, damping_ratio, 2.0)
+    restitution, duration = integrated_restitution(0.02, damping_ratio, (0.7, 0.7, 0.001), speed=2.0)
+    assert restitution == pytest.approx(float(bounce.restitution), rel=1e-8)
+    assert duration == pytest.approx(float(bounce.duration), rel=1e-8)
+
+
+def test_a_critically_damped_ball_keeps_the_share_exp_minus_two():
+    """Then x = v t exp(−ω t): its acceleration vanishes at ω t = 2, where the speed is −v exp(−2)."""
+    assert float(Bounce(0.02, 1.0).restitution) == pytest.approx(np.exp(-2), rel=1e-12)
+    assert float(Bounce(0.02, 1.0).duration) == pytest.approx(2 * 0.02, rel=1e-12)
+
+
+def test_nothing_jumps_where_damping_becomes_critical():
+    """Just inside and outside of the series about ζ = 1 values agree to its first left-out term, 1e-12."""
+    for edge in (1 - 1e-4, 1 + 1e-4):
+        near, far = Bounce(0.02, edge * (1 - 1e-9)), Bounce(0.02, edge * (1 + 1e-9))
+        assert float(near.restitution) == pytest.approx(float(far.restitution), rel=1e-8)
+    slopes = jax.vmap(jax.grad(lambda ratio: Bounce(0.02, ratio).restitution))(jnp.array([0.999, 1.0, 1.001]))
+    assert float(slopes[1]) == pytest.approx(float((slopes[0] + slopes[2]) / 2), rel=1e-5)
+
+
+def test_the_simulated_height_is_that_of_the_closed_form(found):
+    """Semi-implicit steps are of first order: the ball is off by about one step's flight, v h."""
+    exact = Bounce(0.02, 1.0).height(found.parameters, DURATION)
+    assert np.abs(found.outcomes - np.asarray(exact)).max() < 1.0 * TIMESTEP
+
+
+def test_the_slope_of_the_simulated_height_is_less_the_restitution(found):
+    """First order in h: h/t_c is 2.5 %."""
+    assert float(found.slope) == pytest.approx(-np.exp(-2), rel=0.05)
+    assert bool(found.is_resolved())
+
+
+def test_only_the_event_gradient_of_a_bounce_is_its_slope(found):
+    """The aim at this time step is 5 % of the discrete gradient's own error, which is several times the slope."""
+    assert found.gradients == ("discrete", "event")
+    assert found.is_off().tolist() == [True, False]
+    assert found.is_close().tolist() == [False, True]
+    assert abs(found.mean[0]) > 1.5 * abs(found.slope)
+
+
+def test_a_ball_that_is_not_released_in_time_is_refused():
+    """An impedance that hardly rises within a kilometre hardly stops it."""
+    with pytest.raises(ValueError, match="the ball must be released within 2"):
+        integrated_restitution(0.02, 1.0, (0.0, 0.95, 1e3))

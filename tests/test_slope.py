@@ -1,0 +1,135 @@
+"""Derivatives held against the slope: on functions whose slope and derivative are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.diagnostics import compare_to_slope, derivative_against_slope, phases
+
+INTERVAL = (0.2, 0.7)
+
+
+def sawtooth(x, tooth, rise):
+    """A smooth trend of slope 3x² with teeth on it, whose flanks add `rise` to the derivative and whose jumps take it back."""
+    return x**3 + rise * tooth * (x / tooth - np.floor(x / tooth))
+
+
+def compare(function, derivatives, num_phases=64, interval=INTERVAL):
+    x = phases(interval, num_phases)
+    return compare_to_slope(x, function(x), [d(x) for d in derivatives], [str(i) for i in range(len(derivatives))])
+
+
+@pytest.mark.parametrize("power", [1, 2, 3])
+def test_the_mean_of_a_polynomials_derivative_is_its_slope(power):
+    """Both are the same average: by parts, whatever the curvature, but for the sum in place of the integral."""
+    found = compare(lambda x: x**power, [lambda x: power * x ** (power - 1)])
+    # Sums over jittered points replace integrals to about 1/N² of the change of the derivative.
+    assert found.mean[0] == pytest.approx(found.slope, rel=2e-3)
+
+
+def test_the_slope_of_a_cubic_is_its_derivative_averaged_with_a_quartic():
+    """With weight k = 15/16 (1 − u²)², E u² = 1/7: the mean of 3x² is 3 (m² + w²/7), m the middle, w half the width."""
+    found = compare(lambda x: x**3, [lambda x: 3 * x**2])
+    middle, half = 0.45, 0.25
+    # The points' own ends are within half a distance of those of the interval: 0.25/64 in m, twice that relatively in m².
+    assert float(found.slope) == pytest.approx(3 * (middle**2 + half**2 / 7), rel=0.017)
+
+
+def test_jumps_count_in_the_slope_and_not_in_the_derivative():
+    """Teeth of rise 20 leave the slope where it was and add 20 to the derivative."""
+    tooth, rise = 0.021, 20.0
+    found = compare(lambda x: sawtooth(x, tooth, rise), [lambda x: 3 * x**2 + rise, lambda x: 3 * x**2], 256)
+    smooth = compare(lambda x: x**3, [lambda x: 3 * x**2], 256)
+    assert float(found.slope) == pytest.approx(float(smooth.slope), abs=3 * float(found.slope_error))
+    assert float(found.slope_error) < 0.02 * rise
+    assert found.mean[0] == pytest.approx(smooth.mean[0] + rise)
+    assert bool(found.is_off()[0])
+    assert bool(found.is_close()[1])
+    assert bool(found.is_resolved())
+
+
+def test_teeth_are_counted():
+    found = compare(lambda x: sawtooth(x, 0.05, 20.0), [lambda x: 3 * x**2 + 20], 256)
+    assert float(found.num_teeth) == pytest.approx(10, abs=1)
+
+
+def test_the_error_bar_covers_the_slope_of_the_trend():
+    """Teeth from a sixth of the points' distance to an eighth of the interval, 15 shifts each: two errors cover nine in ten."""
+    x, rise, rng = phases(INTERVAL, 64), 20.0, np.random.default_rng(3)
+    teeth = np.repeat(np.geomspace(0.0013, 0.0625, 20), 15)
+    heights = rise * teeth * ((x[:, None] / teeth + rng.uniform(size=teeth.size)) % 1)
+    found = compare_to_slope(x, heights, [np.full_like(heights, rise)], ["flank"])
+    covered = np.abs(found.slope) <= 2 * found.slope_error
+    # The points are the same for all, so the 300 cases are not independent.
+    assert covered.mean() >= 0.9
+    # No idle bar: within three of the true errors in the mean over all teeth.
+    assert (found.slope_error**2).mean() <= 9 * (found.slope**2).mean()
+
+
+def test_an_interval_within_one_tooth_is_not_resolved():
+    """Two teeth cannot tell the trend from their flanks: errors of half the rise must not pass for a slope."""
+    found = compare(lambda x: sawtooth(x, 0.26, 20.0), [lambda x: 3 * x**2 + 20])
+    assert not bool(found.is_resolved())
+
+
+def test_a_torn_outcome_is_irregular_and_a_curved_one_is_not():
+    """A slope that turns from one quarter to the next is none; that of a parabola changes along a straight line."""
+    torn = compare(lambda x: np.sin(60 * x) / 10, [lambda x: 6 * np.cos(60 * x)])
+    curved = compare(lambda x: 5 * (x - 0.3) ** 2, [lambda x: 10 * (x - 0.3)])
+    assert float(torn.irregularity) > 0.5
+    assert float(curved.irregularity) < 0.05
+
+
+def test_phases_that_are_not_finite_are_left_out_and_counted():
+    x = phases(INTERVAL, 64)
+    y = np.stack([x**2, np.where(np.arange(64) % 16 == 5, np.nan, x**2), np.full(64, np.nan)], axis=1)
+    found = compare_to_slope(x, y, [np.stack([2 * x] * 3, axis=1)], ["exact"])
+    assert found.num_finite.tolist() == [64, 60, 0]
+    assert found.slope[1] == pytest.approx(found.slope[0], rel=1e-2)
+    assert np.isnan(found.slope[2])
+    assert not found.is_resolved()[2]
+
+
+def test_an_error_of_rounding_alone_is_none():
+    """Both derivatives of a constant are zero but for rounding; neither is to look wrong beside the other."""
+    x = phases(INTERVAL, 64)
+    found = compare_to_slope(x, np.ones(64), [np.full(64, 1e-16), np.zeros(64)], ["a", "b"])
+    assert found.relative_error.tolist() == [0.0, 0.0]
+
+
+def test_one_function_is_compared_for_each_gradient_by_its_name():
+    """The outcome is x² at one time and 2x at another; the gradient "cut" keeps the value and loses the first derivative."""
+
+    def simulate(x, gradient):
+        square = jax.lax.stop_gradient(x**2) if gradient == "cut" else x**2
+        return jnp.stack([square, 2 * x])
+
+    found = derivative_against_slope(simulate, INTERVAL, gradients=("cut", "exact"))
+    assert found.outcomes.shape == (64, 2)
+    assert found.mean[0].tolist() == [0.0, pytest.approx(2.0)]
+    assert found.mean[1] == pytest.approx(found.slope, rel=2e-3)
+    assert found.relative_error[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("interval", "num_phases", "sentence"),
+    [
+        ((0.3, 0.3), 64, "interval must be two finite numbers"),
+        ((0.0, np.inf), 64, "interval must be two finite numbers"),
+        ((0.0, 1.0), 31, "num_phases must be at least 32, got 31"),
+    ],
+)
+def test_an_interval_or_a_number_without_meaning_is_refused(interval, num_phases, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        phases(interval, num_phases)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    x = phases(INTERVAL, 64)
+    with pytest.raises(ValueError, match="derivatives must hold one array"):
+        compare_to_slope(x, x, [x[:-1]], ["short"])
+    with pytest.raises(ValueError, match="parameters must be at least 32 and increase"):
+        compare_to_slope(x[::-1], x, [x], ["backwards"])
+    with pytest.raises(ValueError, match="gradients must name at least one"):
+        derivative_against_slope(lambda x, gradient: x, INTERVAL, gradients=())
