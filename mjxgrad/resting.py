@@ -1,10 +1,11 @@
 r"""How deep a contact rests, for any impedance profile.
 
 Under a force that would give its bodies the acceleration $a_0$ towards each other, a contact at rest has
-$K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and $K = k / d_w^2$.
+$K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and
+$K = k / d_w^2$.
 The factor $c$ is 1 for frictionless contacts and elliptic cones; in a pyramid the normal force is the sum of its edges,
-whose regularisation MuJoCo scales with friction, and $c = \mu^2 (1 + \mu^2) / ((n - 1)\,\text{impratio})$, $n$ the dimension
-of the contact: 1 only for $\mu = 1$, $n = 3$.
+whose regularisation MuJoCo scales with friction, and $c = \mu^2 (1 + \mu^2) / ((n - 1)\,\text{impratio})$, $n$ the
+dimension of the contact: 1 only for $\mu = 1$, $n = 3$.
 
 The left side grows with the depth, so there is one solution. Where $a_0$ is the force over MuJoCo's own estimate of
 the contact's mass, at the reference pose, it is exact.

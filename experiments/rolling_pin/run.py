@@ -61,6 +61,6 @@ def _video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     except RenderingUnavailableError as error:
         return None, str(error)
     return "video.mp4", (
-        f"The motion that {outcome.best.label} ends with, at {wanted.speed:g} of real speed; the green line is the depth that "
-        "was asked for."
+        f"The motion that {outcome.best.label} ends with, at {wanted.speed:g} of real speed; the green line is the depth "
+        "that was asked for."
     )

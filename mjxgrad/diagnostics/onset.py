@@ -8,8 +8,8 @@ every time step. The derivative of the speed after a bounce by where it starts, 
 
 $$2 \zeta \omega_0 e,$$
 
-$e$ the restitution ($2 \zeta \omega_0 = b$ is what the dashpot gives a body of unit speed at the first touch, $e$ what the bounce
-leaves of it), and the place it reaches is off by that times the time since. With MuJoCo's default, 12.8 1/s.
+$e$ the restitution ($2 \zeta \omega_0 = b$ is what the dashpot gives a body of unit speed at the first touch, $e$ what the
+bounce leaves of it), and the place it reaches is off by that times the time since. With MuJoCo's default, 12.8 1/s.
 
 *A rise within a step.* With $d_0 = 0$ the simulated outcome is continuous, so the mean of the discrete derivative over
 where within a step the contact falls is right, however long the step. Its spread is not. With
@@ -17,8 +17,8 @@ where within a step the contact falls is right, however long the step. Its sprea
 $$n = \text{width} / (\text{approach speed} \times \text{time step}),$$
 
 the steps across the rise, a share $1 - n$ of all phases does not meet it at all if $n < 1$, and has the derivative of a
-jump; the rest make up for it. The standard deviation over phases, in the unit above ($h \omega_0$ of 0.02 and of 0.1, MuJoCo's
-default at 2 ms; ζ of 0.3 and 1):
+jump; the rest make up for it. The standard deviation over phases, in the unit above ($h \omega_0$ of 0.02 and of 0.1,
+MuJoCo's default at 2 ms; ζ of 0.3 and 1):
 
 | n | 0.03 | 0.3 | 1 | 1.5 | 2 | 3 | 5 | 10 |
 |---|---|---|---|---|---|---|---|---|
@@ -112,7 +112,8 @@ class OnsetResolution(eqx.Module):
             sentences.append(
                 f"{count} onset{'s' if count > 1 else ''} of {pair}, at up to {speed:.3g} m/s, "
                 f"{'are' if count > 1 else 'is'} not resolved: {_reason(steps, jump, width)}; take gradient='event', "
-                f"or an impedance from 0 (at most {LARGEST_JUMP:g}) over a width of at least {STEPS_NEEDED * speed * step:.2g} m"
+                f"or an impedance from 0 (at most {LARGEST_JUMP:g}) over a width of at least "
+                f"{STEPS_NEEDED * speed * step:.2g} m"
                 + (
                     f", or a time step of at most {width / (STEPS_NEEDED * speed):.2g} s"
                     if jump <= LARGEST_JUMP
@@ -126,7 +127,7 @@ def onset_resolution(scene: Scene, trajectory: Trajectory) -> OnsetResolution:
     """Find where contacts begin along a rollout, and how many steps their force takes to rise.
 
     Traceable; for a batch of rollouts use `jax.vmap`. Collision is found anew from the positions, so that no rollout need
-    have kept it. The speed is that of the step in which a pair comes closer than its margin, along the normal it has after it.
+    have kept it. The speed is that of the step in which a pair comes closer than its margin, along its normal after it.
 
     Args:
         scene: that was rolled out.

@@ -62,8 +62,9 @@ def _resting_otherwise(
         if distance < -size / 2:
             yield (
                 pair,
-                f"under gravity alone bodies rest {-distance:.3g} m inside each other, more than half the size of the smaller "
-                f"({size:.3g} m); take a smaller margin than {margin:.3g} m, or keep the height under gravity's acceleration",
+                f"under gravity alone bodies rest {-distance:.3g} m inside each other, more than half the size of the "
+                f"smaller ({size:.3g} m); take a smaller margin than {margin:.3g} m, or keep the height under gravity's "
+                "acceleration",
             )
         elif distance > _ABOVE_NOTHING and softness.rest_acceleration is None:
             yield (

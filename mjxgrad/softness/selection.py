@@ -114,8 +114,8 @@ def margin_shares(model: mjx.Model, selected: Selected) -> tuple[np.ndarray, np.
     for pair in selected:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
             raise ValueError(
-                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only where they "
-                "touch; select other pairs, or replace the mesh by primitive geoms"
+                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only where "
+                "they touch; select other pairs, or replace the mesh by primitive geoms"
             )
     implicit = [pair for pair in selected if pair.explicit < 0]
     others = [pair for pair in contact_pairs(model) if pair.explicit < 0 and pair not in selected]

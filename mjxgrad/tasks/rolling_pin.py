@@ -1,7 +1,7 @@
 r"""A rolling pin above a bed that it does not touch: a first-order gradient of exactly zero, and ways around it.
 
-The bed is to have a dent. With $z$ the heights of its pillars in the end, $z^\ast$ those wished for, $a$ the depth of the dent
-and $u$ the controls, the true cost is
+The bed is to have a dent. With $z$ the heights of its pillars in the end, $z^\ast$ those wished for and $u$ the controls,
+the true cost is
 
 $$\sum_i (z_i - z_i^\ast)^2 / \sum_i (z_i^\ast)^2 + w_u \overline{u^2},$$
 
@@ -9,8 +9,8 @@ $$\sum_i (z_i - z_i^\ast)^2 / \sum_i (z_i^\ast)^2 + w_u \overline{u^2},$$
 judged in the end: `true_cost` is of the scene as it is loaded.
 
 References:
-    Huang, Hu, Du, Zhou, Su, Tenenbaum, Gan. PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable Physics.
-    ICLR 2021, arXiv:2104.03311 (the rolling pin, and soft contact of its tools).
+    Huang, Hu, Du, Zhou, Su, Tenenbaum, Gan. PlasticineLab: A Soft-Body Manipulation Benchmark with Differentiable
+    Physics. ICLR 2021, arXiv:2104.03311 (the rolling pin, and soft contact of its tools).
 """
 
 import dataclasses
