@@ -23,8 +23,8 @@ def captions(outcome: Outcome) -> dict[str, str]:
         "plane": plane,
         "pose": "The rod under the plan that was kept, every decision; dashed, the goal.",
         "tree": (
-            "Left, where the rod is in every node, joined to its parent; thick, the way that was found. Right, the nearest that the "
-            f"tree has come to the goal, in units of the tolerance, against its nodes, for {settings.tree.num_seeds} seeds of each "
-            "kind of linear model; below the dotted line it is solved."
+            "Left, where the rod is in every node, joined to its parent; thick, the way that was found. Right, the nearest that "
+            "the tree has come to the goal, in units of the tolerance, against its nodes, for "
+            f"{settings.tree.num_seeds} seeds of each kind of linear model; below the dotted line it is solved."
         ),
     }

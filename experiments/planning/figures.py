@@ -1,10 +1,12 @@
 """The pictures of a planning experiment."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.patches import Circle
 
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.report import Figure
@@ -125,7 +127,7 @@ def _stages(attempt: Attempt, shown: list[int], most: int = 9) -> list[list[int]
     """Split the poses to be drawn into panels that overlap in one pose: too many on one another hide what happens."""
     count = max(1, -(-(len(shown) - 1) // (most - 1)))
     ends = np.linspace(0, len(shown) - 1, count + 1).round().astype(int)
-    return [shown[a : b + 1] for a, b in zip(ends, ends[1:], strict=False)]
+    return [shown[a : b + 1] for a, b in itertools.pairwise(ends)]
 
 
 def _rod(axis: Axes, pose: np.ndarray, **look) -> None:
@@ -141,6 +143,4 @@ def _rod(axis: Axes, pose: np.ndarray, **look) -> None:
 
 
 def _disc(centre: np.ndarray, **look):
-    from matplotlib.patches import Circle
-
     return Circle((float(centre[0]), float(centre[1])), _RADIUS, **look)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 # Newton steps of the projected method. Each settles bounds that are active for good, or shortens the way by backtracking; two or
 # three suffice for a few controls, and the rest cost nothing beside a step of the dynamics.
@@ -53,7 +53,7 @@ def minimise_in_box(
         slope = hessian @ x + gradient
         return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
 
-    def improve(_: int, x: Float[Array, " m"]) -> Float[Array, " m"]:
+    def improve(_: ArrayLike, x: Float[Array, " m"]) -> Float[Array, " m"]:
         slope, is_free = free(x)
         direction = -solve_free(hessian, slope[:, None], is_free)[:, 0]
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad.planning.backward import Feedback, backward_pass
 from mjxgrad.planning.cost import Cost, stage_model, terminal_model
@@ -18,7 +18,7 @@ _TOLERANCE = 1e-4
 
 
 class Iterations(eqx.Module):
-    """What happened in each iteration.
+    """What happened in an iteration, or in all of them.
 
     Attributes:
         factor: of the smoothing under which the step was chosen and measured.
@@ -30,13 +30,13 @@ class Iterations(eqx.Module):
         finite_fraction: the least share of finite samples behind a linear model.
     """
 
-    factor: Float[Array, " iterations"]
-    smoothed_cost: Float[Array, " iterations"]
-    cost: Float[Array, " iterations"]
-    step: Float[Array, " iterations"]
-    promised: Float[Array, " iterations"]
-    regularisation: Float[Array, " iterations"]
-    finite_fraction: Float[Array, " iterations"]
+    factor: Float[Array, "*iterations"]
+    smoothed_cost: Float[Array, "*iterations"]
+    cost: Float[Array, "*iterations"]
+    step: Float[Array, "*iterations"]
+    promised: Float[Array, "*iterations"]
+    regularisation: Float[Array, "*iterations"]
+    finite_fraction: Float[Array, "*iterations"]
 
 
 class Plan(eqx.Module):
@@ -77,7 +77,7 @@ class _Problem(eqx.Module):
     system: System
     cost: Cost
     smoother: Smoother
-    keys: PRNGKeyArray
+    keys: Key[Array, " horizon"]
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
 

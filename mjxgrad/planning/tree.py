@@ -52,7 +52,7 @@ def reach(model: LinearModel, radius: Float[Array, " m"], weights: Float[Array, 
 
 
 class Nodes(eqx.Module):
-    """Nodes with room for more; those from `size` on are empty.
+    """Nodes with room for more, those from `size` on empty; or, without the leading axis, a single one.
 
     Attributes:
         states: of the system itself, each a true successor of its parent.
@@ -63,10 +63,10 @@ class Nodes(eqx.Module):
         size: how many nodes there are.
     """
 
-    states: Float[Array, "capacity state"]
-    controls: Float[Array, "capacity m"]
-    parents: Int[Array, " capacity"]
-    errors: Float[Array, " capacity"]
+    states: Float[Array, "*capacity state"]
+    controls: Float[Array, "*capacity m"]
+    parents: Int[Array, "*capacity"]
+    errors: Float[Array, "*capacity"]
     reaches: Reach
     size: Int[Array, ""]
 

@@ -182,9 +182,10 @@ IMPEDANCE = 1e-3
 
 def test_a_contact_in_the_solver_averaged_three_ways_is_its_closed_form(key):
     """With impedance d small the force is k times depth per unit mass, so v gains h k σ [φ(z) − z Φ(−z)] on average."""
-    h, k = 0.01, 2000.0
-    contact = f'solref="-{k} 0" solimp="{IMPEDANCE} {IMPEDANCE} 0.001"'
-    # K d = k d / dw² of the direct format is k / d here, and the solve takes d of it: the force per mass is k.
+    h, given = 0.01, 700.0
+    contact = f'solref="-{given} 0" solimp="{IMPEDANCE} {IMPEDANCE} 0.001"'
+    # MuJoCo takes a body's inverse inertia for the mean over three axes, of which one can move here: a third of it.
+    k = 3 * given
     scene = mg.load_scene(BALL.format(h=h, contact=contact))
     system, at = SceneSystem(scene), jnp.array([POINT, 0.0])
     noise = {"stddev_state": jnp.array([STDDEV, 1e-3]), "stddev_control": 0.1}
@@ -193,16 +194,16 @@ def test_a_contact_in_the_solver_averaged_three_ways_is_its_closed_form(key):
     def models():
         return (
             analytic(system.with_smoothing(Smoothing(STDDEV)), at, CONTROL),
-            first_order(system, at, CONTROL, key, num_samples=4000, **noise),
-            zeroth_order(system, at, CONTROL, key, num_samples=4000, **noise),
+            first_order(system, at, CONTROL, key, num_samples=1000, **noise),
+            zeroth_order(system, at, CONTROL, key, num_samples=1000, **noise),
         )
 
     z = POINT / STDDEV
     slope, gain = -h * k * norm.cdf(-z), h * k * STDDEV * (norm.pdf(z) - z * norm.cdf(-z))
     for model in models():
         # The share d of all acceleration into the contact is no spring's.
-        np.testing.assert_array_less(np.abs(model.A[1, 0] - slope), 4 * model.A_error[1, 0] + 2 * IMPEDANCE * h * k)
-        np.testing.assert_array_less(np.abs(model.c[1] - gain), 4 * model.c_error[1] + 2 * IMPEDANCE * h * k)
+        np.testing.assert_array_less(np.abs(model.A[1, 0] - slope), 4 * model.A_error[1, 0] + 4 * IMPEDANCE * h * k)
+        np.testing.assert_array_less(np.abs(model.c[1] - gain), 4 * model.c_error[1] + 4 * IMPEDANCE * h * k)
         within(model.B[1, 0], model.B_error[1, 0] + IMPEDANCE * h, h)
 
 
