@@ -53,7 +53,7 @@ def cost(outcome: Outcome):
             right.plot(1 + np.arange(len(smoothed)), 1e3 * attempt.course["length"], color=REFERENCE)
     left.set_yscale("log")
     left.set(title="Cost", xlabel="iteration")
-    left.legend(loc="upper right")
+    left.legend(loc="center right")
     right.set_yscale("log")
     right.set(title="Smoothing length in mm", xlabel="iteration")
     return figure

@@ -1,7 +1,7 @@
 """Which smoothed step a planner sees, and how its linear model is found."""
 
 from abc import abstractmethod
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -94,7 +94,7 @@ class Analytic(Smoother):
     def scaled(self, factor: ArrayLike) -> "Analytic":
         """Give the smoother with other lengths."""
 
-        def lengths(smoothing: Smoothing) -> list[Array]:
+        def lengths(smoothing: Smoothing) -> list[Any]:
             both = (smoothing.length, smoothing.limit_length)
             return [length for length in both if length is not None]
 

@@ -164,23 +164,31 @@ def test_a_plan_is_the_rollout_of_its_controls(pushing):
 
 @pytest.fixture(scope="module")
 def searched():
-    """From a smoother to the search for a way of the block from 0 to 1; the finger starts behind it."""
+    """The search for a way of the block from 0 to 1; the finger starts short of it."""
     sampling = Sampling(-2 * jnp.ones(2), 2 * jnp.ones(2), 0.01 * jnp.ones(2), batch=4, max_extension=4)
 
     @eqx.filter_jit
-    def run(smoother):
+    def run():
         return search(
-            FunctionSystem(pushed, 2, 1), jnp.array([-GAP, 0.0]), jnp.array([0.0, 1.0]), np.array([np.inf, 0.02]),
-            jax.random.key(0), smoother=smoother, sampling=sampling, lower=-0.1, upper=0.1, capacity=2000, max_turns=200,
-        )  # fmt: skip
+            FunctionSystem(pushed, 2, 1),
+            jnp.array([-GAP, 0.0]),
+            jnp.array([0.0, 1.0]),
+            np.array([np.inf, 0.02]),
+            jax.random.key(0),
+            smoother=Sampled(0.2, 0.02, 50, "first"),
+            sampling=sampling,
+            lower=-0.1,
+            upper=0.1,
+            capacity=1000,
+            max_turns=200,
+        )
 
-    return run
+    return run()
 
 
 def test_a_tree_by_smoothed_reach_finds_a_way_that_is_a_rollout(searched):
-    found = searched(Sampled(0.2, 0.02, 50, "first"))
-    assert found.is_solved
-    way = path(found)
+    assert searched.is_solved
+    way = path(searched)
     np.testing.assert_array_equal(way.states[0], [-GAP, 0.0])
     np.testing.assert_allclose(way.states[-1, 1], 1.0, atol=0.02)
     assert np.all(np.abs(way.controls) <= 0.1 + 1e-12)
@@ -189,7 +197,7 @@ def test_a_tree_by_smoothed_reach_finds_a_way_that_is_a_rollout(searched):
 
 
 def test_a_tree_knows_the_parent_of_every_node(searched):
-    nodes = jax.tree.map(np.asarray, searched(Sampled(0.2, 0.02, 50, "first")).nodes)
+    nodes = jax.tree.map(np.asarray, searched.nodes)
     for i in range(1, int(nodes.size)):
         assert 0 <= nodes.parents[i] < i
         np.testing.assert_allclose(
