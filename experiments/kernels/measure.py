@@ -19,7 +19,7 @@ _SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" t
 <geom type="plane" size="1 1 .1"/><body pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
 </worldbody><actuator><motor joint="z"/></actuator></mujoco>"""
 
-# Noise on velocity and force (m/s, N), for derivatives by them; so little that it smooths nothing.
+# Half width of differences by velocity and force (m/s, N), so little that it smooths nothing.
 _LITTLE = 1e-3
 
 
@@ -59,7 +59,8 @@ def _profiles(settings: KernelsSettings) -> list[Profile]:
     """Probe each kernel on a constant impedance, and what MuJoCo has of its own."""
     plain = _scene(settings, 0.9, 0.9)
     cases = {name: contact_profile(plain, smoothing=mg.Smoothing(settings.length, name)) for name in settings.kernels}
-    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=settings.length))
+    # Those of both bodies add up.
+    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=settings.length / 2))
     cases["impedance"] = contact_profile(_scene(settings, 0.2, 0.9))
     grid = np.linspace(-4 * settings.length, 4 * settings.length, 401)
     return [
@@ -80,8 +81,9 @@ def _draw(name: str, key: Array, shape: tuple[int, ...]) -> Array:
     return size * (uniform - 0.5) / jnp.sqrt(uniform * (1 - uniform))
 
 
-def _move(scene, smoothing, height, velocity, force, noise=0.0):
-    """Step once with the contact's distance shifted by the noise."""
+def _move(scene, smoothing, point, noise):
+    """Step once from height, velocity and force, with the contact's distance shifted by the noise."""
+    height, velocity, force = point
     data = scene.data.replace(qpos=(height + noise)[None], qvel=velocity[None], ctrl=force[None])
     moved = mg.step(scene.model, data, smoothing=smoothing)
     return moved.qpos[0] - noise, moved.qvel[0]
@@ -90,7 +92,7 @@ def _move(scene, smoothing, height, velocity, force, noise=0.0):
 @eqx.filter_jit
 def _heights(scene, smoothing, start, speed, noise):
     def advance(state, w):
-        moved = _move(scene, smoothing, *state, jnp.zeros(()), w)
+        moved = _move(scene, smoothing, (*state, jnp.zeros(())), w)
         return moved, moved[0]
 
     _, heights = jax.lax.scan(advance, (start, -speed), noise)
@@ -127,25 +129,26 @@ def _mean(samples: Float[Array, "samples *rest"]) -> tuple[np.ndarray, np.ndarra
 @eqx.filter_jit
 def _slope(scene, smoothing, point, noise):
     """Return the velocity after a step, and its derivative by height, velocity and force."""
-    return jax.value_and_grad(lambda p: _move(scene, smoothing, *p, noise)[1])(point)
+    return jax.value_and_grad(lambda p: _move(scene, smoothing, p, noise)[1])(point)
 
 
 @eqx.filter_jit
-def _samples(scene, point, noise, score, little):
-    """Return samples of the derivative by first and by zeroth order; the latter by score, and by pairs on both sides."""
-    still = _move(scene, None, *point)[1]
+def _samples(scene, point, noise, score):
+    """Return samples of the derivative by first and by zeroth order: by the noise's score, and by differences."""
+    still = _move(scene, None, point, 0.0)[1]
 
     def value(shift, w):
-        return _move(scene, None, *(point + shift), w)[1]
+        return _move(scene, None, point + shift, w)[1]
 
-    def sample(w, score, little):
+    pushes = _LITTLE * jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+    def sample(w, score):
         middle, first = _slope(scene, None, point, w)
-        pushes = little * jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         ends = jax.vmap(value, in_axes=(0, None))(jnp.concatenate([pushes, -pushes]), w)
-        others = (ends[:2] - ends[2:]) / 2 * little / _LITTLE**2
+        others = (ends[:2] - ends[2:]) / (2 * _LITTLE)
         return first, jnp.concatenate([((middle - still) * score)[None], others])
 
-    return jax.vmap(sample)(noise, score, little)
+    return jax.vmap(sample)(noise, score)
 
 
 def _linear(scene, settings: KernelsSettings, name: str, velocity: float, key: Array) -> Linear:
@@ -153,13 +156,11 @@ def _linear(scene, settings: KernelsSettings, name: str, velocity: float, key: A
     smoothing, length = mg.Smoothing(settings.length, name), settings.length
     point = jnp.array([0.5 * length, velocity, 0.0])
 
-    noise_key, little_key = jax.random.split(key)
-    noise = length * _draw(name, noise_key, (settings.num_samples,))
+    noise = length * _draw(name, key, (settings.num_samples,))
     # The noise on height moves the height itself, so the derivative of the mean is minus that by the noise, whose score is known.
     density = KERNELS[name].density
     score = -jax.vmap(jax.grad(lambda w: jnp.log(density(w))))(noise / length) / length
-    little = _LITTLE * jax.random.normal(little_key, (settings.num_samples,))
-    first, zeroth = (_mean(samples) for samples in _samples(scene, point, noise, score, little))
+    first, zeroth = (_mean(samples) for samples in _samples(scene, point, noise, score))
     exact = np.asarray(_slope(scene, smoothing, point, jnp.zeros(()))[1])
     value = np.stack([exact, first[0], zeroth[0]], axis=1)
     return Linear(velocity, value, np.stack([0 * exact, first[1], zeroth[1]], axis=1))
