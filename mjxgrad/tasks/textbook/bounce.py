@@ -123,7 +123,7 @@ def integrated_restitution(
     found = solve_ivp(
         lambda t, state: (state[1], acceleration(t, state)),
         (0, 100 * time_constant),
-        [0.0, -speed],
+        np.array([0.0, -speed]),
         events=acceleration,
         rtol=1e-10,
         atol=1e-14,
