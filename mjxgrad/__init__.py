@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, smoothing, tasks
+from mjxgrad import baselines, diagnostics, estimators, integration, smoothing, tasks
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
@@ -50,6 +50,7 @@ __all__ = [
     "estimators",
     "forward",
     "initial_state",
+    "integration",
     "linear_policy",
     "load_scene",
     "mlp_policy",

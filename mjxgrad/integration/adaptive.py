@@ -15,7 +15,7 @@ References:
     Simulators for Learning and Control (DiffMJX). arXiv:2506.14186, which integrates so, too, with contact from a distance.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -56,7 +56,7 @@ class AdaptiveTrajectory(eqx.Module):
 def adaptive_rollout(
     scene: Scene,
     state: State,
-    times: Float[ArrayLike, " times"],
+    times: Float[ArrayLike, " times"] | Sequence[float],
     controls: Callable[[Float[Array, ""]], Float[Array, " nu"]] | None = None,
     *,
     tolerance: Float[ArrayLike, ""] = 1e-6,

@@ -3,6 +3,8 @@
 from mjxgrad.task import Outcome, SceneTask, Task
 from mjxgrad.tasks import published, textbook
 from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
+from mjxgrad.tasks.billiards import Billiards, billiards
+from mjxgrad.tasks.cube_toss import CubeToss, cube_toss
 from mjxgrad.tasks.friction import friction
 from mjxgrad.tasks.motion_planning import motion_planning
 from mjxgrad.tasks.push import push, push_softness
@@ -12,12 +14,16 @@ from mjxgrad.tasks.tennis import tennis
 
 __all__ = [
     "BallWall",
+    "Billiards",
+    "CubeToss",
     "Outcome",
     "RollingPin",
     "SceneTask",
     "StoryTask",
     "Task",
     "ball_wall",
+    "billiards",
+    "cube_toss",
     "friction",
     "motion_planning",
     "published",
