@@ -7,7 +7,7 @@ speed of the finger.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.rollout import initial_state
 from mjxgrad.scene import load_scene
@@ -58,9 +58,9 @@ def beside_rod(key: PRNGKeyArray, state: Float[Array, " state"]) -> Float[Array,
 
 
 def planar_pusher(
-    finger: Float[ArrayLike, " 2"] = (0.0, -0.15),
-    rod: Float[ArrayLike, " 3"] = (0.0, 0.0, 0.0),
-    goal: Float[ArrayLike, " 3"] = (0.0, 0.12, 0.0),
+    finger: tuple[float, float] = (0.0, -0.15),
+    rod: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    goal: tuple[float, float, float] = (0.0, 0.12, 0.0),
     *,
     num_substeps: int = _NUM_SUBSTEPS,
 ) -> PlanarPusher:
@@ -75,9 +75,11 @@ def planar_pusher(
     Returns:
         The task.
     """
-    system = SceneSystem(load_scene(scene_path("planar_pusher")), num_substeps)
+    scene = load_scene(scene_path("planar_pusher"))
+    # The sizes are the scene's; pyright takes them for arguments, since `System` declares them as variables.
+    system = SceneSystem(scene=scene, num_substeps=num_substeps)  # pyright: ignore[reportCallIssue]
 
-    def at(pose: Float[ArrayLike, " 3"]) -> Float[Array, " state"]:
+    def at(pose: tuple[float, float, float]) -> Float[Array, " state"]:
         qpos = jnp.concatenate([jnp.asarray(finger, float), jnp.asarray(pose, float)])
         return system.flatten(initial_state(system.scene, qpos=qpos))
 
