@@ -137,7 +137,7 @@ def _rod(axis: Axes, pose: np.ndarray, **look) -> None:
     outline = np.concatenate([right, -right], axis=1)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = np.array([[cos, -sin], [sin, cos]]) @ outline + pose[:2, None]
-    axis.fill(x, y, **({"lw": 0} | look))
+    axis.fill(x, y, **({"lw": 0} | look))  # pyright: ignore[reportArgumentType]
     # The end that the scene paints in another colour tells one half turn from the other.
     axis.plot(pose[0] + cos * _HALF_LENGTH, pose[1] + sin * _HALF_LENGTH, ".", color=REFERENCE, ms=3)
 
