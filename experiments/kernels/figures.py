@@ -78,15 +78,17 @@ def motion(outcome: Outcome):
             (right, one.slope, one.sampled_slope, one.sampled_slope_error),
         )
         for axis, line, dots, error in pairs:
-            axis.plot(outcome.time, line, color=colour, label=f"{TITLES[name]}, smoothed solver")
+            axis.plot(outcome.time, line, color=colour, label=TITLES[name])
             axis.errorbar(
                 outcome.time[every], dots[every], 2 * error[every], color=colour, fmt="o", ms=3.2, lw=0.9,
-                label=f"{TITLES[name]}, sampled",
+                label="sampled",
             )  # fmt: skip
     left.set(title="Height (mm)", xlabel="time (s)")
     right.set(title="Derivative of the height by the start height", xlabel="time (s)")
     # The derivative without noise is one of the simulated map, and may leave the picture.
     seen = np.concatenate([np.stack([m.slope, m.sampled_slope]) for m in outcome.motions.values()])
-    right.set_ylim(min(1.5 * seen.min(), -1.2), 1.5)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
+    right.set_ylim(min(1.5 * seen.min(), -0.3), 1.2)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside lower center", ncols=7, columnspacing=1.2, fontsize=8.5
+    )
     return figure

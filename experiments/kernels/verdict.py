@@ -1,5 +1,7 @@
 """The answer of an experiment on smoothing kernels in words, computed from its numbers."""
 
+import re
+
 import numpy as np
 
 from experiments.kernels.figures import NAMES
@@ -60,7 +62,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 def _describe(found) -> str:
     if not found.is_noise:
-        return found.reason
+        return re.sub(r"-(?=\d)", "−", found.reason)
     if found.stddev == 0:
         return f"noise of no width, shifted by {1e3 * found.mean:.3g} mm".replace("-", "−")
     width = "infinite" if np.isinf(found.stddev) else f"{1e3 * found.stddev:.3g} mm"

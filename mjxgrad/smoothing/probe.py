@@ -96,6 +96,8 @@ def probe(profile: Profile, *, reach: float, num_points: int = 2001) -> Equivale
     if reason := _objection(profile, grid, force, mass, slope):
         return _none(reason, slope, w, mass / (grid[1] - grid[0]))
     mean = float(1000 * reach - ends[0] / slope)
+    # Of heavy tails a little is left even a thousand times as deep as the grid.
+    mean = 0.0 if abs(mean) < 1e-6 * reach else mean
     stddev = np.inf if _tail_exponent(profile, reach, slope) < _HEAVIEST else _stddev(w, mass)
     reason = "noise with a density" + (" of infinite variance" if np.isinf(stddev) else "")
     if mass.max() > _POINT:
