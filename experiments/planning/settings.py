@@ -34,7 +34,7 @@ class TreeSettings(Settings):
 
     capacity: Annotated[int, Field(ge=200)] = 4000
     """Nodes at most."""
-    max_turns: Count = 400
+    max_turns: Count = 800
     """Turns of 16 samples at most."""
     num_seeds: Count = 3
     """Trees for each kind of linear model."""
