@@ -1,100 +1,131 @@
-r"""What automatic differentiation misses when a contact or limit begins or ends: first version, docstring follows."""
+r"""What automatic differentiation misses when a contact or a limit begins or ends.
 
+(docstring follows)
+"""
+
+import dataclasses
 import functools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.constraint import RowLayout
 from mjxgrad.dynamics.newton import Problem
 
-_SLOWEST = 1e-3
+# Nodes and weights of Gauss and Legendre on (0, 1).
+_NODES = 0.5 + 0.5 * np.polynomial.legendre.leggauss(3)[0]
+_SHARES = 0.5 * np.polynomial.legendre.leggauss(3)[1]
 
 
-class _Situation(eqx.Module):
-    """A state with this step's events all at r = 0, in contact; rows of the whole problem.
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """What is static about the events of a step.
+
+    Attributes:
+        layout: the laws of the rows.
+        max_iterations: of a solve.
+        owner: the contact or limit that each row belongs to, -1 if it never begins or ends.
+        is_spread: whether an event lies within the step, so that the contact damps its impulse for the rest of it.
+    """
+
+    layout: RowLayout
+    max_iterations: int
+    owner: tuple[int, ...]
+    is_spread: bool
+
+
+class _Events(eqx.Module):
+    """The events of one step, and the state in which all of them are just in contact.
 
     Attributes:
         problem: whose minimum is the acceleration.
-        damping: B of each row (1/s), zero where the row does not act after the event.
-        is_event: whether the row begins or ends in this step.
-        rate: by how much an event comes later per distance, over the time that its force acts for (1/m, or s/m).
+        damping: h B of each row that acts after the events; zero of others.
+        begins: whether a contact or limit begins.
+        ends: whether it ends.
+        normal: from joint velocities to the rate of distance.
+        speed: of approach or retreat (m/s or rad/s).
         start: acceleration to start from.
-        tolerance: of the solve.
+        timestep: h (s).
+        tolerance: of a solve.
     """
 
     problem: Problem
     damping: Float[Array, " rows"]
-    is_event: Bool[Array, " rows"]
-    rate: Float[Array, " rows"]
+    begins: Bool[Array, " contacts"]
+    ends: Bool[Array, " contacts"]
+    normal: Float[Array, "contacts nv"]
+    speed: Float[Array, " contacts"]
     start: Float[Array, " nv"]
+    timestep: Float[Array, ""]
     tolerance: Float[Array, ""]
 
 
 def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
-    """Return data whose acceleration and constraint force have the tangent of a semi-implicit step's events."""
+    """Return data with acceleration and constraint force to which the tangents of a semi-implicit step's events are added.
+
+    Args:
+        model: gives the time step.
+        data: of the present state, solved.
+        blocks: its constraint rows.
+
+    Returns:
+        Data of the same values.
+    """
     if not any(block.rows_each for block in blocks):
         return data
-    distance, normal = _groups(blocks)
+    distance, normal = _contacts(blocks)
     speed = normal @ data.qvel
-    moved = model.opt.timestep * speed
-    begins = (distance < 0) & (distance - moved >= 0) & (speed < -_SLOWEST)
-    ends = (distance >= 0) & (distance - moved < 0) & (speed > _SLOWEST)
-    situation = _situation(model, data, data.qvel, blocks, (begins, ends), jnp.abs(moved))
-    change = _saltation(assembly.row_layout(model, data), _limits(model, None), situation, _spread(blocks, distance))
-    return data.replace(qacc=data.qacc + change, qfrc_constraint=data.qfrc_constraint + situation.problem.mass @ change)
+    before = distance - model.opt.timestep * speed
+    begins = (distance < 0) & (before >= 0) & (speed < 0)
+    ends = (distance >= 0) & (before < 0) & (speed > 0)
+    events = _events(model, data, data.qvel, blocks, begins, ends)
+    change = _impulse(_plan(model, data, blocks, is_spread=False), events, distance) / model.opt.timestep
+    return data.replace(qacc=data.qacc + change, qfrc_constraint=data.qfrc_constraint + events.problem.mass @ change)
 
 
 def impulse(
     model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: Float[Array, " nv"]
 ) -> Float[Array, " nv"]:
-    """Return a velocity of value zero with the tangent of the events between two states, for Runge-Kutta steps.
+    """Return a change of velocity of value zero with the tangents of the events between two states.
 
     Args:
         model: gives the time step.
-        data: of the state before.
-        blocks: of the state before.
-        mean_velocity: displacement over the step, divided by the time step.
+        data: of the state before, solved.
+        blocks: its constraint rows.
+        mean_velocity: displacement until the state after, divided by the time step.
+
+    Returns:
+        To be added to the velocity after the step.
     """
     if not any(block.rows_each for block in blocks):
         return jnp.zeros_like(data.qvel)
-    h = model.opt.timestep
-    distance, normal = _groups(blocks)
-    after = distance + h * (normal @ mean_velocity)
-    velocity = data.qvel + 0.5 * h * data.qacc
+    distance, normal = _contacts(blocks)
+    after = distance + model.opt.timestep * (normal @ mean_velocity)
+    velocity = data.qvel + 0.5 * model.opt.timestep * data.qacc
     speed = normal @ velocity
-    begins = (distance >= 0) & (after < 0) & (speed < -_SLOWEST)
-    ends = (distance < 0) & (after >= 0) & (speed > _SLOWEST)
-    situation = _situation(model, data, velocity, blocks, (begins, ends), jnp.abs(speed))
-    layout = assembly.row_layout(model, data)
-    return _saltation(layout, _limits(model, 0.5), situation, _spread(blocks, distance))
+    begins = (distance >= 0) & (after < 0) & (speed < 0)
+    ends = (distance < 0) & (after >= 0) & (speed > 0)
+    events = _events(model, data, velocity, blocks, begins, ends)
+    return _impulse(_plan(model, data, blocks, is_spread=True), events, distance)
 
 
-def _limits(model, share):
-    return int(model.opt.iterations), share
+def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: bool) -> _Plan:
+    owner, count = [], 0
+    for block in blocks:
+        num_rows, each = len(block.residual), block.rows_each
+        owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
+        count += num_rows // each if each else 0
+    return _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
 
 
-def _situation(model, data, velocity, blocks, events, scale) -> _Situation:
-    begins, ends = events
-    happens = begins | ends
-    rate = jnp.where(happens, 1 / jnp.where(happens, scale, 1.0), 0.0)
-    is_event = _spread(blocks, happens)
-    touching = _touching(assembly.joined(blocks), is_event)
-    jacobian, reference, weight = assembly.law(model, velocity, touching)
-    rows = assembly.rows_of(model, data, assembly.row_layout(model, data))
-    rows = eqx.tree_at(lambda r: (r.reference, r.weight), rows, (reference, weight))
-    problem = Problem(mjx.full_m(model, data), data.qfrc_smooth, jacobian, rows)
-    damping = jnp.where(_spread(blocks, ends), 0.0, model.opt.timestep * assembly.stiffness_damping(model, touching)[1])
-    tolerance = jnp.asarray(model.opt.tolerance, velocity.dtype)
-    return _Situation(problem, damping, is_event, _spread(blocks, rate), data.qacc, tolerance)
-
-
-def _groups(blocks: list[Block]) -> tuple[Float[Array, " groups"], Float[Array, "groups nv"]]:
-    """Return distance and normal row of each contact and limit."""
+def _contacts(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[Array, "contacts nv"]]:
+    """Return distance less margin, and normal row, of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
         if not block.rows_each:
@@ -105,55 +136,113 @@ def _groups(blocks: list[Block]) -> tuple[Float[Array, " groups"], Float[Array, 
     return jnp.concatenate(distance), jnp.concatenate(normal)
 
 
-def _spread(blocks: list[Block], values: Array) -> Array:
-    """Return per row what is given per group, zero where rows never begin or end."""
-    parts, start = [], 0
-    for block in blocks:
-        count = len(block.residual)
-        if not block.rows_each:
-            parts.append(jnp.zeros(count, values.dtype))
-            continue
-        num_groups = count // block.rows_each
-        parts.append(jnp.repeat(values[start : start + num_groups], block.rows_each, total_repeat_length=count))
-        start += num_groups
-    return jnp.concatenate(parts)
+def _events(
+    model: mjx.Model,
+    data: mjx.Data,
+    velocity: Float[Array, " nv"],
+    blocks: list[Block],
+    begins: Bool[Array, " contacts"],
+    ends: Bool[Array, " contacts"],
+) -> _Events:
+    plan = _plan(model, data, blocks, is_spread=False)
+    is_event = _per_row(plan, begins | ends)
+    touching = _in_contact(assembly.joined(blocks), is_event)
+    jacobian, reference, weight = assembly.law(model, velocity, touching)
+    rows = assembly.rows_of(model, data, plan.layout)
+    rows = eqx.tree_at(lambda r: (r.reference, r.weight), rows, (reference, weight))
+    problem = Problem(mjx.full_m(model, data), data.qfrc_smooth, jacobian, rows)
+    damping = model.opt.timestep * assembly.stiffness_damping(model, touching)[1]
+    normal = _contacts(blocks)[1]
+    return _Events(
+        problem=problem,
+        damping=jnp.where(_per_row(plan, ends), 0.0, damping),
+        begins=begins,
+        ends=ends,
+        normal=normal,
+        speed=jnp.abs(normal @ velocity),
+        start=data.qacc,
+        timestep=jnp.asarray(model.opt.timestep, velocity.dtype),
+        tolerance=jnp.asarray(model.opt.tolerance, velocity.dtype),
+    )
 
 
-def _touching(block: Block, is_event: Bool[Array, " rows"]) -> Block:
-    first = jnp.where(is_event, block.impedance[:, 2], block.impedance[:, 0])
+def _per_row(plan: _Plan, values: Array) -> Array:
+    """Return per row what is given per contact, zero where rows never begin or end."""
+    owner = np.asarray(plan.owner)
+    return jnp.where(owner >= 0, values[np.maximum(owner, 0)], jnp.zeros((), values.dtype))
+
+
+def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
+    """Return rows with some of them at zero distance, in contact."""
+    impedance = jnp.where(which, block.impedance[:, 2], block.impedance[:, 0])
     return eqx.tree_at(
         lambda b: (b.residual, b.impedance, b.is_active),
         block,
         (
-            jnp.where(is_event, 0.0, block.residual),
-            block.impedance.at[:, 0].set(first),
-            block.is_active | is_event,
+            jnp.where(which, 0.0, block.residual),
+            block.impedance.at[:, 0].set(impedance),
+            block.is_active | which,
         ),
     )
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _saltation(layout, limits, situation: _Situation, distance: Float[Array, " rows"]) -> Float[Array, " nv"]:
-    """Return zero, whose tangent is the response of the motion to the force that a later event leaves out."""
-    return jnp.zeros_like(situation.start)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _impulse(plan: _Plan, events: _Events, distance: Float[Array, " contacts"]) -> Float[Array, " nv"]:
+    """Return zero, whose tangent is the change of velocity by what later events leave out."""
+    # Not a constant, which JAX (0.10.2) cannot batch twice in the rule below.
+    return jnp.zeros_like(events.start)
 
 
-@_saltation.defjvp
-def _saltation_jvp(layout, limits, primals, tangents):
-    situation, _ = primals
-    max_iterations, share = limits
-    problem, is_event = situation.problem, situation.is_event
-    acceleration = implicit.solve(layout, max_iterations, problem, situation.start, situation.tolerance)
-    point = problem.at(layout, acceleration)
-    quiet = eqx.tree_at(lambda p: p.rows.weight, problem, jnp.where(is_event, 0.0, problem.rows.weight))
-    response = quiet.hessian(layout, point.x)
-    late = jnp.where(is_event, point.row_force * situation.rate, 0.0)
-    change = -linear.solve_positive_definite(response, problem.jacobian.T @ (late * tangents[1]))
-    if share is not None:
-        full = problem.hessian(layout, point.x)
-        damped = constraint.curvature_product(
-            layout, problem.rows, point.x, situation.damping[:, None] * problem.jacobian
-        )
-        slowed = full + share * problem.jacobian.T @ damped
-        change = jnp.linalg.solve(slowed, full @ change)
-    return jnp.zeros_like(situation.start), change
+@_impulse.defjvp
+def _impulse_jvp(plan, primals, tangents):
+    events, _ = primals
+    problem, is_event = events.problem, _per_row(plan, events.begins | events.ends)
+    without = _without(problem, is_event)
+    held = implicit.solve(plan.layout, plan.max_iterations, problem, events.start, events.tolerance)
+    free = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
+    point, other = problem.at(plan.layout, held), without.at(plan.layout, free)
+    late = jnp.where(events.begins | events.ends, tangents[1] * _delay(events, free), 0.0)
+    lost = linear.rmatvec(problem.jacobian, point.row_force * _per_row(plan, late))
+    response = _secant_hessian(plan.layout, without, other.x, point.x)
+    change = -linear.solve_positive_definite(response, lost)
+    if plan.is_spread:
+        change = _damped(plan, events, point.x, change)
+    return jnp.zeros_like(events.start), change
+
+
+def _delay(events: _Events, free: Float[Array, " nv"]) -> Float[Array, " contacts"]:
+    """Return by how much an event comes later per distance (s/m), less where the speed is not resolved."""
+    drift = events.timestep * (events.normal @ free)
+    square = events.speed**2 + drift**2
+    return events.speed / jnp.where(square > 0, square, 1.0)
+
+
+def _without(problem: Problem, which: Bool[Array, " rows"]) -> Problem:
+    return eqx.tree_at(lambda p: p.rows.weight, problem, jnp.where(which, 0.0, problem.rows.weight))
+
+
+def _secant_hessian(
+    layout: RowLayout, problem: Problem, start: Float[Array, " rows"], stop: Float[Array, " rows"]
+) -> Float[Array, "nv nv"]:
+    """Return the Hessian averaged between two points, by which the forces at both differ."""
+    rows, jacobian = problem.rows, problem.jacobian
+    moved = stop - start
+    curved = constraint.curvature_product(layout, rows, stop, jacobian)
+    is_far = jnp.abs(moved) > jnp.sqrt(jnp.finfo(moved.dtype).eps) * (jnp.abs(start) + jnp.abs(stop))
+    gained = constraint.force(layout, rows, start) - constraint.force(layout, rows, stop)
+    secant = (gained / jnp.where(is_far, moved, 1.0))[:, None] * jacobian
+    if layout.cones:
+        # The rows of a cone act on each other: no quotient gives their matrix.
+        between = (constraint.curvature_product(layout, rows, start + t * moved, jacobian) for t in _NODES)
+        mean = sum(share * product for share, product in zip(_SHARES, between, strict=True))
+        secant = jnp.concatenate([secant[: layout.simple_stop], mean[layout.simple_stop :]])
+    return problem.mass + linear.gram(jacobian, jnp.where(is_far[:, None], secant, curved))
+
+
+def _damped(plan: _Plan, events: _Events, x: Float[Array, " rows"], change: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Return what contacts leave of a change of velocity in half a time step, by the implicit midpoint rule."""
+    after = _without(events.problem, _per_row(plan, events.ends))
+    hessian = after.hessian(plan.layout, x)
+    slope = events.damping[:, None] * after.jacobian
+    damped = linear.gram(after.jacobian, constraint.curvature_product(plan.layout, after.rows, x, slope))
+    return linear.solve_positive_definite(hessian + 0.5 * damped, hessian @ change)
