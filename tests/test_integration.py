@@ -17,7 +17,7 @@ BALL = f"""
 <mujoco>
   <option gravity="0 0 0" timestep="{STEP}"/>
   <worldbody>
-    <geom type="plane" size="1 1 .1"/>
+    <geom type="plane" size="1 1 .1" solimp="0.9 0.9 0.001"/>
     <body pos="0 0 {RADIUS}">
       <joint type="slide" axis="0 0 1"/>
       <geom type="sphere" size="{RADIUS}" mass="2" solimp="0.9 0.9 0.001"/>

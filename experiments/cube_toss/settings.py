@@ -22,7 +22,7 @@ class CubeTossSettings(RunSettings):
     """Over which an average is taken."""
     num_substeps: Annotated[int, Field(ge=2)] = 8
     """In a step that holds an event."""
-    num_throws: Annotated[int, Field(ge=3)] = 6
+    num_throws: Annotated[int, Field(ge=3)] = 4
     """Throws at slightly different speed, over which the error is taken; single derivatives depend on chance."""
     interval: Positive = 0.005
     """That the speeds of these throws span, in m/s."""
