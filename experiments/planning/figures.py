@@ -65,11 +65,12 @@ def tree(outcome: Outcome):
     left, right = axes[0]
     best = outcome.shortest(outcome.settings.models[0])
     assert best.nodes is not None and best.parents is not None  # noqa: PT018
+    reached = "way found" if outcome.is_solved(best) else "way to the nearest node"
     places = best.nodes[:, 2:4]
     joined = np.stack([places[best.parents[1:]], places[1:]], axis=1)
     left.add_collection(LineCollection(list(joined), colors=MUTED, linewidths=0.5, alpha=0.6))
     left.plot(*places.T, ".", ms=1.5, color=MUTED)
-    left.plot(*best.states[:, 2:4].T, color=ZEROTH, lw=2.2, label="way found")
+    left.plot(*best.states[:, 2:4].T, color=ZEROTH, lw=2.2, label=reached)
     left.plot(*best.states[0, 2:4], "o", color=REFERENCE, ms=5, label="start")
     left.plot(*outcome.goal[:2], "*", color=FIRST, ms=11, label="goal", zorder=4)
     left.set(title="Rod's centre in the nodes", xlabel="x in m", ylabel="y in m", aspect="equal")
@@ -87,7 +88,7 @@ def tree(outcome: Outcome):
     right.set_xscale("log")
     right.set_yscale("log")
     right.set(title="Nearest to the goal, in tolerances", xlabel="nodes")
-    right.legend(loc="lower left")
+    right.legend(loc="upper right")
     return figure
 
 
