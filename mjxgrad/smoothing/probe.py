@@ -6,7 +6,7 @@ $$\rho(w) = F''(-w) / s, \qquad \mathbb{E} w = \lim_{r \to -\infty} (-r - F(r) /
 
 Read backwards: a profile of force against distance is that of noise exactly if it is convex, vanishes far away and runs along a
 line of slope $-s$ deep inside. It is noise of no width (a point mass) if it is a ramp itself, which a margin shifts. MuJoCo's
-impedance is no noise: where it rises with depth, the force is for a while steeper than in the end, and the density negative there.
+impedance is no noise: where it rises with depth, the force is for a while steeper than in the end, and the density negative.
 Nor is a force that jumps at the surface, as MuJoCo's does where the bodies accelerate against each other.
 """
 
