@@ -16,7 +16,7 @@ def captions(outcome: Outcome) -> dict[str, str]:
     return {
         "error": (
             "One dot per time and coordinate after the first impact, where the slope can be judged by; discs are medians. "
-            "Errors below 10⁻⁴ are drawn there. "
+            "Errors below 10⁻⁴ and above 10² are drawn there. "
             f"Left of the dotted line an error is at most {settings.tolerance:.0%}."
         ),
         "derivative": (

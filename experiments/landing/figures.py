@@ -38,7 +38,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
 def derivative(course: Course):
     """One panel per coordinate: slope with its band, mean of each derivative, when something begins."""
     count = len(course.labels)
-    figure, axes = subplots(1, count, height=3.1)
+    figure, axes = subplots(1, count, height=3.4)
     found = course.found
     for j, axis in enumerate(axes[0]):
         band = 2 * found.slope_error[:, j]
@@ -65,7 +65,7 @@ def derivative(course: Course):
     ]
     if not course.can_judge.all():
         handles.append((Line2D([], [], color=REFERENCE, marker="x", ls="", ms=5), "slope too uncertain to judge by"))
-    figure.legend(*zip(*handles, strict=True), loc="outside lower center", ncols=len(handles), fontsize=8.5)
+    figure.legend(*zip(*handles, strict=True), loc="outside lower center", ncols=3, fontsize=8.5)
     figure.suptitle(f"{course.title}, time step {1e3 * course.timestep:g} ms", fontsize=10)
     return figure
 
@@ -73,12 +73,12 @@ def derivative(course: Course):
 def error(outcome: Outcome):
     """Relative error over all times and coordinates: median and range, by motion and time step."""
     courses = outcome.all
-    figure, axes = subplots(1, 1, height=1.4 + 0.3 * len(courses))
+    figure, axes = subplots(1, 1, height=1.8 + 0.3 * len(courses))
     axis = axes[0, 0]
     for place, course in enumerate(courses):
         judged = course.can_judge & course.has_impact
         for row, name in enumerate(course.found.gradients):
-            errors = np.maximum(course.found.relative_error[row][judged], 1e-4)
+            errors = np.clip(course.found.relative_error[row][judged], 1e-4, 1e2)
             if not errors.size:
                 continue
             at = place + (0.14 if name == EVENT else -0.14)
@@ -90,7 +90,7 @@ def error(outcome: Outcome):
     axis.set_xscale("log")
     axis.set_xlabel("error, as a share of the larger of the slope and the discrete gradient's own error")
     handles = [Line2D([], [], color=_COLOURS[n], marker="o", ls="", ms=5, label=f"{n} gradient") for n in _COLOURS]
-    axis.legend(handles=handles, loc="upper left", bbox_to_anchor=(0, 1.0), framealpha=0.9, frameon=True)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8.5)
     return figure
 
 
