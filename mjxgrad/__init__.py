@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, integration, smoothing, tasks
+from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
@@ -57,6 +57,7 @@ __all__ = [
     "open_loop",
     "optimise",
     "parameter_noise",
+    "planning",
     "rollout",
     "smoothing",
     "solve",

@@ -4,6 +4,7 @@ from mjxgrad.planning.cost import Cost, GoalCost
 from mjxgrad.planning.search import Path, Sampling, Search, path, search
 from mjxgrad.planning.smoothers import Analytic, Exact, Sampled, Smoother
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
+from mjxgrad.smoothing.linear_model import LinearModel
 from mjxgrad.smoothing.system import FunctionSystem, SceneSystem, System
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "FunctionSystem",
     "GoalCost",
     "Iterations",
+    "LinearModel",
     "Path",
     "Plan",
     "Sampled",

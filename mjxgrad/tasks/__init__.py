@@ -7,6 +7,7 @@ from mjxgrad.tasks.billiards import Billiards, billiards
 from mjxgrad.tasks.cube_toss import CubeToss, cube_toss
 from mjxgrad.tasks.friction import friction
 from mjxgrad.tasks.motion_planning import motion_planning
+from mjxgrad.tasks.planar_pusher import PlanarPusher, planar_pusher
 from mjxgrad.tasks.push import push, push_softness
 from mjxgrad.tasks.rolling_pin import RollingPin, rolling_pin
 from mjxgrad.tasks.story import StoryTask
@@ -17,6 +18,7 @@ __all__ = [
     "Billiards",
     "CubeToss",
     "Outcome",
+    "PlanarPusher",
     "RollingPin",
     "SceneTask",
     "StoryTask",
@@ -26,6 +28,7 @@ __all__ = [
     "cube_toss",
     "friction",
     "motion_planning",
+    "planar_pusher",
     "published",
     "push",
     "push_softness",
