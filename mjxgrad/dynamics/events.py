@@ -189,8 +189,8 @@ def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _impulse(plan: _Plan, events: _Events, distance: Float[Array, " contacts"]) -> Float[Array, " nv"]:
     """Return zero, whose tangent is the change of velocity by what later events leave out."""
-    # Not a constant, which JAX (0.10.2) cannot batch twice in the rule below.
-    return jnp.zeros_like(events.start)
+    # Not a constant: under nested batches JAX (0.10.2) fails on a rule whose value has no batch and whose tangent has one.
+    return 0 * events.start
 
 
 @_impulse.defjvp
@@ -207,7 +207,7 @@ def _impulse_jvp(plan, primals, tangents):
     change = -linear.solve_positive_definite(response, lost)
     if plan.is_spread:
         change = _damped(plan, events, point.x, change)
-    return jnp.zeros_like(events.start), change
+    return 0 * events.start, change
 
 
 def _delay(events: _Events, free: Float[Array, " nv"]) -> Float[Array, " contacts"]:
