@@ -58,28 +58,31 @@ def closed_form(height):
 
 @pytest.fixture(scope="module")
 def adaptive(ball):
-    @eqx.filter_jit
+    @jax.jit
+    @jax.value_and_grad
     def run(height):
-        def end(height):
-            return adaptive_rollout(ball, thrown(ball, height), [HORIZON * STEP], tolerance=1e-8).qpos[-1, 0]
-
-        return end(height), jax.grad(end)(height)
+        found = adaptive_rollout(ball, thrown(ball, height), [HORIZON * STEP], tolerance=1e-6, max_steps=1024)
+        return jnp.where(found.has_failed, jnp.nan, found.qpos[-1, 0])
 
     return run
 
 
+@pytest.mark.slow
 def test_adaptive_integration_finds_the_bounce_in_closed_form(adaptive):
     height, _ = adaptive(jnp.array(0.05))
-    # Errors add up over some 10³ steps of 1e-8.
-    assert height == pytest.approx(float(closed_form(0.05)), abs=1e-6)
+    # Errors add up over some 10² steps of 1e-6 and are carried along for 0.1 s.
+    assert height == pytest.approx(float(closed_form(0.05)), abs=2e-5)
 
 
+@pytest.mark.slow
 def test_the_difference_quotient_of_adaptive_rollouts_is_the_restitution_and_its_derivative_is_not(adaptive):
-    (low, slope), (high, _) = adaptive(jnp.array(0.0495)), adaptive(jnp.array(0.0505))
-    assert (high - low) / 1e-3 == pytest.approx(-RESTITUTION, abs=1e-3)
+    (low, slope), (high, _) = adaptive(jnp.array(0.045)), adaptive(jnp.array(0.055))
+    # Two errors of 2e-5 over 0.01.
+    assert (high - low) / 0.01 == pytest.approx(-RESTITUTION, abs=4e-3)
     assert abs(slope + RESTITUTION) > 0.5
 
 
+@pytest.mark.slow
 def test_adaptive_integration_turns_a_free_body_about_its_axis_and_keeps_quaternions_normalised():
     scene = mg.load_scene(SPINNING)
     state = mg.initial_state(scene, qvel=jnp.array([1.0, 0, 0, 0, 0, 3.0]))
@@ -90,11 +93,13 @@ def test_adaptive_integration_turns_a_free_body_about_its_axis_and_keeps_quatern
     assert not bool(found.has_failed)
 
 
+@pytest.mark.slow
 def test_steps_that_run_out_are_flagged(ball):
     found = eqx.filter_jit(adaptive_rollout)(ball, thrown(ball, 0.05), jnp.array([0.2]), tolerance=1e-8, max_steps=10)
     assert bool(found.has_failed)
 
 
+@pytest.mark.slow
 def test_a_shift_by_a_whole_step_is_none(ball):
     whole = eqx.filter_jit(mg.rollout)(ball, thrown(ball, 0.05), horizon=HORIZON)
     shifted = eqx.filter_jit(shifted_rollout)(ball, thrown(ball, 0.05), phase=jnp.array(1.0), horizon=HORIZON)
@@ -111,6 +116,7 @@ def test_shifted_controls_act_over_the_intervals_that_they_were_given_for():
     assert np.allclose(found.qvel[1:, 0], [0.06, (0.4 - 0.06) / 2, (0.4 - 0.2 + 0.18) / 2, (0.4 - 0.2 + 0.6) / 2])
 
 
+@pytest.mark.slow
 def test_the_mean_over_phases_removes_the_sawtooth(ball):
     heights = RADIUS + jnp.linspace(0, STEP, 17)[:-1]  # one whole tooth at 1 m/s
 
@@ -139,6 +145,7 @@ def test_phases_moved_by_a_key_average_to_the_same_grid_shifted(key):
     assert float(phase_average(lambda phase: phase, 4)()) == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_short_steps_at_events_bring_the_bounce_closer_and_flight_is_untouched(ball):
     heights = RADIUS + jnp.linspace(0, STEP, 9)[:-1]
 

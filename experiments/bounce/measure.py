@@ -57,7 +57,7 @@ def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
     with workspace.stage("quadrature", "steps", 1):
         cells = [_cell(settings, *point) for point in grid]
     scene = bounce_scene()
-    found, tiny, wide = [], [], []
+    found, differences = [], []
     starts = jnp.asarray(phases(settings.heights, settings.num_phases))
     with workspace.stage("rollouts", "time steps", len(settings.timesteps)) as advance_to:
         for timestep in settings.timesteps:
@@ -65,16 +65,18 @@ def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
             sampled = {name: _values_and_derivatives(contacts, starts, name) for name in (DISCRETE, EVENT)}
             derivatives = [derivative for _, derivative in sampled.values()]
             found.append(compare_to_slope(starts, sampled[DISCRETE][0], derivatives, tuple(sampled)))
-            tiny.append(_differences(contacts, starts, _TINY))
-            wide.append(_differences(contacts, starts, settings.speed * timestep))
+            widths = (_TINY, settings.speed * timestep)
+            quotients = [_differences(contacts, starts, width) for width in widths]
+            # Their means need the weights of the derivatives' to be compared with them.
+            differences.append(compare_to_slope(starts, sampled[DISCRETE][0], quotients, ("tiny", "wide")))
             advance_to(len(found))
     return Outcome(
         settings=settings,
         cells=cells,
         found=found,
-        tiny=np.array([one.mean(axis=0) for one in tiny]),
-        wide=np.array([one.mean(axis=0) for one in wide]),
-        wide_spread=np.array([one.std(axis=0, ddof=1) for one in wide]),
+        tiny=np.array([one.mean[0] for one in differences]),
+        wide=np.array([one.mean[1] for one in differences]),
+        wide_spread=np.array([one.spread[1] for one in differences]),
     )
 
 

@@ -5,8 +5,6 @@ References:
     Simulators for Learning and Control (DiffMJX). arXiv:2506.14186; the cube of its timing experiment.
 """
 
-from typing import Literal
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -25,8 +23,6 @@ _CONTACTS = {
     "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
     "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),
 }
-
-Contact = Literal["published", "default"]
 
 
 class CubeToss(eqx.Module):
@@ -52,7 +48,7 @@ class CubeToss(eqx.Module):
         return qpos[..., 1]
 
 
-def cube_toss(contact: Contact = "published", *, timestep: float | None = None) -> CubeToss:
+def cube_toss(contact: str = "published", *, timestep: float | None = None) -> CubeToss:
     """Load the throw.
 
     Args:

@@ -1,4 +1,4 @@
-"""A run on bounces, small, from its file to its folder."""
+"""A run on bounces, small, from its file to its folder, which takes a minute; and what cannot be run."""
 
 import csv
 import json
@@ -30,6 +30,7 @@ def finished(tmp_path_factory):
     return folder / "ball"
 
 
+@pytest.mark.slow
 def test_the_metrics_hold_derivatives_differences_and_both_truths(finished):
     with (finished / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -43,6 +44,7 @@ def test_the_metrics_hold_derivatives_differences_and_both_truths(finished):
             assert float(row["slope"]) == pytest.approx(float(row["truth"]), rel=0.1)  # first order in the step
 
 
+@pytest.mark.slow
 def test_the_verdict_counts_where_the_event_gradient_holds(finished):
     verdict = json.loads((finished / "summary.json").read_text())["verdict"]
     assert "Up to 0.5 ms the event gradient is within 5% at " in verdict
