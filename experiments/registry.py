@@ -13,6 +13,7 @@ from experiments.kernels.settings import KernelsSettings
 from experiments.landing.settings import LandingSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.planning.settings import PlanningSettings
+from experiments.policy_gradient.settings import PolicyGradientSettings
 from experiments.report import Report
 from experiments.rolling_pin.settings import RollingPinSettings
 from experiments.textbook.settings import TextbookSettings
@@ -47,6 +48,7 @@ EXPERIMENTS = {
     "kernels": Experiment(KernelsSettings, "experiments.kernels.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
+    "policy_gradient": Experiment(PolicyGradientSettings, "experiments.policy_gradient.run:run"),
     "rolling_pin": Experiment(RollingPinSettings, "experiments.rolling_pin.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
 }

@@ -6,6 +6,7 @@ from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
 from mjxgrad.tasks.billiards import Billiards, billiards
 from mjxgrad.tasks.cube_toss import CubeToss, cube_toss
 from mjxgrad.tasks.friction import friction
+from mjxgrad.tasks.hopper import Hopper, hopper
 from mjxgrad.tasks.motion_planning import motion_planning
 from mjxgrad.tasks.planar_pusher import PlanarPusher, planar_pusher
 from mjxgrad.tasks.push import push, push_softness
@@ -17,6 +18,7 @@ __all__ = [
     "BallWall",
     "Billiards",
     "CubeToss",
+    "Hopper",
     "Outcome",
     "PlanarPusher",
     "RollingPin",
@@ -27,6 +29,7 @@ __all__ = [
     "billiards",
     "cube_toss",
     "friction",
+    "hopper",
     "motion_planning",
     "planar_pusher",
     "published",

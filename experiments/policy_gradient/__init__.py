@@ -1,0 +1,1 @@
+"""First-order control and policy gradients, discrete and event, against an unbiased reference."""

@@ -1,0 +1,192 @@
+"""The pictures of an experiment on policy gradients."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter
+
+from experiments.policy_gradient.outcome import DISCRETE, EVENT, GRADIENTS, Cell, Course, Outcome
+from experiments.report import Figure
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+
+_COLOURS = {DISCRETE: FIRST, EVENT: ZEROTH}
+_MARKERS = {DISCRETE: "o", EVENT: "s"}
+_SMALLEST = 1e-3
+_OBSERVED = ("thigh", "leg", "foot", "thigh's speed", "leg's speed", "foot's speed", "offset")
+_MOTORS = ("thigh", "leg", "foot")
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw all figures.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by name: summary, throw, push, hopper, descent.
+
+    Returns:
+        The figures in order of reading; those of tasks that were left out are not drawn.
+    """
+    throws, pushes, hoppers = (
+        outcome.of(*names) for names in (("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff"), ("hopper",))
+    )
+    drawings = [("summary", "Bias, trust and error", summary, outcome.cells)]
+    drawings += [("throw", "Throws over the wall", throw, throws)] if throws else []
+    drawings += [("hopper", "Policy gradient of the hopper", hopper, hoppers)] if hoppers else []
+    drawings += [("push", "Control gradient of the push", push, pushes)] if pushes else []
+    drawings += [("descent", "Descents", descent, outcome.courses)] if outcome.courses else []
+    return [
+        Figure(save(function(numbers), folder, name), title, captions[name])
+        for name, title, function, numbers in drawings
+    ]
+
+
+def summary(cells: list[Cell]):
+    """Three panels with one row per point: bias of the first order, α, error of one α-order estimate."""
+    figure, axes = subplots(1, 3, height=1.4 + 0.27 * len(cells), sharey=True)
+    rows = np.arange(len(cells))
+    for gradient, shift in ((DISCRETE, -0.14), (EVENT, 0.14)):
+        look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ls": "", "ms": 5}
+        bias, low, high = np.maximum(np.array([cell.bias(gradient) for cell in cells]).T, _SMALLEST)
+        spread = np.abs(np.stack([bias - low, high - bias]))
+        axes[0, 0].errorbar(bias, rows + shift, xerr=spread, label=f"{gradient} gradient", elinewidth=1, **look)
+        alpha, alpha_error = np.array([cell.alpha(gradient) for cell in cells]).T
+        axes[0, 1].errorbar(alpha, rows + shift, xerr=2 * alpha_error, elinewidth=1, **look)
+        axes[0, 2].plot([cell.error(gradient, "mixed") for cell in cells], rows + shift, **look)
+    for axis in axes[0]:
+        for row in rows[[cell.hits_and_misses for cell in cells]]:
+            axis.axhspan(row - 0.5, row + 0.5, color=MUTED, alpha=0.18, lw=0)
+        axis.grid(axis="y", visible=False)
+    for axis in axes[0, ::2]:
+        axis.set_xscale("log")
+        axis.xaxis.set_major_formatter(FuncFormatter(_percent))
+    axes[0, 0].set_xlim(left=_SMALLEST)
+    axes[0, 1].set_xlim(-0.04, 1.04)
+    axes[0, 0].set_yticks(rows, [cell.label for cell in cells])
+    axes[0, 0].invert_yaxis()
+    axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
+    axes[0, 1].set(title="Weight of the first order", xlabel="α")
+    axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def throw(cells: list[Cell]):
+    """A row per contact: gradients against the angle, and α."""
+    names = list(dict.fromkeys(cell.name for cell in cells))
+    figure, axes = subplots(len(names), 2, height=0.6 + 2.7 * len(names), sharex=True, width_ratios=[1.6, 1])
+    for (left, right), name in zip(axes, names, strict=True):
+        shown = [cell for cell in cells if cell.name == name]
+        angle = np.array([float(cell.point.split()[0]) for cell in shown])
+        reference = np.array([cell.reference_mean() for cell in shown])[:, :, 0]
+        left.errorbar(
+            angle, reference[:, 0], 2 * reference[:, 1], color=REFERENCE, lw=2.2, capsize=3, label="unbiased reference"
+        )
+        for gradient, shift in ((DISCRETE, -0.006), (EVENT, 0.006)):
+            look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ms": 5, "lw": 1, "ls": (0, (4, 2))}
+            first = np.array([cell.first_mean(gradient) for cell in shown])[:, :, 0]
+            left.errorbar(
+                angle + shift, first[:, 0], 2 * first[:, 1], label=f"first order, {gradient} gradient", **look
+            )
+            alpha = np.array([cell.alpha(gradient) for cell in shown])
+            right.errorbar(angle + shift, alpha[:, 0], 2 * alpha[:, 1], **look)
+        for axis in (left, right):
+            for cell, place in zip(shown, angle, strict=True):
+                if cell.hits_and_misses:
+                    axis.axvspan(place - 0.05, place + 0.05, color=MUTED, alpha=0.18, lw=0)
+        left.set_yscale("symlog", linthresh=0.01)
+        left.yaxis.set_major_formatter(FuncFormatter(_plain))
+        left.set(title=shown[0].title, ylabel="gradient, m²/rad")
+        right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
+    for axis in axes[-1]:
+        axis.set_xlabel("angle, rad")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def push(cells: list[Cell]):
+    """A panel per stiffness: components of the gradient over the steps."""
+    figure, axes = subplots(1, len(cells), height=3.4)
+    for axis, cell in zip(axes[0], cells, strict=True):
+        mean, error = cell.reference_mean()
+        step = np.arange(len(mean))
+        axis.fill_between(
+            step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
+        )
+        for gradient in GRADIENTS:
+            style = {"ls": (0, (4, 2))} if gradient == EVENT else {"lw": 2.4}
+            axis.plot(
+                step, cell.first_mean(gradient)[0], color=_COLOURS[gradient], label=f"{gradient} gradient", **style
+            )
+        axis.set(title=cell.title, xlabel="step")
+        axis.yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes[0, 0].set_ylabel("gradient, 1/N")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def hopper(cells: list[Cell]):
+    """A panel per motor: components of the policy gradient by what is observed."""
+    (cell,) = cells
+    figure, axes = subplots(1, 3, height=3.8, sharey=True)
+    looks = [(REFERENCE, "D", "unbiased reference", cell.reference_mean(), 0.0)]
+    looks += [
+        (_COLOURS[gradient], _MARKERS[gradient], f"first order, {gradient} gradient", cell.first_mean(gradient), shift)
+        for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True)
+    ]
+    places = np.arange(len(_OBSERVED))
+    for motor, axis in enumerate(axes[0]):
+        axis.axhline(0, color=MUTED, lw=0.8)
+        for colour, marker, label, (mean, error), shift in looks:
+            values, errors = _by_motor(mean)[motor], _by_motor(error)[motor]
+            axis.errorbar(
+                places + shift, values, 2 * errors, color=colour, marker=marker, ms=5, ls="", elinewidth=1, label=label
+            )
+        axis.set(title=f"Motor of the {_MOTORS[motor]}")
+        axis.set_xticks(places, _OBSERVED, rotation=35, ha="right")
+        axis.grid(axis="x", visible=False)
+    axes[0, 0].yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes[0, 0].set_ylabel("gradient, m per unit of gain")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def descent(courses: list[Course]):
+    """A column per task and estimator: cost above, α below."""
+    kinds = list(dict.fromkeys((course.name, course.estimator) for course in courses))
+    figure, axes = subplots(2, len(kinds), height=4.6, sharex="col", height_ratios=[2, 1])
+    for (above, below), kind in zip(axes.T, kinds, strict=True):
+        for course in courses:
+            if (course.name, course.estimator) != kind:
+                continue
+            style = {"ls": (0, (4, 2))} if course.gradient == EVENT else {}
+            colour, steps = _COLOURS[course.gradient], np.arange(course.costs.shape[1])
+            for axis, values in ((above, course.costs), (below, course.alphas)):
+                axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)
+                axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
+            title = course.title.replace("Throw, ", "Throw\n")
+            above.set_title(f"{title}\n{'first order' if kind[1] == 'first' else 'α-order'}".replace("\n", ", ", 1))
+        above.yaxis.set_major_formatter(FuncFormatter(_plain))
+        below.set(ylim=(-0.05, 1.05), xlabel="step")
+    axes[0, 0].set_ylabel("cost")
+    axes[1, 0].set_ylabel("α")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _by_motor(flat: np.ndarray) -> np.ndarray:
+    """Give (motor, observed) from the flattened gain and offset."""
+    return np.concatenate([flat[:18].reshape(3, 6), flat[18:, None]], axis=1)
+
+
+def _percent(value: float, _: object) -> str:
+    return f"{100 * value:g}%"
+
+
+def _plain(value: float, _: object) -> str:
+    return f"{value:g}".replace("-", "−")

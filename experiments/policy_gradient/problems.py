@@ -1,0 +1,153 @@
+"""The tasks, each as it is with either gradient, and the points at which both are compared."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import mjxgrad as mg
+from experiments.policy_gradient.settings import PolicyGradientSettings
+from mjxgrad.dynamics import Gradient
+
+# What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
+DEFAULT_CONTACT = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.9, 0.95), width=0.001)
+WALL_STIFFNESS = 1e4  # 1/s², that of the README
+THROW_START, THROW_STDDEV, THROW_RATE = 0.5, 0.1, 0.02  # rad, rad, of Adam; the README's
+HOPPER_RATE = 0.01
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How a task is optimised by Adam.
+
+    Attributes:
+        start: parameters.
+        stddev: of the noise.
+        learning_rate: of Adam.
+        num_steps: of it.
+        estimators: by which the descents are done: "first" order or "alpha"-order.
+    """
+
+    start: Float[Array, " dim"]
+    stddev: float
+    learning_rate: float
+    num_steps: int
+    estimators: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where gradients are compared.
+
+    Attributes:
+        label: for tables.
+        params: the parameters.
+        hits_and_misses: whether the noise covers a jump of the cost.
+    """
+
+    label: str
+    params: Float[Array, " dim"]
+    hits_and_misses: bool = False
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A task.
+
+    Attributes:
+        name: in the settings.
+        title: for headings.
+        objective: of a gradient ("discrete" or "event") and a standard deviation of the noise.
+        stddev: of the noise at the points.
+        points: where gradients are compared.
+        num_samples: rollouts of one estimate.
+        has_jump_of_force: whether its contacts set in with a force that is not zero.
+        descent: None if it is not optimised.
+    """
+
+    name: str
+    title: str
+    objective: Callable[[str, Float[Array, ""]], mg.Objective]
+    stddev: float
+    points: Sequence[Point]
+    num_samples: int
+    has_jump_of_force: bool
+    descent: Descent | None = None
+
+
+def problem(name: str, settings: PolicyGradientSettings) -> Problem:
+    """Build a task.
+
+    Args:
+        name: one of `experiments.policy_gradient.settings.TaskName`.
+        settings: of the run.
+
+    Returns:
+        The task.
+    """
+    if name == "hopper":
+        return _hopper(settings)
+    return _push(name) if name.startswith("push") else _throw(name, settings)
+
+
+# Throws between about 35 and 74 degrees clear the wall.
+_JUMPS = (0.62, 1.29)
+
+
+def _throw(name: str, settings: PolicyGradientSettings) -> Problem:
+    is_default = name == "ball_wall_default"
+    softness = DEFAULT_CONTACT if is_default else mg.tasks.wall_softness(WALL_STIFFNESS)
+    task = mg.tasks.ball_wall().with_softness(softness)
+    points = [
+        Point(
+            f"{angle:g} rad",
+            jnp.array([angle]),
+            any(abs(angle - jump) < 3 * settings.angle_stddev for jump in _JUMPS),
+        )
+        for angle in settings.angles
+    ]
+    return Problem(
+        name=name,
+        title="Throw, default contact" if is_default else "Throw, gentle contact",
+        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        stddev=settings.angle_stddev,
+        points=points,
+        num_samples=50,
+        has_jump_of_force=is_default,
+        descent=_descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"]),
+    )
+
+
+def _push(name: str) -> Problem:
+    stiffness = {"push_soft": 10.0, "push_stiff": 1000.0}[name]
+    task = mg.tasks.push(stiffness)
+    return Problem(
+        name=name,
+        title=f"Push, {stiffness:g} N/m",
+        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        stddev=task.settings.stddev,
+        points=[Point("start", task.initial_params())],
+        num_samples=16,
+        has_jump_of_force=False,
+    )
+
+
+def _hopper(settings: PolicyGradientSettings) -> Problem:
+    task = mg.tasks.hopper()
+    start = task.initial_params()
+    return Problem(
+        name="hopper",
+        title="Hopper",
+        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        stddev=0.1,
+        points=[Point("start", start)],
+        num_samples=32,
+        has_jump_of_force=True,
+        descent=_descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"]),
+    )
+
+
+def _descent(start, stddev: float, rate: float, num_steps: int, estimators: list[str]) -> Descent | None:
+    return Descent(start, stddev, rate, num_steps, estimators) if num_steps else None

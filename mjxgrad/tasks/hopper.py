@@ -1,0 +1,104 @@
+"""Gymnasium's hopper, dropped onto its foot under a linear policy that holds a posture.
+
+Nothing in it jumps, and yet its policy gradient is the discrete derivative's hardest case: the foot lands under an impedance
+that is not zero at first touch, so that every parameter that moves the moment of landing is misjudged.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from mjxgrad.objective import ActionNoise, closed_loop
+from mjxgrad.policy import Affine, LinearPolicy, linear_policy
+from mjxgrad.rollout import State, Trajectory, initial_state
+from mjxgrad.scene import load_scene
+from mjxgrad.task import SceneTask
+
+# Bent, so that the legs take up the landing; moving down, so that it lands after 70 ms.
+START_POSE = (0.0, 1.22, 0.0, -0.4, -0.5, 0.3)  # m, m, rad
+START_VELOCITY = (0.5, -1.0, 0.0, 0.0, 0.0, 0.0)
+# In actions per rad and per rad/s; the motors turn with 200 Nm for an action of 1.
+STIFFNESS, DAMPING = (0.5, 0.5, 0.3), (0.05, 0.05, 0.03)
+STDDEV = 0.1
+
+
+class JumpCost(eqx.Module):
+    """How far and high the torso comes, as a cost.
+
+    Attributes:
+        height_weight: of the final height.
+    """
+
+    height_weight: Float[Array, ""]
+
+    def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
+        """Give minus the distance forward, less the weighted height, in m."""
+        return -trajectory.qpos[-1, 0] - self.height_weight * trajectory.qpos[-1, 1]
+
+
+class Hopper(SceneTask):
+    """The drop; see `hopper`.
+
+    Attributes:
+        policy: from `Affine` parameters and a state to the three actions.
+        start_params: the posture's gains and offsets.
+    """
+
+    policy: LinearPolicy = eqx.field(kw_only=True)
+    start_params: Affine = eqx.field(kw_only=True)
+
+    def objective(self, stddev: float | Float[Array, "..."] = STDDEV) -> ActionNoise:
+        """Give the cost under noise on the actions, as a function of the policy's parameters, flattened."""
+        return closed_loop(self, self.policy, stddev, params=self.start_params)
+
+    def initial_params(self) -> Float[Array, " dim"]:
+        """Give the posture's parameters as the flat vector that estimators take."""
+        return ravel_pytree(self.start_params)[0]
+
+
+def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> Hopper:
+    """Load the drop: the foot lands after 70 ms, and what counts is where the torso is at the end.
+
+    Model and contact are gymnasium's; steps are Euler's, not RK4's, which costs a quarter. The policy sees angles and speeds
+    of the three joints; at the start it holds the posture like springs and dampers.
+
+    Args:
+        horizon: number of steps of 2 ms.
+        height_weight: of the final height against the distance forward.
+
+    Returns:
+        The task.
+    """
+    model = mujoco.MjModel.from_xml_path(str(_path()))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    scene = load_scene(model)
+    policy, zero = linear_policy(6, 3, observe=joints)
+    stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
+    gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
+    posture = dataclasses.replace(zero, gain=gain, offset=stiffness * jnp.array(START_POSE[3:]))
+    # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
+    return Hopper(  # pyright: ignore[reportCallIssue]
+        scene=scene,
+        state=initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY)),
+        cost=JumpCost(jnp.asarray(height_weight, float)),
+        horizon=horizon,
+        policy=policy,
+        start_params=posture,
+    )
+
+
+def joints(state: State) -> Float[Array, " 6"]:
+    """Observe the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
+    return jnp.concatenate([state.qpos[3:], state.qvel[3:]])
+
+
+def _path() -> Path:
+    # Imported here: only this task needs it.
+    import gymnasium
+
+    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"

@@ -1,0 +1,68 @@
+"""The drop of the hopper: its policy, its motion against C MuJoCo, its derivative against its slope."""
+
+import copy
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.tasks.hopper import DAMPING, START_POSE, STIFFNESS, hopper
+
+HORIZON = 60  # until 0.12 s, 25 steps after the foot touches
+
+
+@pytest.fixture(scope="module")
+def task():
+    return hopper(horizon=HORIZON)
+
+
+def test_in_its_posture_and_at_rest_the_policy_does_nothing(task):
+    assert np.allclose(task.policy(task.start_params, task.state), 0, atol=1e-15)
+
+
+def test_the_policy_is_a_spring_and_a_damper_in_each_joint(task):
+    moved = eqx.tree_at(
+        lambda state: (state.qpos, state.qvel), task.state, (task.state.qpos + 0.1, task.state.qvel + 2.0)
+    )
+    expected = -0.1 * np.array(STIFFNESS) - 2.0 * np.array(DAMPING)
+    assert np.allclose(task.policy(task.start_params, moved), expected, rtol=1e-12)
+
+
+def test_the_drop_costs_what_c_mujoco_says(task):
+    """The landing included: the foot touches after 70 ms. Both solve to a tolerance of 1e-8."""
+    model = copy.copy(task.scene.mj_model)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = task.state.qpos, task.state.qvel
+    has_landed = False
+    for _ in range(HORIZON):
+        error = np.array(START_POSE[3:]) - data.qpos[3:]
+        data.ctrl[:] = np.array(STIFFNESS) * error - np.array(DAMPING) * data.qvel[3:]
+        mujoco.mj_step(model, data)
+        has_landed |= data.ncon > 0
+    assert has_landed
+    cost = eqx.filter_jit(task.run)(task.policy, task.start_params).cost
+    assert float(cost) == pytest.approx(-data.qpos[0] - data.qpos[1], abs=1e-6)
+
+
+@pytest.mark.slow
+def test_after_the_landing_only_the_event_derivative_is_the_slope():
+    """With respect to the angle that the foot holds, moved so far that the landing passes through some time steps."""
+    task = hopper()
+    offset = jnp.asarray(task.start_params.offset)
+    shifts = jnp.asarray(mg.diagnostics.phases((-0.1, 0.1), 48))
+
+    def cost(shift, gradient):
+        params = eqx.tree_at(lambda p: p.offset, task.start_params, offset.at[2].add(shift))
+        return task.with_gradient(gradient).run(task.policy, params).cost
+
+    def along(gradient):
+        return jax.jit(jax.vmap(jax.value_and_grad(lambda shift: cost(shift, gradient))))(shifts)
+
+    (costs, event), (_, discrete) = along("event"), along("discrete")
+    slope = np.polynomial.Polynomial.fit(np.asarray(shifts), np.asarray(costs), 3).deriv()(np.asarray(shifts)).mean()
+    assert float(event.mean()) == pytest.approx(slope, abs=0.1 * abs(float(discrete.mean()) - slope))
+    assert abs(float(discrete.mean()) - slope) > abs(slope)
