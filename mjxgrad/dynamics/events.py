@@ -1,6 +1,51 @@
 r"""What automatic differentiation misses when a contact or a limit begins or ends.
 
-(docstring follows)
+MuJoCo's contact force jumps where contact begins (by default its impedance there is 0.9, not 0), and often where it
+ends. The simulated outcome is therefore a sawtooth in the state: smooth while the same steps are in contact, with a jump
+wherever a step joins or leaves them. Its derivative, the *discrete* one, is that of a tooth. The derivative of the motion
+is the slope across the teeth, and the jumps belong to it.
+
+**The term.** Let e be a contact or limit (all its rows together), r its distance less the margin, v = ṙ = J_n q̇. A jump
+lies where r = 0 in some step. Shift r at fixed velocities: the state passes such a place once for every h|v| of r, and the
+velocity after that step then jumps by h (a₊ - a₋), the accelerations with and without e in contact at r = 0. Spread evenly
+over the interval in which a step finds its event, a jump adds to the tangent of the velocity
+
+    δv += -(a₊ - a₋) δr / |v|,        r < 0 ≤ r - h v at the beginning,  r - h v < 0 ≤ r at the end,
+
+the saltation of the motion that MuJoCo's contact stands for as h → 0, and for semi-implicit steps, whose displacement is
+exactly h v, the mean over all phases of the step for any h, as far as what follows is linear in the jump. Its value is
+zero; it exists as a tangent only, in both modes, and simulating costs nothing.
+
+**Several at once** all stand at r = 0 in contact in a₊. The difference is split by their forces λ_e:
+
+    δv += -H⁻¹ Σ_e J_eᵀ λ_e δr_e / |v_e|,        H = M + Jᵀ S J,
+
+S being, for the rows of all others, the slope of their force *between* the two accelerations: then H (a₊ - a₋) is exactly
+Σ J_eᵀ λ_e, whatever the others do. With the slope at one end instead a foot that an impact elsewhere makes slip counts as
+stuck: on gymnasium's ant the correction of a second landing is then off by half. Rows of elliptic cones act on each other, so
+there S is the mean of their curvature along the way, by Gauss and Legendre, exact while they stay in a zone.
+
+**Runge-Kutta** steps meet r = 0 in four stages, each with a jump of its own that later stages answer to. Here the
+whole event is charged once, to the step across which r changes sign, with the state before it: contact then acts for the
+rest of the step, half of it on average, and leaves (1 + h B d/2)⁻¹ of the impulse; half of it times h goes to the position.
+
+**Grazing.** With |v| small an interval is short, and its term rare and huge; a product of several has no usable mean. Below
+the speed u = h |J_n a₋| that free motion changes by in one step a crossing is not resolved in time, and which of the two sides
+comes next is the step's choice. There 1/|v| is replaced by |v|/(v² + u²), which tends to zero: the discrete derivative
+remains. The price is a bias for landings slower than a few u, as that of the step itself.
+
+**Nothing changes** for contacts that rest, slide or stick, since they do not cross r = 0; for a contact slot that goes over to
+another pair of features, whose distance does not fit its own speed; where force begins at zero (d₀ = 0); and in
+what is read of a step (`qacc`, forces, sensors), whose derivative stays the discrete one.
+
+**Limits.** The jump is carried on by the tangent of the phase at hand, so contact should last some steps: on a
+bounce the mean is right to a few per cent from about six steps on, and wrong below (`make bounce`). The spread over phases
+remains (`mjxgrad.integration.phase_average`). Contacts that begin in the same step have no order. And a real discontinuity,
+hit or miss, has no derivative: that needs zeroth order.
+
+References:
+    Aizerman, Gantmakher. On the stability of periodic motions. J. Appl. Math. Mech. 1958 (saltation). Kong, Payne, Zhu,
+    Johnson. Saltation matrices: the essential tool for linearizing hybrid dynamical systems. arXiv:2306.06862.
 """
 
 import dataclasses
