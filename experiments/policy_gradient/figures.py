@@ -30,15 +30,12 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
     throws, pushes, hoppers = (
         outcome.of(*names) for names in (("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff"), ("hopper",))
     )
-    drawings = [("summary", "Bias, trust and error", summary, outcome.cells)]
-    drawings += [("throw", "Throws over the wall", throw, throws)] if throws else []
-    drawings += [("hopper", "Policy gradient of the hopper", hopper, hoppers)] if hoppers else []
-    drawings += [("push", "Control gradient of the push", push, pushes)] if pushes else []
-    drawings += [("descent", "Descents", descent, outcome.courses)] if outcome.courses else []
-    return [
-        Figure(save(function(numbers), folder, name), title, captions[name])
-        for name, title, function, numbers in drawings
-    ]
+    drawings = [("summary", "Bias, trust and error", lambda: summary(outcome.cells))]
+    drawings += [("throw", "Throws over the wall", lambda: throw(throws))] if throws else []
+    drawings += [("hopper", "Policy gradient of the hopper", lambda: hopper(hoppers[0]))] if hoppers else []
+    drawings += [("push", "Control gradient of the push", lambda: push(pushes))] if pushes else []
+    drawings += [("descent", "Descents", lambda: descent(outcome.courses))] if outcome.courses else []
+    return [Figure(save(picture(), folder, name), title, captions[name]) for name, title, picture in drawings]
 
 
 def summary(cells: list[Cell]):
@@ -128,9 +125,8 @@ def push(cells: list[Cell]):
     return figure
 
 
-def hopper(cells: list[Cell]):
+def hopper(cell: Cell):
     """A panel per motor: components of the policy gradient by what is observed."""
-    (cell,) = cells
     figure, axes = subplots(1, 3, height=3.8, sharey=True)
     looks = [(REFERENCE, "D", "unbiased reference", cell.reference_mean(), 0.0)]
     looks += [

@@ -63,6 +63,7 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     Returns:
         What each estimator makes of them.
     """
+    objective = objective.sized_for(params)
     parts = stream_parts(objective, params, key, plan_by_noise(objective, num_samples, None), control_variate=True)
     weights = weigh(Consistent(), parts, np.zeros(params.size, int), 1)
     reason = weights.reason._value[0]  # pyright: ignore[reportAttributeAccessIssue]
