@@ -41,7 +41,9 @@ def fall(scene):
         return trajectory.qvel[-1, 0], trajectory
 
     def run(height, softness):
-        (_, trajectory), slope = jax.value_and_grad(end, has_aux=True)(height, softness)
+        # Forward mode compiles in half the time.
+        at, ahead = (height,), (jnp.ones_like(height),)
+        _, slope, trajectory = jax.jvp(lambda height: end(height, softness), at, ahead, has_aux=True)
         return trajectory, slope, onset_resolution(scene.with_softness(softness), trajectory)
 
     return eqx.filter_jit(jax.vmap(run, in_axes=(0, None)))

@@ -41,6 +41,7 @@ def _batch(seen, params, *variants):
     return seen(jnp.broadcast_to(params, (len(variants), 2 * HORIZON)), *jnp.asarray(columns))
 
 
+@pytest.mark.slow
 def test_the_gradient_is_exactly_zero_where_nothing_touches_and_not_with_a_remedy(seen):
     untouched = jnp.zeros(2 * HORIZON)
     costs, gradients, _ = _batch(seen, untouched, (0, 0, 0), (0.3, 0, 0), (0, 0.04, 0), (0, 0, 0.04))
@@ -51,6 +52,7 @@ def test_the_gradient_is_exactly_zero_where_nothing_touches_and_not_with_a_remed
     assert (largest_by_height > 1e-4).all()
 
 
+@pytest.mark.slow
 def test_a_margin_is_nothing_but_a_larger_pin(seen):
     pressed = jnp.zeros((HORIZON, 2)).at[:, 0].set(0.1).at[:, 1].set(-0.6).ravel()
     costs, gradients, last = _batch(seen, pressed, (0, 0.02, 0), (0, 0, 0.02), (0, 0, 0), (0.3, 0, 0))

@@ -173,7 +173,7 @@ def test_values_without_meaning_are_refused(part, value, requirement):
 def test_a_sweep_is_one_vmap(unequal):
     stiffness = np.array([1e2, 1e3, 1e4])
     sweep = Softness.sweep(stiffness=stiffness, damping_ratio=1.0, impedance=(0.2, 0.4))
-    got = jax.vmap(lambda s: unequal.with_softness(s).contact_parameters())(sweep)
+    got = jax.jit(jax.vmap(lambda s: unequal.with_softness(s).contact_parameters()))(sweep)
     np.testing.assert_allclose(got.stiffness, np.tile(stiffness[:, None], len(unequal.pairs)))
     np.testing.assert_allclose(got.impedance[..., 0], 0.2)
     np.testing.assert_allclose(got.impedance[..., 1], 0.4)
@@ -200,7 +200,7 @@ def test_derivatives_are_those_of_the_closed_form(unequal):
         softness = Softness(stiffness=stiffness, damping_ratio=ratio)
         return unequal.with_softness(softness).contact_parameters().damping
 
-    by_stiffness, by_ratio = jax.jacfwd(damping, (0, 1))(jnp.array(900.0), jnp.array(0.7))
+    by_stiffness, by_ratio = jax.jit(jax.jacfwd(damping, (0, 1)))(jnp.array(900.0), jnp.array(0.7))
     # b = 2ζ√k: ∂b/∂k = ζ/√k and ∂b/∂ζ = 2√k.
     np.testing.assert_allclose(by_stiffness, 0.7 / 30, rtol=1e-12)
     np.testing.assert_allclose(by_ratio, 60.0, rtol=1e-12)
@@ -213,7 +213,7 @@ def test_reverse_mode_agrees_with_forward_mode_in_every_part(unequal):
         return sum(jnp.sum(part**1.5) for part in parts)
 
     softness = Softness(stiffness=900.0, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
-    forward, reverse = jax.jacfwd(total)(softness), jax.grad(total)(softness)
+    forward, reverse = jax.jit(jax.jacfwd(total))(softness), jax.jit(jax.grad(total))(softness)
     for ours, theirs in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
         assert np.isfinite(ours).all()
         assert np.abs(ours).min() > 0
@@ -231,7 +231,7 @@ def test_contact_without_damping_or_stiffness_or_weights_has_finite_derivatives(
         frequency = parameters.natural_frequency.sum()
         return parameters.stiffness.sum() + parameters.damping.sum() + frequency
 
-    gradient = jax.grad(total, allow_int=True)(scene.model)
+    gradient = jax.jit(jax.grad(total, allow_int=True))(scene.model)
     assert np.isfinite(gradient.geom_solref).all()
     assert np.isfinite(gradient.geom_solmix).all()
 
