@@ -12,7 +12,10 @@ def captions(outcome: Outcome) -> dict[str, str]:
     Returns:
         By the figure's name.
     """
-    plane = "Rod and finger every 0.3 s, from light to dark; the dashed outline is the goal, the ring where the finger starts."
+    plane = (
+        "Rod and finger every 0.3 s and at the end, from light to dark; the dashed outline is the goal, the ring where the "
+        "finger starts."
+    )
     settings = outcome.settings
     return {
         "cost": (

@@ -95,7 +95,8 @@ def tree(outcome: Outcome):
 def plane(outcome: Outcome):
     """Rod and finger along the plan."""
     best = outcome.best
-    shown = list(range(0, len(best.states), _EVERY))
+    last = len(best.states) - 1
+    shown = [*range(0, last, _EVERY), last]
     parts = _stages(best, shown)
     figure, axes = subplots(1, len(parts), height=4.4, sharex=True, sharey=True)
     for axis, part in zip(axes[0], parts, strict=True):
