@@ -178,13 +178,18 @@ def _line_search(
     smooth_slope = linear.dot(direction, point.inertia - problem.force)
     smooth_curvature = linear.dot(direction, linear.matvec(problem.mass, direction))
 
-    def slope(t: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        forces = constraint.force(layout, problem.rows, point.x + t * along)
-        return smooth_slope + t * smooth_curvature - linear.dot(forces, along)
+    def slope(t: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        x = point.x + t * along
+        forces = constraint.force(layout, problem.rows, x)
+        bend = constraint.curvature_product(layout, problem.rows, x, along[:, None])[:, 0]
+        return (
+            smooth_slope + t * smooth_curvature - linear.dot(forces, along),
+            smooth_curvature + linear.dot(bend, along),
+        )
 
     def improve(_, bracket):
         low, high, length, _ = bracket
-        value, curvature = jax.jvp(slope, (length,), (jnp.ones_like(length),))
+        value, curvature = slope(length)
         low, high = jnp.where(value < 0, length, low), jnp.where(value < 0, high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
         inside = (newton >= low) & (newton <= high)

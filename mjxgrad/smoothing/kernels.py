@@ -29,17 +29,23 @@ References:
 
 import abc
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from scipy import special
 
 # The mean of |w| that all kernels share.
 _MEAN_SIZE = math.sqrt(2 / math.pi)
 _LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
 # 4/κ, the square of twice the softened ramp at zero.
 _BARRIER_SQUARE = _MEAN_SIZE**2
+# Of the normal distribution's tail, by the size of a number in bytes: to 7e-8 and 1e-14.
+_TAIL_SCALE = 3.0
+_TAIL_DEGREE = {4: 10, 8: 24}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +55,8 @@ class Kernel(abc.ABC):
     Static and hashable: which kernel it is shapes the compiled program.
 
     Attributes:
-        reach: distance beyond which `share` may leave the range of single precision; what is left there is below 1e-14
-        of
-            a contact.
+        reach: distance beyond which `share` may leave the range of single precision; what is left there of a contact
+            is below 1e-14.
         stddev: standard deviation.
     """
 
@@ -81,18 +86,15 @@ class Gaussian(Kernel):
 
     def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Return φ(r) - r Φ(-r)."""
-        # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times
-        # r².
-        near = jnp.minimum(distance, 4 * self.reach)
-        return self.density(near) - near * self.share(near)
+        return _normal_ramp(distance)
 
     def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Return Φ(-r)."""
-        return 0.5 * jax.lax.erfc(distance * math.sqrt(0.5))
+        return _normal_share(distance)
 
     def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Return φ(w)."""
-        return jnp.exp(-0.5 * noise**2) / math.sqrt(2 * math.pi)
+        return jnp.exp(-0.5 * noise**2) * (1 / math.sqrt(2 * math.pi))
 
 
 class Logistic(Kernel):
@@ -128,6 +130,50 @@ class LogBarrier(Kernel):
         """Return 2√κ / (4 + κ w²)^(3/2)."""
         root = jnp.sqrt(noise**2 + _BARRIER_SQUARE)
         return 0.5 * _BARRIER_SQUARE / root / root / root
+
+
+@functools.cache
+def _tail_coefficients(degree: int) -> tuple[float, ...]:
+    """Return the polynomial in s = 2t - 1 of log(Φ(-r) / t) + r²/2, t = 1 / (1 + r/3), highest power first."""
+
+    def rest(t: np.ndarray) -> np.ndarray:
+        return np.log(0.5 * special.erfcx(_TAIL_SCALE * math.sqrt(0.5) * (1 / t - 1)) / t)
+
+    fit = np.polynomial.Chebyshev.interpolate(rest, degree, domain=[0.0, 1.0])
+    return tuple(np.polynomial.chebyshev.cheb2poly(fit.coef)[::-1].tolist())
+
+
+@jax.custom_jvp
+def _normal_share(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return Φ(-r), to rounding relative to itself on both sides.
+
+    Not by `jax.lax.erfc`: that ends in polynomials, which XLA takes for so cheap that it evaluates them again for every
+    entry of the Hessian that they go into. An exponential is computed once and stored.
+    """
+    size = jnp.abs(r)
+    t = 1 / (1 + size / _TAIL_SCALE)
+    s = 2 * t - 1
+    exponent = functools.reduce(lambda sum_, c: sum_ * s + c, _tail_coefficients(_TAIL_DEGREE[r.dtype.itemsize]))
+    tail = t * jnp.exp(exponent - 0.5 * size * size)
+    return jnp.where(r > 0, tail, 1 - tail)
+
+
+@_normal_share.defjvp
+def _normal_share_jvp(primals, tangents):
+    return _normal_share(*primals), -KERNELS["gaussian"].density(*primals) * tangents[0]
+
+
+@jax.custom_jvp
+def _normal_ramp(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return φ(r) - r Φ(-r)."""
+    # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times r².
+    near = jnp.minimum(r, 4 * KERNELS["gaussian"].reach)
+    return KERNELS["gaussian"].density(r) - near * _normal_share(r)
+
+
+@_normal_ramp.defjvp
+def _normal_ramp_jvp(primals, tangents):
+    return _normal_ramp(*primals), -_normal_share(*primals) * tangents[0]
 
 
 KERNELS: dict[str, Kernel] = {

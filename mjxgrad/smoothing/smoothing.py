@@ -44,16 +44,13 @@ class Smoothing(eqx.Module):
 
     Attributes:
         length: of the noise (m): the standard deviation of the Gaussian, and for the other kernels the one that gives
-        the same
-            mean absolute value.
+            the same mean absolute value.
         kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach some lengths far, the last
             one falls off as 1/r.
         mode: "forward" moves by the smoothed contact: force at a distance, and derivatives to match. "backward" moves
-        as without
-            smoothing, and takes the derivative of the smoothed step at each state that is visited.
+            as without smoothing, and takes the derivative of the smoothed step at each state that is visited.
         limit_length: likewise for the limits of joints and tendons, in their own units (m or rad); None leaves them as
-        they
-            are. Apart from contacts, since no one length fits metres and radians.
+            they are. Apart from contacts, since no one length fits metres and radians.
         gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
     """
 

@@ -1,5 +1,7 @@
 """The kernels against quadrature and scipy's distributions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,55 +22,76 @@ DISTRIBUTIONS = {
 }
 
 
+@functools.cache
+def _program(name):
+    """Return values, slopes and curvatures of all that a kernel has, compiled together."""
+    kernel = KERNELS[name]
+
+    def with_derivatives(function, r):
+        slope = jax.grad(function)
+        return function(r), slope(r), jax.grad(slope)(r)
+
+    functions = {f: getattr(kernel, f) for f in ("ramp", "share", "density", "depth")}
+    return jax.jit(jax.vmap(lambda r: {f: with_derivatives(function, r) for f, function in functions.items()}))
+
+
+@functools.cache
+def _at_points(name):
+    return _program(name)(jnp.asarray(POINTS))
+
+
 @kernels
 def test_density_and_share_are_those_of_the_named_distribution(name):
     """To a few units of rounding."""
-    kernel, distribution = KERNELS[name], DISTRIBUTIONS[name]
-    np.testing.assert_allclose(kernel.density(jnp.asarray(POINTS)), distribution.pdf(POINTS), rtol=1e-13)
-    np.testing.assert_allclose(kernel.share(jnp.asarray(POINTS)), distribution.cdf(-POINTS), rtol=1e-13)
-    assert kernel.stddev == pytest.approx(distribution.std(), rel=1e-12)
+    found, distribution = _at_points(name), DISTRIBUTIONS[name]
+    np.testing.assert_allclose(found["density"][0], distribution.pdf(POINTS), rtol=1e-13)
+    np.testing.assert_allclose(found["share"][0], distribution.cdf(-POINTS), rtol=1e-13)
+    assert KERNELS[name].stddev == pytest.approx(distribution.std(), rel=1e-12)
 
 
 @kernels
 def test_ramp_is_the_mean_push(name):
     """E max(-r - w, 0), by quadrature to 1e-10 on a half line."""
-    kernel, distribution = KERNELS[name], DISTRIBUTIONS[name]
-    for r in POINTS:
+    distribution = DISTRIBUTIONS[name]
+    for r, found in zip(POINTS, _at_points(name)["ramp"][0], strict=True):
         exact, _ = integrate.quad(lambda w, r=r: (-r - w) * distribution.pdf(w), -np.inf, -r, epsabs=1e-12, limit=200)
-        assert float(kernel.ramp(jnp.asarray(r))) == pytest.approx(exact, rel=1e-9, abs=1e-10)
+        assert float(found) == pytest.approx(exact, rel=1e-9, abs=1e-10)
 
 
 @kernels
 def test_all_push_alike_at_the_surface(name):
     """Half the mean size of the noise."""
-    assert float(KERNELS[name].ramp(jnp.array(0.0))) == pytest.approx(_SIZE / 2, rel=1e-14)
+    assert float(_at_points(name)["ramp"][0][POINTS == 0][0]) == pytest.approx(_SIZE / 2, rel=1e-14)
 
 
 def test_log_barrier_is_the_barrier():
     """Its ramp minimises f²/2 + f r - log(f)/κ with κ = 2π; the root of the derivative, f + r - 1/(κ f), by bisection."""
-    for r in POINTS:
+    for r, found in zip(POINTS, _at_points("log_barrier")["ramp"][0], strict=True):
         exact = optimize.brentq(lambda f, r=r: f + r - 1 / (2 * np.pi * f), 1e-9, 1e3, xtol=1e-14)
-        assert float(KERNELS["log_barrier"].ramp(jnp.asarray(r))) == pytest.approx(exact, rel=1e-9)
+        assert float(found) == pytest.approx(exact, rel=1e-9)
 
 
 @kernels
 def test_nothing_breaks_at_any_distance_in_single_precision(name):
-    """Values and two derivatives stay finite from the surface to slots without contact, whose distance may be 1e10 m."""
-    kernel = KERNELS[name]
-    distance = jnp.array([-1e13, -1e4, -40.0, 0.0, 12.0, 40.0, 1e4, 1e13], jnp.float32)
-    for function in (kernel.ramp, kernel.share, kernel.density, kernel.depth):
-        slope = jax.grad(function)
-        every = jax.jit(jax.vmap(lambda r, f=function, s=slope: (f(r), s(r), jax.grad(s)(r))))
-        for values in every(distance):
-            assert np.isfinite(values).all(), function
-            assert values.dtype == jnp.float32
-    assert kernel.ramp(distance)[-1] <= 1e-13
-    np.testing.assert_allclose(kernel.ramp(distance)[:2], -distance[:2], rtol=1e-6)
+    """Values and two derivatives stay finite from the surface to slots without contact, whose distance may be 1e10 m.
+
+    Where there is a share left, it is right to some units of rounding times the exponent r²/2.
+    """
+    distance = jnp.array([-1e13, -1e4, -40.0, -2.0, 0.0, 3.0, 8.0, 40.0, 1e4, 1e13], jnp.float32)
+    found = _program(name)(distance)
+    for function, values in found.items():
+        assert np.isfinite(values).all(), function
+        assert values[0].dtype == jnp.float32
+    ramp, share = found["ramp"][0], found["share"][0]
+    assert ramp[-1] <= 1e-13
+    np.testing.assert_allclose(ramp[:2], -distance[:2], rtol=1e-6)
+    np.testing.assert_allclose(share[3:7], DISTRIBUTIONS[name].cdf(-distance[3:7]), rtol=5e-6)
 
 
 @kernels
 def test_slopes_agree(name):
-    """S' = -share and share' = -density, also where derivatives are taken automatically: a few units of rounding."""
-    kernel, points = KERNELS[name], jnp.asarray(POINTS)
-    np.testing.assert_allclose(jax.vmap(jax.grad(kernel.ramp))(points), -kernel.share(points), rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(jax.vmap(jax.grad(kernel.share))(points), -kernel.density(points), rtol=1e-10)
+    """S' = -share and share' = -density, by automatic differentiation: a few units of rounding."""
+    found = _at_points(name)
+    np.testing.assert_allclose(found["ramp"][1], -found["share"][0], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(found["ramp"][2], found["density"][0], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(found["share"][1], -found["density"][0], rtol=1e-10)
