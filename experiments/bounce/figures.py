@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FuncFormatter
 
@@ -81,11 +82,11 @@ def error(outcome: Outcome):
     errors = outcome.error(EVENT).reshape(-1, *shape)
     judged = outcome.can_judge.reshape(-1, *shape)
     unsure = (outcome.can_judge & ~outcome.holds & ~outcome.fails).reshape(-1, *shape)
-    image = None
+    look = ScalarMappable(LogNorm(1e-3, 1), "RdYlBu_r")
     for i, j in np.ndindex(rows, columns):
         axis = axes[i, j]
         shown = np.clip(errors[j, :, :, i].T, 1e-3, 1)
-        image = axis.imshow(shown, norm=LogNorm(1e-3, 1), cmap="RdYlBu_r", origin="lower", aspect="auto")
+        axis.imshow(shown, norm=look.norm, cmap=look.cmap, origin="lower", aspect="auto")
         for ratio, constant in np.argwhere(~judged[j, :, :, i]):
             axis.plot(ratio, constant, "x", color=REFERENCE, ms=6)
         for ratio, constant in np.argwhere(unsure[j, :, :, i]):
@@ -99,7 +100,7 @@ def error(outcome: Outcome):
             axis.set_xlabel("damping ratio")
         if j == 0:
             axis.set_ylabel(f"{settings.impedances[i].label}\ntime constant, ms", fontsize=8)
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.01)
+    bar = figure.colorbar(look, ax=axes, shrink=0.8, pad=0.01)
     bar.set_ticks(
         [1e-3, 1e-2, settings.tolerance, 0.3, 1],
         labels=["≤ 0.1%", "1%", f"{settings.tolerance:.0%}", "30%", "≥ 100%"],

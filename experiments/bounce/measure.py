@@ -33,11 +33,9 @@ class _Contacts(eqx.Module):
     def height(self, start: Float[Array, ""], cell: Int[Array, ""], gradient: str) -> Float[Array, ""]:
         """Bounce once, from a start height to the height at the end."""
         model = at_time_step(self.scene.model, self.timestep)
-        model = model.tree_replace(
-            {
-                "geom_solref": jnp.broadcast_to(self.solref[cell], model.geom_solref.shape),
-                "geom_solimp": jnp.broadcast_to(self.solimp[cell], model.geom_solimp.shape),
-            }
+        model = model.replace(
+            geom_solref=jnp.broadcast_to(self.solref[cell], model.geom_solref.shape),
+            geom_solimp=jnp.broadcast_to(self.solimp[cell], model.geom_solimp.shape),
         )
         data = self.scene.data.replace(qpos=start[None], qvel=-self.speed[None])
         return motion(model, data, _height, num_times=1, steps_between=self.num_steps, gradient=gradient)[0]
