@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 
 from mjxgrad.planning import (
     Analytic,
+    Cost,
     Exact,
     FunctionSystem,
     GoalCost,
@@ -19,6 +20,7 @@ from mjxgrad.planning import (
     search,
 )
 from mjxgrad.planning.box import minimise_in_box
+from mjxgrad.planning.cost import terminal_model
 from mjxgrad.planning.tree import reach
 from mjxgrad.smoothing import Smoothing
 from mjxgrad.smoothing.linear_model import LinearModel
@@ -117,6 +119,35 @@ def test_the_distance_from_a_reach_is_that_of_its_inverse_covariance():
         scaled = (J * radius / resolution[:, None])[counts]
         ridge = np.linalg.solve(scaled.T @ scaled + np.eye(2), scaled.T @ (away / resolution)[counts])
         np.testing.assert_allclose(control, ridge, rtol=1e-10)
+
+
+class Saddle(Cost):
+    """A cost that bends down along the second coordinate."""
+
+    def stage(self, system, state, control):
+        return 0.0 * control[0]
+
+    def terminal(self, system, state):
+        return state[0] ** 2 + state[0] - state[1] ** 2
+
+
+def test_curvature_that_bends_down_is_left_out_and_the_slope_kept():
+    found = terminal_model(Saddle(), FunctionSystem(affine, 2, 2), jnp.array([1.0, 2.0]))
+    np.testing.assert_allclose(found.gradient, [3.0, -4.0])
+    np.testing.assert_allclose(found.hessian, [[2.0, 0.0], [0.0, 0.0]], atol=1e-12)
+
+
+def test_a_step_that_would_leave_finite_numbers_is_shortened():
+    """A point on a line may go anywhere up to 0.5, beyond which there are no numbers; its goal is at 1."""
+    system = FunctionSystem(lambda state, control: jnp.where(state + control > 0.5, jnp.nan, state + control), 1, 1)
+    cost = GoalCost(jnp.ones(1), 0.0, 1.0, 1e-3)
+    plan = optimise_trajectory(
+        system, cost, jnp.zeros(1), jnp.zeros((4, 1)), jax.random.key(0), smoother=Exact(), schedule=np.ones(20)
+    )
+    assert np.isfinite(plan.states).all()
+    # The shortest of the steps that are tried is 0.03 of the way.
+    assert 0.45 < plan.states[-1, 0] <= 0.5
+    assert not plan.diverged
 
 
 @pytest.fixture(scope="module")
