@@ -203,7 +203,9 @@ class Outcome:
                     "alpha": float(course.alphas.mean()),
                 }
             )
-        return rows
+        # One table holds both: what a row has nothing to say about is empty.
+        columns = dict.fromkeys(key for row in rows for key in row)
+        return [{column: row.get(column, "") for column in columns} for row in rows]
 
 
 def _mean(vectors: Vectors) -> tuple[np.ndarray, np.ndarray]:
