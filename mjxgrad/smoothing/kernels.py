@@ -43,7 +43,7 @@ _MEAN_SIZE = math.sqrt(2 / math.pi)
 _LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
 # 4/κ, the square of twice the softened ramp at zero.
 _BARRIER_SQUARE = _MEAN_SIZE**2
-# Of the normal distribution's tail, by the size of a number in bytes: to 7e-8 and 1e-14.
+# Of the normal distribution's tail, by the size of a number in bytes: to 9e-8 and 1e-14 of it.
 _TAIL_SCALE = 3.0
 _TAIL_DEGREE = {4: 10, 8: 24}
 
@@ -55,8 +55,7 @@ class Kernel(abc.ABC):
     Static and hashable: which kernel it is shapes the compiled program.
 
     Attributes:
-        reach: distance beyond which `share` may leave the range of single precision; what is left there of a contact
-            is below 1e-14.
+        reach: distance beyond which `share` is below 1e-8, and `depth` is held.
         stddev: standard deviation.
     """
 

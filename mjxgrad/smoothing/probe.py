@@ -13,6 +13,7 @@ Nor is a force that jumps at the surface, as MuJoCo's does where the bodies acce
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,6 +26,7 @@ from mjxgrad.scene import Scene
 from mjxgrad.smoothing.smoothing import Smoothing
 
 Profile = Callable[[Float[Array, " n"]], Float[Array, " n"]]
+_ForceAt = Callable[[np.ndarray], np.ndarray]
 
 # Negative mass, of the whole, from which on it is not rounding and not the grid.
 _NEGATIVE = 1e-4
@@ -78,13 +80,19 @@ def probe(profile: Profile, *, reach: float, num_points: int = 2001) -> Equivale
         raise ValueError(f"reach must be positive, got {reach}")
     if num_points < 101:
         raise ValueError(f"num_points must be at least 101, got {num_points}")
+
+    def force_at(distance: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        # Of one shape whatever is asked for, so that a profile under `jax.jit` is compiled once.
+        padded = np.pad(distance, (0, num_points - len(distance)), mode="edge")
+        return np.asarray(profile(jnp.asarray(padded)), float)[: len(distance)]
+
     grid = np.linspace(-reach, reach, num_points)
-    force = np.asarray(profile(jnp.asarray(grid)), float)
+    force = force_at(grid)
     if not np.isfinite(force).all():
         where = grid[~np.isfinite(force)][0]
         raise ValueError(f"profile must be finite, got {force[~np.isfinite(force)][0]} at the distance {where:g} m")
     # Deeper than the grid, so that tails as long as the barrier's do not pass for a smaller slope.
-    ends = np.asarray(profile(jnp.array([-1000 * reach, -2000 * reach])), float)
+    ends = force_at(np.array([-1000.0 * reach, -2000.0 * reach]))
     slope = float(ends[1] - ends[0]) / (1000 * reach)
     if not slope > 0:
         return _none(
@@ -93,12 +101,12 @@ def probe(profile: Profile, *, reach: float, num_points: int = 2001) -> Equivale
     mass = (force[2:] - 2 * force[1:-1] + force[:-2]) / ((grid[1] - grid[0]) * slope)
     # In order of the noise, which counts against the distance.
     w, mass = -grid[1:-1][::-1], mass[::-1]
-    if reason := _objection(profile, grid, force, mass, slope):
+    if reason := _objection(force_at, grid, force, mass, slope):
         return _none(reason, slope, w, mass / (grid[1] - grid[0]))
     mean = float(1000 * reach - ends[0] / slope)
     # Of heavy tails a little is left even a thousand times as deep as the grid.
     mean = 0.0 if abs(mean) < 1e-6 * reach else mean
-    stddev = np.inf if _tail_exponent(profile, reach, slope) < _HEAVIEST else _stddev(w, mass)
+    stddev = np.inf if _tail_exponent(force_at, reach, slope) < _HEAVIEST else _stddev(w, mass)
     reason = "noise with a density" + (" of infinite variance" if np.isinf(stddev) else "")
     if mass.max() > _POINT:
         reason, stddev = "a ramp: noise of no width", 0.0
@@ -127,9 +135,11 @@ def contact_profile(
     """
     if not 0 <= pair < len(scene.pairs):
         raise ValueError(f"pair must be the index of one of the scene's {len(scene.pairs)} pairs, got {pair}")
-    parameters = contact_parameters(scene.model, scene.pairs[pair : pair + 1])
 
+    @jax.jit
     def profile(distance: Float[Array, " n"]) -> Float[Array, " n"]:
+        parameters = contact_parameters(scene.model, scene.pairs[pair : pair + 1])
+
         def repeat(x: Array) -> Array:
             return jnp.broadcast_to(x, (len(distance), *x.shape[1:]))
 
@@ -157,13 +167,13 @@ def contact_profile(
     return profile
 
 
-def _objection(profile: Profile, grid: np.ndarray, force: np.ndarray, mass: np.ndarray, slope: float) -> str:
+def _objection(force_at: _ForceAt, grid: np.ndarray, force: np.ndarray, mass: np.ndarray, slope: float) -> str:
     """Say why a profile is not the mean of a ramp; nothing if it is."""
     spacing = grid[1] - grid[0]
     drops = -np.diff(force) / (slope * spacing)  # between 0 and 1 for a mean of ramps
     worst = int(np.argmax(np.abs(drops - 0.5)))
     between = np.linspace(grid[worst], grid[worst + 1], 65)
-    fine = np.diff(np.asarray(profile(jnp.asarray(between)), float)) / (slope * spacing)
+    fine = np.diff(force_at(between)) / (slope * spacing)
     if np.abs(fine).max() > 0.5 * abs(drops[worst]) and np.abs(fine).max() > _NEGATIVE:
         jump = -fine[np.argmax(np.abs(fine))] * slope * spacing
         return f"the force jumps by {jump:.3g} near the distance {grid[worst]:.3g} m"
@@ -178,13 +188,13 @@ def _objection(profile: Profile, grid: np.ndarray, force: np.ndarray, mass: np.n
     return ""
 
 
-def _tail_exponent(profile: Profile, reach: float, slope: float) -> float:
+def _tail_exponent(force_at: _ForceAt, reach: float, slope: float) -> float:
     """Give the exponent of the power by which the probability of large noise falls off, infinite if it falls off faster."""
     width = 1e-3 * reach
 
     def outside(size: float) -> float:
         ends = np.array([-size - width, -size + width, size - width, size + width])
-        force = np.asarray(profile(jnp.asarray(ends)), float)
+        force = force_at(ends)
         return 1 - (force[0] - force[1] - force[2] + force[3]) / (2 * width * slope)
 
     near, far = outside(reach / 2), outside(reach)

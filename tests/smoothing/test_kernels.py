@@ -47,6 +47,7 @@ def test_density_and_share_are_those_of_the_named_distribution(name):
     np.testing.assert_allclose(found["density"][0], distribution.pdf(POINTS), rtol=1e-13)
     np.testing.assert_allclose(found["share"][0], distribution.cdf(-POINTS), rtol=1e-13)
     assert KERNELS[name].stddev == pytest.approx(distribution.std(), rel=1e-12)
+    assert distribution.cdf(-KERNELS[name].reach) < 1e-8
 
 
 @kernels
