@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from experiments.policy_gradient.outcome import DISCRETE, EVENT, GRADIENTS, Cell, Course, Outcome
 from experiments.report import Figure
@@ -57,6 +57,7 @@ def summary(cells: list[Cell]):
     for axis in axes[0, ::2]:
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter(FuncFormatter(_percent))
+        axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].set_xlim(left=_SMALLEST)
     axes[0, 1].set_xlim(-0.04, 1.04)
     axes[0, 0].set_yticks(rows, [cell.label for cell in cells])

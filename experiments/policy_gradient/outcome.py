@@ -77,8 +77,9 @@ class Cell:
 
     @functools.cached_property
     def norm(self) -> float:
-        """Norm of the reference."""
-        return max(squared_norm(self.reference), 0.0) ** 0.5
+        """Norm of the reference; NaN where it is not known from zero, as everything measured by it."""
+        square = squared_norm(self.reference)
+        return square**0.5 if square > 0 else np.nan
 
     def first_mean(self, gradient: str) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
         """Mean of the first-order estimates, with its standard error."""

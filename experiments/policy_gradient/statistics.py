@@ -30,8 +30,9 @@ def squared_distance(first: Vectors, reference: Vectors) -> float:
 
 
 def share_along(first: Vectors, reference: Vectors) -> float:
-    """Give the component of a mean along another, as a share of that one's length."""
-    return float(first.mean(axis=0) @ reference.mean(axis=0)) / squared_norm(reference)
+    """Give the component of a mean along another, as a share of that one's length; NaN where that is not known from zero."""
+    square = squared_norm(reference)
+    return float(first.mean(axis=0) @ reference.mean(axis=0)) / square if square > 0 else np.nan
 
 
 def cosine(first: Vectors, reference: Vectors) -> float:
@@ -42,8 +43,9 @@ def cosine(first: Vectors, reference: Vectors) -> float:
 
 
 def relative_squared_distance(first: Vectors, reference: Vectors) -> float:
-    """Give the squared distance of a mean to a reference, over the reference's squared norm."""
-    return squared_distance(first, reference) / squared_norm(reference)
+    """Give the squared distance of two means over the squared norm of the second; NaN where that is not known from zero."""
+    square = squared_norm(reference)
+    return squared_distance(first, reference) / square if square > 0 else np.nan
 
 
 def jackknife_error(function: Callable[..., float], *sets: Vectors) -> float:

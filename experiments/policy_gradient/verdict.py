@@ -172,11 +172,12 @@ def _error(spread: float) -> float | None:
 
 
 def _range(values: list[float]) -> str:
-    return _span([100 * value for value in values], "{:.2g}") + " %"
+    low, high = (f"{100 * value:.0f}" if value > 0.1 else f"{100 * value:.2g}" for value in (min(values), max(values)))
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
-def _span(values: list[float], form: str = "{:.2f}") -> str:
-    low, high = form.format(min(values)), form.format(max(values))
+def _span(values: list[float]) -> str:
+    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
     return low if low == high else f"{low} to {high}"
 
 
