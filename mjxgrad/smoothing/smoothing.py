@@ -70,16 +70,17 @@ class Smoothing(eqx.Module):
         for name, choices in (("kernel", get_args(KernelName)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
-        for name in ("length", "limit_length"):
+        remedies = {
+            "length": "for a step without smoothing give smoothing=None",
+            "limit_length": "None leaves limits alone",
+        }
+        for name, remedy in remedies.items():
             value = getattr(self, name)
             if not _is_known(value):
                 continue
             known = np.asarray(value)
             if not np.all((known > 0) & np.isfinite(known)):
-                raise ValueError(
-                    f"{name} must be positive and finite, got {known.tolist()}: "
-                    f"for a step without smoothing give smoothing=None"
-                )
+                raise ValueError(f"{name} must be positive and finite, got {known!s}: {remedy}")
 
     @property
     def noise(self) -> Kernel:
