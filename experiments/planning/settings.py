@@ -46,9 +46,10 @@ class TreeSettings(Settings):
     """How near the rod must come to its goal (m)."""
     angle_tolerance: Positive = 0.15
     """Likewise its turn (rad)."""
-    polish_iterations: Annotated[int, Field(ge=0)] = 30
-    """Iterations of trajectory optimisation on the shortest way found; 0 leaves it out."""
-    polish_length: Positive = 0.01
+    polish_iterations: Annotated[int, Field(ge=0)] = 0
+    """Iterations of trajectory optimisation on the shortest way found. A way of many pushes is easily lost under smoothing:
+    then nothing is gained, and the way stays as it was."""
+    polish_length: Positive = 0.002
     """Smoothing at which these begin (m)."""
 
 
