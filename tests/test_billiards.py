@@ -82,5 +82,5 @@ def test_the_verdict_tells_solved_from_stuck():
     text = verdict(Outcome(settings, hard.optimum(), runs, 1 / 960))
     assert "near (1.395) reach the optimum of 1.3965" in text
     assert "No progress beyond standing still (cost 2): idle (2.000)." in text
-    assert "In between: half (1.700)." in text
+    assert "In between: half (1.700; with hard balls 1.705)." in text
     assert "touching: solved (1.390)" in text

@@ -27,7 +27,8 @@ def captions(outcome: Outcome) -> dict[str, str]:
     return {
         "cost": (
             "Cost without noise and with the contact as it is, along each descent. Solid: the balls do not touch at the start; "
-            f"dashed: they do. Dotted: standing still, and the optimum for hard balls, {best:.6f}."
+            f"dashed: they do. Dotted: standing still, and the optimum for hard balls, {best:.6f}. "
+            "Descents that coincide cover each other."
         ),
         "strokes": (
             "From above: the driven ball's way (blue), the knocked ball's (orange), both where they end; the ring is the target. "

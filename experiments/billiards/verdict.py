@@ -21,12 +21,16 @@ def verdict(outcome: Outcome) -> str:
     parts = []
     if solved:
         parts.append(
-            f"From balls that do not touch, {_listed(solved)} reach the optimum of {outcome.optimum[0]:.4f} to one per cent."
+            f"From balls that do not touch, {_listed(solved)} reach the optimum of {outcome.optimum[0]:.4f} to one per cent, "
+            "also when hard balls play their forces."
         )
     if stuck:
         parts.append(f"No progress beyond standing still (cost {IDLE:g}): {_listed(stuck)}.")
     if between:
-        parts.append(f"In between: {_listed(between)}.")
+        ends = ", ".join(
+            f"{run.method.label} ({run.final_cost:.3f}; with hard balls {run.hard_cost:.3f})" for run in between
+        )
+        parts.append(f"In between: {ends}.")
     touching = [run for run in outcome.runs if run.has_touched]
     if touching:
         ends = "; ".join(f"{run.method.label}: {_ending(run)}" for run in touching)
