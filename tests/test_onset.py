@@ -110,6 +110,9 @@ def test_messages_name_the_pair_and_what_would_resolve_it(fall):
     assert "time step of at most 0.0005 s" in short.messages()[0]
     _, _, ample = fall(PHASES, _softness(4.0))
     assert ample.messages() == []
+    # However wide the rise, a jump before it is not resolved.
+    _, _, late = fall(PHASES, _softness(4.0, first=0.9))
+    assert "begins with a jump" in late.messages()[0]
 
 
 def test_a_pair_that_already_touches_has_no_onset(fall):

@@ -197,7 +197,7 @@ SPRING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
   <actuator><motor joint="x"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("gradient", ["discrete", "event"])
+@pytest.mark.parametrize("gradient", ["discrete", pytest.param("event", marks=pytest.mark.slow)])
 def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
     """One step: v ← (m v + h (u − k q)) / (m + h c), q ← q + h v; here two of them."""
     h, m, k, c = 0.01, 0.5, 3.0, 0.4
