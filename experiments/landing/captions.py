@@ -1,6 +1,7 @@
 """What each figure shows and how to read it."""
 
 from experiments.landing.outcome import Outcome
+from experiments.landing.settings import LandingSettings
 
 
 def captions(outcome: Outcome) -> dict[str, str]:
@@ -20,8 +21,18 @@ def captions(outcome: Outcome) -> dict[str, str]:
             f"Left of the dotted line an error is at most {settings.tolerance:.0%}."
         ),
         "derivative": (
-            f"Black, slope of the simulated position over {settings.num_phases} starts; colours, means of the derivatives "
-            "at the same starts. Positions and starts are in m or rad. Where the discrete gradient leaves the panel it is cut."
+            f"Black, slope of the simulated position over {_starts(settings)}; colours, means of the derivatives at the same "
+            "starts; bands, two standard errors. Positions and starts are in m or rad. Where the discrete gradient leaves the "
+            "panel it is cut."
         ),
         "next": "As the figure before.",
     }
+
+
+def _starts(settings: LandingSettings) -> str:
+    if settings.average_over == "phases":
+        return f"{settings.num_phases} starts"
+    return (
+        f"{settings.num_samples} starts, whose joints differ by {settings.position_stddev:g} rad and velocities by "
+        f"{settings.velocity_stddev:g} m/s or rad/s at random"
+    )

@@ -7,7 +7,8 @@ from pathlib import Path
 import gymnasium
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from experiments.motion import Read
 
@@ -51,6 +52,23 @@ def case(name: str) -> Case:
         The motion.
     """
     return _BUILDERS[name]()
+
+
+def jittered_positions(one: Case) -> Bool[np.ndarray, " nq"]:
+    """Say which positions jitter may change: those of hinges and slides of other bodies than the moved one.
+
+    Args:
+        one: the motion.
+
+    Returns:
+        One truth value per position.
+    """
+    model = one.model
+    moved = np.flatnonzero(model.jnt_qposadr <= one.moved)[-1]
+    # A free joint's position holds a quaternion, which noise would leave denormalised.
+    is_scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    chosen = model.jnt_qposadr[is_scalar & (model.jnt_bodyid != model.jnt_bodyid[moved])]
+    return np.isin(np.arange(model.nq), chosen)
 
 
 def _planar(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 3"]:
@@ -111,7 +129,7 @@ def _half_cheetah() -> Case:
         "Half cheetah",
         _gymnasium("half_cheetah.xml"),
         moved=1,
-        interval=(0.0, 0.06),
+        interval=(0.0, 0.03),
         labels=("x", "z", "pitch (rad)"),
         read=_planar,
         duration=0.5,
@@ -126,7 +144,7 @@ def _ant() -> Case:
         "Ant",
         _gymnasium("ant.xml"),
         moved=2,
-        interval=(0.0, 0.08),
+        interval=(0.0, 0.03),
         labels=("x", "z", "pitch (sine)"),
         read=_free,
         duration=0.5,

@@ -37,7 +37,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
 
 def derivative(course: Course):
     """One panel per coordinate: slope with its band, mean of each derivative, when something begins."""
-    count = len(course.labels)
+    count, event = len(course.labels), course.found.gradients.index(EVENT)
     figure, axes = subplots(1, count, height=3.4)
     found = course.found
     for j, axis in enumerate(axes[0]):
@@ -49,22 +49,31 @@ def derivative(course: Course):
         for row, name in enumerate(found.gradients):
             style = {"ls": (0, (4, 2))} if name == EVENT else {}
             axis.plot(course.times, found.mean[row, :, j], color=_COLOURS[name], lw=1.5, **style)
+            wide = 2 * found.mean_error[row, :, j]
+            below, above = found.mean[row, :, j] - wide, found.mean[row, :, j] + wide
+            axis.fill_between(course.times, below, above, color=_COLOURS[name], alpha=0.18, lw=0)
         low, high = _window(course, j)
         axis.set_ylim(low, high)
         axis.plot(course.events, np.full(len(course.events), low), "|", color=MUTED, ms=9, clip_on=False)
         is_doubtful = ~course.can_judge[:, j]
         axis.plot(course.times[is_doubtful], found.slope[is_doubtful, j], "x", color=REFERENCE, ms=5)
+        is_heavy = course.is_heavy[:, j] & course.can_judge[:, j]
+        axis.plot(course.times[is_heavy], found.mean[event, is_heavy, j], "o", color=ZEROTH, mfc="white", ms=5)
         axis.set(title=course.labels[j], xlabel="time, s")
     axes[0, 0].set_ylabel("derivative with respect to the start")
     handles = [
         (Line2D([], [], color=REFERENCE, lw=2.6), "slope of the simulated outcome"),
-        (Patch(color=MUTED, alpha=0.35), "± 2 standard errors"),
+        (Patch(color=MUTED, alpha=0.35), "± 2 standard errors, of each in its colour"),
         (Line2D([], [], color=FIRST), "discrete gradient"),
         (Line2D([], [], color=ZEROTH, ls=(0, (4, 2))), "event gradient"),
         (Line2D([], [], color=MUTED, marker="|", ls="", ms=9), "contact or limit begins"),
     ]
     if not course.can_judge.all():
         handles.append((Line2D([], [], color=REFERENCE, marker="x", ls="", ms=5), "slope too uncertain to judge by"))
+    if (course.is_heavy & course.can_judge).any():
+        handles.append(
+            (Line2D([], [], color=ZEROTH, marker="o", mfc="white", ls="", ms=5), "mean hangs on a few starts")
+        )
     figure.legend(*zip(*handles, strict=True), loc="outside lower center", ncols=3, fontsize=8.5)
     figure.suptitle(f"{course.title}, time step {1e3 * course.timestep:g} ms", fontsize=10)
     return figure

@@ -4,19 +4,21 @@ import copy
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.failure import ExperimentError
-from experiments.landing.cases import Case, case
+from experiments.landing.cases import Case, case, jittered_positions
 from experiments.landing.outcome import DISCRETE, EVENT, Course, Outcome
 from experiments.landing.settings import LandingSettings
 from experiments.motion import Read, at_time_step, motion
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
+from mjxgrad.diagnostics import JitterComparison, SlopeComparison, derivative_against_slope, derivative_under_jitter
 
 
 class _Simulate(eqx.Module):
@@ -30,7 +32,14 @@ class _Simulate(eqx.Module):
     num_times: int = eqx.field(static=True)
 
     def __call__(self, parameter: Float[Array, ""], gradient: str) -> Float[Array, "times labels"]:
-        start = self.start.replace(qpos=self.start.qpos.at[self.moved].add(parameter))
+        return self.jittered(parameter, (0.0, 0.0), gradient)
+
+    def jittered(
+        self, parameter: Float[Array, ""], jitter: tuple[ArrayLike, ArrayLike], gradient: str
+    ) -> Float[Array, "times labels"]:
+        """Read the motion from a start with noise on positions and velocities."""
+        qpos = self.start.qpos.at[self.moved].add(parameter) + jitter[0]
+        start = self.start.replace(qpos=qpos, qvel=self.start.qvel + jitter[1])
         return motion(
             self.model, start, self.read, num_times=self.num_times, steps_between=self.steps_between, gradient=gradient
         )
@@ -81,12 +90,34 @@ def _course(name: str, one: Case, settings: LandingSettings, refinement: int) ->
     simulate = _Simulate(
         at_time_step(scene.model, timestep), start, jnp.int32(steps), one.read, one.moved, settings.num_times
     )
-    found = mg.diagnostics.derivative_against_slope(
-        simulate, one.interval, num_phases=settings.num_phases, gradients=(DISCRETE, EVENT)
-    )
+    found = _compare(simulate, one, settings)
     times = timestep * steps * np.arange(1, settings.num_times + 1)
     events = _event_times(one, timestep)
     return Course(name, one.title, one.labels, timestep, refinement, times, events, found, settings.tolerance)
+
+
+def _compare(simulate: _Simulate, one: Case, settings: LandingSettings) -> SlopeComparison | JitterComparison:
+    gradients = (DISCRETE, EVENT)
+    if settings.average_over == "phases":
+        return derivative_against_slope(simulate, one.interval, num_phases=settings.num_phases, gradients=gradients)
+    positions = settings.position_stddev * jnp.asarray(jittered_positions(one))
+    num_velocities = one.model.nv
+
+    def jitter(key: PRNGKeyArray) -> tuple[Array, Array]:
+        position_key, velocity_key = jax.random.split(key)
+        return (
+            positions * jax.random.normal(position_key, positions.shape),
+            settings.velocity_stddev * jax.random.normal(velocity_key, (num_velocities,)),
+        )
+
+    return derivative_under_jitter(
+        simulate.jittered,
+        one.interval,
+        jax.random.key(settings.seed),
+        jitter=jitter,
+        num_samples=settings.num_samples,
+        gradients=gradients,
+    )
 
 
 def _replaced(values: Array, changes: Mapping[int, float]) -> Array:

@@ -7,12 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.landing.settings import LandingSettings
-from mjxgrad.diagnostics import SlopeComparison
+from mjxgrad.diagnostics import JitterComparison, SlopeComparison
 
 DISCRETE, EVENT = "discrete", "event"
-
-# Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
-_IRREGULAR = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,13 +35,13 @@ class Course:
     refinement: int
     times: Float[np.ndarray, " times"]
     events: Float[np.ndarray, " events"]
-    found: SlopeComparison
+    found: SlopeComparison | JitterComparison
     tolerance: float
 
     @property
     def can_judge(self) -> Bool[np.ndarray, "times labels"]:
         """Where the motion is regular and its slope known well enough to judge derivatives by."""
-        return self.found.is_resolved(self.tolerance) & (self.found.irregularity <= _IRREGULAR)
+        return self.found.is_resolved(self.tolerance) & self.found.is_regular
 
     @property
     def has_impact(self) -> Bool[np.ndarray, "times labels"]:
@@ -52,10 +49,17 @@ class Course:
         first = self.events.min() if len(self.events) else np.inf
         return np.broadcast_to((self.times > first)[:, None], self.found.slope.shape)
 
+    @property
+    def is_heavy(self) -> Bool[np.ndarray, "times labels"]:
+        """Where the mean of the event gradients hangs on a few of the jittered starts, and its error bar with it."""
+        if not isinstance(self.found, JitterComparison):
+            return np.zeros(self.found.slope.shape, bool)
+        return self.found.is_heavy[self.found.gradients.index(EVENT)]
+
     def share(self, gradient: str) -> tuple[int, int, int]:
         """Count, after the first impact, where a derivative is within the tolerance, where beyond it, and what is judged.
 
-        The last count is larger than the sum of the first two where more phases would be needed to tell.
+        The last count is larger than the sum of the first two where more rollouts would be needed to tell.
 
         Args:
             gradient: its name.
@@ -117,8 +121,8 @@ class Outcome:
                         "outcome": course.labels[j],
                         "slope": float(found.slope[i, j]),
                         "slope_error": float(found.slope_error[i, j]),
-                        "irregularity": float(found.irregularity[i, j]),
                         "can_judge": bool(course.can_judge[i, j]),
+                        "is_heavy": bool(course.is_heavy[i, j]),
                         **{
                             f"{name}{suffix}": float(values[row, i, j])
                             for row, name in enumerate(found.gradients)
@@ -127,6 +131,7 @@ class Outcome:
                                 ("_error", found.mean_error),
                                 ("_spread", found.spread),
                                 ("_relative_error", found.relative_error),
+                                ("_relative_error_bar", found.standard_error / found.scale),
                             )
                         },
                     }

@@ -17,17 +17,20 @@ def verdict(outcome: Outcome) -> str:
     """
     event, discrete = _total(outcome, EVENT), _total(outcome, DISCRETE)
     if not event[2]:
-        return "No slope is known well enough to judge a derivative by: take more phases, or a shorter motion."
+        return "No slope is known well enough to judge a derivative by: take more rollouts, or a shorter motion."
     percent = f"{outcome.settings.tolerance:.0%}"
     sentences = [
         f"After the first impact the event gradient is within {percent} at {event[0]} of {event[2]} times and coordinates, "
         f"the discrete one at {discrete[0]}."
     ]
     failing = [course for course in outcome.all if course.share(EVENT)[1]]
-    if not failing:
-        return " ".join([*sentences, "Nowhere is it farther off beyond chance."])
     listed = [f"{_name(c)} ({c.share(EVENT)[1]} of {c.share(EVENT)[2]})" for c in failing]
-    return " ".join([*sentences, f"It is farther off beyond chance in {_join(listed)}."])
+    off = (
+        f"It is farther off beyond chance in {_join(listed)}" if failing else "Nowhere is it farther off beyond chance"
+    )
+    untold = event[2] - event[0] - event[1]
+    rest = f"; at {untold} it cannot be told from so few rollouts." if untold else "."
+    return " ".join([*sentences, off + rest])
 
 
 def findings(outcome: Outcome) -> list[str]:
@@ -57,7 +60,16 @@ def findings(outcome: Outcome) -> list[str]:
     if lost:
         parts = [f"{_name(c)} ({int((~c.can_judge & c.has_impact).sum())} of {c.has_impact.sum()})" for c in lost]
         sentences.append(
-            f"Where the slope is too uncertain, by chaos or too few phases, nothing is judged: {_join(parts)}."
+            f"Where the slope is too uncertain, by chaos or too few rollouts, nothing is judged: {_join(parts)}."
+        )
+    heavy = [course for course in outcome.all if (course.is_heavy & course.can_judge & course.has_impact).any()]
+    if heavy:
+        parts = [
+            f"{_name(c)} ({(c.is_heavy & c.can_judge & c.has_impact).sum()} of {c.share(EVENT)[2]})" for c in heavy
+        ]
+        sentences.append(
+            "A hundredth of the starts carries half of the event gradient's variance or more, so that its mean and error bar "
+            f"are doubtful, in {_join(parts)}."
         )
     return sentences
 
@@ -67,13 +79,14 @@ def table(outcome: Outcome) -> Table:
     rows, emphasised = [], set()
     for course in outcome.all:
         if course.share(EVENT)[1]:
-            emphasised.add((len(rows), 5))
+            emphasised.add((len(rows), 6))
         rows.append(
             [
                 course.title,
                 f"{1e3 * course.timestep:g}",
                 f"{len(course.events)}",
                 *(_errors(course, name) for name in (DISCRETE, EVENT)),
+                _bar(course),
                 *(_counts(course, name) for name in (EVENT, DISCRETE)),
             ]
         )
@@ -81,12 +94,13 @@ def table(outcome: Outcome) -> Table:
     return Table(
         (
             "motion", "time step, ms", "contacts and limits that begin", "error, discrete", "error, event",
-            f"event within {percent}", f"discrete within {percent}",
+            "standard error, event", f"event within {percent}", f"discrete within {percent}",
         ),
         rows,
         "Errors as a share of the larger of the slope and the discrete gradient's own error, after the first impact: median "
-        "and largest over times and coordinates. Counts are of those where the slope can be judged by; bold where the event "
-        "gradient is somewhere beyond the tolerance by more than two standard errors.",
+        "and largest over times and coordinates; the standard error in the same measure and way. Counts are of those where the "
+        "slope can be judged by; bold where the event gradient is somewhere beyond the tolerance by more than two standard "
+        "errors.",
         frozenset(emphasised),
     )  # fmt: skip
 
@@ -104,6 +118,14 @@ def _errors(course: Course, gradient: str) -> str:
     if not course.share(gradient)[2]:
         return "not judged"
     return f"{course.median(gradient):.1%}, {course.worst(gradient):.1%}"
+
+
+def _bar(course: Course) -> str:
+    judged = course.can_judge & course.has_impact
+    if not judged.any():
+        return "not judged"
+    bars = (course.found.standard_error / course.found.scale)[course.found.gradients.index(EVENT)][judged]
+    return f"{np.median(bars):.1%}, {bars.max():.1%}"
 
 
 def _name(course: Course) -> str:

@@ -4,6 +4,8 @@ from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
 from mjxgrad.diagnostics.budget import Rollouts, Seconds
 from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
+from mjxgrad.diagnostics.jitter import JitterComparison, derivative_under_jitter
+from mjxgrad.diagnostics.judgement import AgainstSlope
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
@@ -19,9 +21,11 @@ from mjxgrad.diagnostics.statistics import (
 from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
 
 __all__ = [
+    "AgainstSlope",
     "BiasVariance",
     "Comparison",
     "EmpiricalBias",
+    "JitterComparison",
     "Landscape",
     "OnsetResolution",
     "Rollouts",
@@ -37,6 +41,7 @@ __all__ = [
     "compare",
     "compare_to_slope",
     "derivative_against_slope",
+    "derivative_under_jitter",
     "empirical_bias",
     "first_order_samples",
     "mean_interval",

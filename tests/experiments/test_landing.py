@@ -2,17 +2,20 @@
 
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.landing.captions import captions
+from experiments.landing.cases import case, jittered_positions
 from experiments.landing.figures import draw
 from experiments.landing.outcome import Course, Outcome
 from experiments.landing.settings import LandingSettings
 from experiments.landing.verdict import findings, table, verdict
-from mjxgrad.diagnostics import compare_to_slope, phases
+from mjxgrad.diagnostics import compare_to_slope, derivative_under_jitter, phases
 
 SETTINGS = LandingSettings(experiment="landing", cases=("ball",), refinements=(1,), num_phases=64, num_times=4)
 
@@ -53,7 +56,40 @@ def test_the_verdict_names_the_motions_where_it_does_not_hold():
     )
     assert "It is farther off beyond chance in Ball at 2 ms (3 of 3)." in verdict(bad)
     assert "5 where the slope is 2; the event gradient says 2." in findings(good)[0]
-    assert table(bad).emphasised == {(1, 5)}
+    assert table(bad).emphasised == {(1, 6)}
+
+
+def jittered_course(draw_jitter):
+    """An outcome of slope 2 + ξ at two times after the impact; the event derivative is right, the discrete 3 too large."""
+
+    def simulate(x, jitter, gradient):
+        error = 3 * (x - jax.lax.stop_gradient(x)) if gradient == "discrete" else 0.0
+        return jnp.full((2, 1), (2 + jitter) * x + error)
+
+    found = derivative_under_jitter(simulate, (0.0, 1.0), jax.random.key(0), jitter=draw_jitter)
+    return Course("ball", "Ball", ("z",), 2e-3, 1, np.array([0.2, 0.3]), np.array([0.15]), found, SETTINGS.tolerance)
+
+
+def test_a_motion_under_jitter_is_judged_and_drawn_as_others_are(tmp_path):
+    settings = SETTINGS.model_copy(update={"average_over": "jitter"})
+    outcome = Outcome(settings, [[jittered_course(lambda key: 0.1 * jax.random.normal(key))]])
+    assert outcome.all[0].share("event") == (2, 0, 2)
+    assert outcome.all[0].share("discrete") == (0, 2, 2)
+    assert "256 starts" in captions(outcome)["derivative"]
+    assert all((tmp_path / figure.file).is_file() for figure in draw(outcome, tmp_path, captions(outcome)))
+    assert not any("doubtful" in sentence for sentence in findings(outcome))
+
+
+def test_means_that_hang_on_a_few_starts_are_named():
+    """One start in a hundred has another derivative than the rest."""
+    outcome = Outcome(SETTINGS, [[jittered_course(lambda key: 1.0 * (jax.random.uniform(key) < 0.01))]])
+    assert outcome.all[0].is_heavy.all()
+    assert "are doubtful, in Ball at 2 ms (2 of 2)." in findings(outcome)[-1]
+
+
+@pytest.mark.parametrize(("name", "chosen"), [("hopper", [3, 4, 5]), ("ant", list(range(7, 15))), ("ball", [])])
+def test_jitter_moves_the_joints_of_other_bodies_and_no_quaternion(name, chosen):
+    assert np.flatnonzero(jittered_positions(case(name))).tolist() == chosen
 
 
 def test_every_motion_gets_its_figure(tmp_path):
