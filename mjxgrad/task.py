@@ -96,7 +96,9 @@ class SceneTask(Task):
             and controls up to t, whose sum is the cost; traceable.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
-        gradient: of each step, "discrete" or "event"; see `step`.
+        gradient: of each step, "discrete" or "event", see `step`. None, the default, takes "event": its bias as an estimate was
+            not to be told from zero on tasks where that of "discrete" was 130 to 630 % (`make policy_gradient`); and
+            "discrete" where there is smoothing, whose derivative has the correction in it.
         smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
@@ -105,7 +107,7 @@ class SceneTask(Task):
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
-    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
+    gradient: Gradient | None = eqx.field(static=True, default=None, kw_only=True)
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self, gradient: Gradient) -> "SceneTask":
@@ -152,7 +154,7 @@ class SceneTask(Task):
             noise,
             horizon=self.horizon,
             observe=_activations if has_activations else None,
-            gradient=self.gradient,
+            gradient=self.gradient or ("event" if self.smoothing is None else "discrete"),
             smoothing=self.smoothing,
         )
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)

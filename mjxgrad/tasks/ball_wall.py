@@ -35,7 +35,8 @@ class BallWall(eqx.Module):
         speed: of the throw, in m/s.
         target: where the ball should end, in m from the start.
         horizon: number of steps; long enough for the ball to land and stop.
-        gradient: of each step, "discrete" or "event"; see `mjxgrad.step`.
+        gradient: of each step, "discrete" or "event"; see `mjxgrad.step`. The scene's contacts set in without a jump, so
+            the two differ only after a change of its impedance.
     """
 
     scene: Scene

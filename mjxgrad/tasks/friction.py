@@ -34,6 +34,7 @@ def friction(*, horizon: int = 400) -> StoryTask:
         cost,
         horizon,
         start_params=jnp.zeros((horizon, 1)),
+        gradient="discrete",  # The contact lasts throughout: there is no event to correct.
         settings=Settings(
             "friction", stddev=0.1, num_samples=10, learning_rate=1e-4, num_steps=100, gamma=2e4, bound=100.0
         ),

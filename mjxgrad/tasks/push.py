@@ -41,6 +41,7 @@ def push(stiffness: float = 10.0, *, horizon: int = 200) -> StoryTask:
         cost,
         horizon,
         start_params=jnp.full((horizon, 1), START_FORCE),
+        gradient="discrete",  # Contact sets in without a jump: there is nothing to correct.
         settings=Settings(
             "push", stddev=0.1, num_samples=10, learning_rate=1e-3, num_steps=200, gamma=1e8, bound=100.0
         ),

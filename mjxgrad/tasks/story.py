@@ -124,7 +124,7 @@ def story_task(
         settings: to optimise it with.
         start_params: the controls, or the policy's parameters.
         state: the nominal start; None is the scene's reference pose at rest.
-        **policy_and_starts: `policy` and `start_distribution` of `StoryTask`, where there are any.
+        **policy_and_starts: `policy`, `start_distribution` and `gradient` of `StoryTask`, where they are not the default.
 
     Returns:
         The task.

@@ -69,6 +69,7 @@ def tennis(*, horizon: int = 200) -> StoryTask:
         start_distribution=starts,
         start_params=params,
         policy=policy,
+        gradient="discrete",  # Contact sets in without a jump: there is nothing to correct.
         settings=Settings(
             "tennis",
             stddev=0.1,
