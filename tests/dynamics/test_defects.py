@@ -169,7 +169,13 @@ WELD = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50" 
 
 
 @both
-@pytest.mark.parametrize("text", [CYLINDER, WELD], ids=["standing cylinder", "weld at zero error"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(CYLINDER, id="standing cylinder"),
+        pytest.param(WELD, id="weld at zero error", marks=pytest.mark.slow),
+    ],
+)
 def test_a_degenerate_pose_keeps_its_derivative(step, text):
     """The cylinder's tilt about its first contact point; a weld with nothing to correct."""
     model, data = _settled(text)

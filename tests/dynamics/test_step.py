@@ -136,9 +136,8 @@ def test_directional_derivative_of_50_steps_is_the_central_difference(name):
     _check_directional(*published(name), steps=50)
 
 
-@pytest.mark.parametrize(
-    ("cone", "integrator"), [_CASES[1], *(pytest.param(*case, marks=_SLOW) for case in (_CASES[0], *_CASES[2:]))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("cone", "integrator"), _CASES)
 def test_derivative_through_all_kinds_of_rows_is_the_central_difference(cone, integrator):
     _check_directional(*zoo(cone, integrator), steps=5)
 
