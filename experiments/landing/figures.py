@@ -91,8 +91,8 @@ def error(outcome: Outcome):
             if not errors.size:
                 continue
             at = place + (0.14 if name == EVENT else -0.14)
-            axis.plot(errors, np.full(errors.size, at), ".", color=_COLOURS[name], ms=3, alpha=0.35, mec="none")
-            axis.plot(np.median(errors), at, "o", color=_COLOURS[name], ms=5, mec="white")
+            axis.plot(errors, np.full(errors.size, at), ".", color=_COLOURS[name], ms=5, alpha=0.4, mec="none")
+            axis.plot(np.median(errors), at, "o", color=_COLOURS[name], ms=8, mec="white")
     axis.axvline(outcome.settings.tolerance, color=MUTED, lw=1, ls=(0, (2, 3)))
     axis.set_yticks(range(len(courses)), [f"{c.title}, {1e3 * c.timestep:g} ms" for c in courses])
     axis.set_ylim(len(courses) - 0.5, -0.5)

@@ -87,7 +87,7 @@ def test_means_that_hang_on_a_few_starts_are_named():
     assert "are doubtful, in Ball at 2 ms (2 of 2)." in findings(outcome)[-1]
 
 
-@pytest.mark.parametrize(("name", "chosen"), [("hopper", [3, 4, 5]), ("ant", list(range(7, 15))), ("ball", [])])
+@pytest.mark.parametrize(("name", "chosen"), [("hopper", [3, 4, 5]), ("ant", list(range(7, 15))), ("two_balls", [])])
 def test_jitter_moves_the_joints_of_other_bodies_and_no_quaternion(name, chosen):
     assert np.flatnonzero(jittered_positions(case(name))).tolist() == chosen
 
