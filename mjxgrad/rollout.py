@@ -121,7 +121,8 @@ def rollout(
             in; its results are stacked. Name what you need: what it does not return is not kept.
         checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
             a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
-        gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same.
+        gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same. The default is what
+            finite differences of it give; for costs of motions that hit something take "event", as tasks do.
         smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
             `SceneWarning` what of the scene it has no effect on.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
