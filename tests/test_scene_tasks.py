@@ -176,6 +176,7 @@ def blind_and_seeing(function, params, stddev, key):
     return both(key)
 
 
+@pytest.mark.slow
 def test_a_robot_that_a_pillar_stops_is_blind_to_its_velocity_and_zeroth_order_is_not(key):
     """It rests at depth (1 − d) u / (h k), d = 0.95, so this is all that 1 m/s more moves it, not 0.24 m."""
     task = motion_planning(horizon=12)
@@ -191,6 +192,7 @@ def test_a_robot_that_a_pillar_stops_is_blind_to_its_velocity_and_zeroth_order_i
     assert estimate.value[1] > 4 * estimate.standard_error[1]
 
 
+@pytest.mark.slow
 def test_a_pad_that_misses_is_blind_to_its_velocity_and_zeroth_order_is_not(key):
     """The ball passes 5 cm beside the pad's reach, 0.8 + 0.15 m; only what moves it there in 0.75 s returns the ball."""
     task = tennis(horizon=40)

@@ -15,7 +15,10 @@ from mjxgrad._mjx import mjx
 from tests.dynamics.scenes import central_difference, put
 
 _MJX_IS_WRONG = pytest.mark.xfail(strict=True, reason="plain MJX gets this wrong")
-both = pytest.mark.parametrize("step", [mg.step, pytest.param(mjx.step, marks=_MJX_IS_WRONG)], ids=["mg", "mjx"])
+# That MJX still is takes as long to compile as that we are not, and may wait for the slow tests.
+both = pytest.mark.parametrize(
+    "step", [mg.step, pytest.param(mjx.step, marks=[_MJX_IS_WRONG, pytest.mark.slow])], ids=["mg", "mjx"]
+)
 
 # Widths of 1e-6 leave truncation near 1e-12 and rounding near 1e-10 of values around one; derivatives of contact are
 # of order ten.

@@ -14,7 +14,7 @@ from tests.dynamics.scenes import published, zoo
 
 _SLOW = pytest.mark.slow
 _NAMES = ["hopper", "half_cheetah", "walker2d", "swimmer", "reacher", "inverted_double_pendulum", "ant"]
-_QUICK = {"hopper", "swimmer"}
+_QUICK = {"hopper"}
 names = pytest.mark.parametrize("name", [n if n in _QUICK else pytest.param(n, marks=_SLOW) for n in _NAMES])
 _CASES = [("pyramidal", "Euler"), ("elliptic", "Euler"), ("elliptic", "implicitfast"), ("pyramidal", "RK4")]
 
@@ -156,7 +156,11 @@ def _sliding():
 
 @pytest.mark.parametrize(
     "field",
-    ["body_mass", "geom_friction", "geom_solref", "dof_damping", "opt.timestep", "opt.gravity"],
+    [
+        "body_mass",
+        "geom_solref",
+        *(pytest.param(x, marks=_SLOW) for x in ("geom_friction", "dof_damping", "opt.timestep", "opt.gravity")),
+    ],
 )
 def test_parameters_of_the_model_have_their_derivative(field):
     """Along a scaling of the whole field; mass alone, not what MuJoCo precomputes from it (invweight)."""
@@ -185,6 +189,7 @@ def _full(data, state):
     return data.replace(qpos=state[0], qvel=state[1], qacc_warmstart=state[2])
 
 
+@_SLOW
 def test_second_derivatives_nest():
     """Forward over reverse through a sliding contact, in velocity, mass and friction together."""
     model, data = _sliding()

@@ -130,6 +130,7 @@ def test_the_mean_step_is_the_mean_that_the_models_hold(key):
     within(mean_step(*at, **noise), zeroth_order(*at, **noise).c_error, exact_wall()[1])
 
 
+@pytest.mark.slow
 def test_samples_that_are_not_finite_are_left_out_and_counted(key):
     def cliff(state, control):
         return jnp.where(state < -0.05, jnp.nan, 3 * state) + control
