@@ -16,7 +16,7 @@ _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 
 def at_time_step(model: mjx.Model, timestep: ArrayLike) -> mjx.Model:
     """Give a model with another time step, which may be traced."""
-    return model.tree_replace({"opt.timestep": jnp.asarray(timestep, model.opt.timestep.dtype)})
+    return model.tree_replace({"opt.timestep": jnp.asarray(timestep, model.opt.timestep.dtype)})  # pyright: ignore[reportReturnType]
 
 
 def motion(

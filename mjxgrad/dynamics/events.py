@@ -52,6 +52,7 @@ References:
 
 import dataclasses
 import functools
+import operator
 
 import equinox as eqx
 import jax
@@ -297,7 +298,7 @@ def _secant_hessian(
     if layout.cones:
         # The rows of a cone act on each other: no quotient gives their matrix.
         between = (constraint.curvature_product(layout, rows, start + t * moved, jacobian) for t in _NODES)
-        mean = sum(share * product for share, product in zip(_SHARES, between, strict=True))
+        mean = functools.reduce(operator.add, (s * product for s, product in zip(_SHARES, between, strict=True)))
         secant = jnp.concatenate([secant[: layout.simple_stop], mean[layout.simple_stop :]])
     return problem.mass + linear.gram(jacobian, jnp.where(is_far[:, None], secant, curved))
 
