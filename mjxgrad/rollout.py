@@ -156,10 +156,10 @@ def rollout(
         state, first_bad = carry
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
-        data = _data(scene, state, ctrl)
+        data = data_of(scene, state, ctrl)
         stepped = step(scene.model, data, gradient=gradient, smoothing=smoothing)
-        moved = _state(stepped)
-        is_bad = ~_is_sound(moved, velocity_limit)
+        moved = state_of(stepped)
+        is_bad = ~is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         seen = None if observe is None else _observed(scene, observe, data, stepped, smoothing)
@@ -176,7 +176,7 @@ def rollout(
         (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
     )
     if observe is not None:
-        data = _data(scene, final, ctrl[-1])
+        data = data_of(scene, final, ctrl[-1])
         last = observe(scene.model, forward(scene.model, data, smoothing=smoothing))
         seen = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, last)
     return Trajectory(
@@ -207,7 +207,8 @@ def check_trajectory(trajectory: Trajectory) -> None:
     )
 
 
-def _data(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
+def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
+    """Give data in a state, ready to be stepped."""
     return scene.data.replace(
         qpos=state.qpos,
         qvel=state.qvel,
@@ -218,11 +219,13 @@ def _data(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
     )
 
 
-def _state(data: mjx.Data) -> State:
+def state_of(data: mjx.Data) -> State:
+    """Give the state that data is in."""
     return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
 
 
-def _is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
+def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
+    """Whether a state is finite and below the velocity limit."""
     limit = jnp.inf if velocity_limit is None else velocity_limit
     numbers = jnp.concatenate([state.qpos, state.act])
     # A comparison with NaN is false, so one test finds both.

@@ -17,7 +17,7 @@ from experiments.failure import ExperimentError
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.integration import adaptive_rollout, substepped_step
-from mjxgrad.integration.march import data_of
+from mjxgrad.rollout import data_of
 from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 
 # Half the step of the reference's difference quotient (m/s), and its tolerance.

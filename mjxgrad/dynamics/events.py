@@ -61,6 +61,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
+from mjxgrad.contacts import safe_sqrt
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import RowLayout
@@ -129,13 +130,14 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
     """
     if not any(block.rows_each for block in blocks):
         return data
-    distance, normal = _contacts(blocks)
+    distance, normal = contacts_of(blocks)
     speed = normal @ data.qvel
     before = distance - model.opt.timestep * speed
     begins = (distance < 0) & (before >= 0) & (speed < 0)
     ends = (distance >= 0) & (before < 0) & (speed > 0)
-    events = _events(model, data, data.qvel, blocks, begins, ends)
-    change = _impulse(_plan(model, data, blocks, is_spread=False), events, distance) / model.opt.timestep
+    plan = _plan(model, data, blocks, is_spread=False)
+    events = _events(model, data, data.qvel, plan, blocks, normal, begins, ends)
+    change = _impulse(plan, events, distance) / model.opt.timestep
     return data.replace(qacc=data.qacc + change, qfrc_constraint=data.qfrc_constraint + events.problem.mass @ change)
 
 
@@ -155,14 +157,14 @@ def impulse(
     """
     if not any(block.rows_each for block in blocks):
         return jnp.zeros_like(data.qvel)
-    distance, normal = _contacts(blocks)
+    distance, normal = contacts_of(blocks)
     after = distance + model.opt.timestep * (normal @ mean_velocity)
     velocity = data.qvel + 0.5 * model.opt.timestep * data.qacc
     speed = normal @ velocity
     begins = (distance >= 0) & (after < 0) & (speed < 0)
     ends = (distance < 0) & (after >= 0) & (speed > 0)
-    events = _events(model, data, velocity, blocks, begins, ends)
-    return _impulse(_plan(model, data, blocks, is_spread=True), events, distance)
+    plan = _plan(model, data, blocks, is_spread=True)
+    return _impulse(plan, _events(model, data, velocity, plan, blocks, normal, begins, ends), distance)
 
 
 def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: bool) -> _Plan:
@@ -174,7 +176,7 @@ def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: b
     return _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
 
 
-def _contacts(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[Array, "contacts nv"]]:
+def contacts_of(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[Array, "contacts nv"]]:
     """Return distance less margin, and normal row, of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
@@ -190,11 +192,12 @@ def _events(
     model: mjx.Model,
     data: mjx.Data,
     velocity: Float[Array, " nv"],
+    plan: _Plan,
     blocks: list[Block],
+    normal: Float[Array, "contacts nv"],
     begins: Bool[Array, " contacts"],
     ends: Bool[Array, " contacts"],
 ) -> _Events:
-    plan = _plan(model, data, blocks, is_spread=False)
     is_event = _per_row(plan, begins | ends)
     touching = _in_contact(assembly.joined(blocks), is_event)
     jacobian, reference, weight = assembly.law(model, velocity, touching)
@@ -202,7 +205,6 @@ def _events(
     rows = eqx.tree_at(lambda r: (r.reference, r.weight), rows, (reference, weight))
     problem = Problem(mjx.full_m(model, data), data.qfrc_smooth, jacobian, rows)
     damping = model.opt.timestep * assembly.stiffness_damping(model, touching)[1]
-    normal = _contacts(blocks)[1]
     return _Events(
         problem=problem,
         damping=jnp.where(_per_row(plan, ends), 0.0, damping),
@@ -219,12 +221,12 @@ def _events(
 
 def _creep(model: mjx.Model, blocks: list[Block]) -> Float[Array, " contacts"]:
     """Return g / 2(B + √K) of each contact, and zero for limits, whose coordinate gravity may not be an acceleration of."""
-    gravity, speeds = jnp.sqrt(jnp.sum(model.opt.gravity**2)), []
+    gravity, speeds = safe_sqrt(jnp.sum(model.opt.gravity**2)), []
     for block in blocks:
         if not block.rows_each:
             continue
         stiffness, damping = assembly.stiffness_damping(model, block)
-        rate = (damping + jnp.sqrt(stiffness))[:: block.rows_each]
+        rate = (damping + safe_sqrt(stiffness))[:: block.rows_each]
         share = gravity / (2 * jnp.where(rate > 0, rate, 1.0))
         speeds.append(jnp.where(rate > 0, share, 0.0) if block.is_contact else jnp.zeros_like(rate))
     return jnp.concatenate(speeds)

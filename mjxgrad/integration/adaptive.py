@@ -26,8 +26,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from mjxgrad.dynamics import forward
 from mjxgrad.dynamics.integrate import integrate_position
-from mjxgrad.integration.march import data_of
-from mjxgrad.rollout import State
+from mjxgrad.rollout import State, data_of
 from mjxgrad.scene import Scene
 
 Rates = tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " na"]]

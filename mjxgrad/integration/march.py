@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from mjxgrad._mjx import mjx
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
-from mjxgrad.rollout import State, Trajectory
+from mjxgrad.rollout import State, Trajectory, is_sound
 from mjxgrad.scene import Scene
 
 Advance = Callable[[State, Float[Array, " nu"], Float[Array, ""]], State]
@@ -40,7 +39,7 @@ def march(
         state, first_bad = carry
         index, control, duration = inputs
         moved = advance(state, control, duration)
-        first_bad = jnp.where((first_bad < 0) & ~_is_sound(moved, velocity_limit), index, first_bad)
+        first_bad = jnp.where((first_bad < 0) & ~is_sound(moved, velocity_limit), index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         return (kept, first_bad), (state.qpos, state.qvel)
 
@@ -57,23 +56,6 @@ def march(
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
     )
-
-
-def data_of(scene: Scene, state: State, control: Float[Array, " nu"]) -> mjx.Data:
-    """Give data in a state, ready to be stepped."""
-    return scene.data.replace(
-        qpos=state.qpos,
-        qvel=state.qvel,
-        act=state.act,
-        time=state.time,
-        qacc_warmstart=state.warmstart,
-        ctrl=control,
-    )
-
-
-def state_of(data: mjx.Data) -> State:
-    """Give the state that data is in."""
-    return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
 
 
 def control_rows(scene: Scene, controls: Float[ArrayLike, "_ _"] | None, horizon: int | None) -> Float[Array, "n nu"]:
@@ -97,8 +79,3 @@ def control_rows(scene: Scene, controls: Float[ArrayLike, "_ _"] | None, horizon
         wanted = f"({horizon or 'steps'}, {nu})"
         raise ValueError(f"controls must have shape {wanted}, one row per step, got {rows.shape}")
     return rows
-
-
-def _is_sound(state: State, velocity_limit: float) -> Bool[Array, ""]:
-    numbers = jnp.concatenate([state.qpos, state.act])
-    return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < velocity_limit)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.dynamics import Gradient, check_gradient, step
-from mjxgrad.integration.march import control_rows, data_of, march, state_of
-from mjxgrad.rollout import State, Trajectory
+from mjxgrad.integration.march import control_rows, march
+from mjxgrad.rollout import State, Trajectory, data_of, state_of
 from mjxgrad.scene import Scene
 
 

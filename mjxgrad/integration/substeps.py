@@ -6,8 +6,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import Gradient, assembly, check_gradient, step
-from mjxgrad.integration.march import control_rows, data_of, march, state_of
-from mjxgrad.rollout import State, Trajectory
+from mjxgrad.dynamics.events import contacts_of
+from mjxgrad.integration.march import control_rows, march
+from mjxgrad.rollout import State, Trajectory, data_of, state_of
 from mjxgrad.scene import Scene
 
 
@@ -83,14 +84,8 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
     """Whether some distance changes its sign in a step."""
     # Contacts and kinematics of a stepped data are those of the state before; its position is not.
     blocks = assembly.gather(model, after.replace(qpos=before.qpos))
-    found = [jnp.zeros((), bool)]
-    for block in blocks:
-        if not block.rows_each:
-            continue
-        # Of a pyramid's edges the mean is the normal, of a cone's rows the first.
-        jacobian = block.jacobian.reshape(-1, block.rows_each, model.nv)
-        normal = jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0]
-        distance = block.residual[:: block.rows_each]
-        later = distance + model.opt.timestep * normal @ after.qvel
-        found.append(jnp.any((distance < 0) != (later < 0)))
-    return jnp.any(jnp.stack(found))
+    if not any(block.rows_each for block in blocks):
+        return jnp.zeros((), bool)
+    distance, normal = contacts_of(blocks)
+    later = distance + model.opt.timestep * normal @ after.qvel
+    return jnp.any((distance < 0) != (later < 0))
