@@ -6,6 +6,7 @@ from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.jitter import JitterComparison, derivative_under_jitter
 from mjxgrad.diagnostics.judgement import AgainstSlope
+from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
@@ -26,6 +27,7 @@ __all__ = [
     "Comparison",
     "EmpiricalBias",
     "JitterComparison",
+    "Jumps",
     "Landscape",
     "OnsetResolution",
     "Rollouts",
@@ -44,6 +46,7 @@ __all__ = [
     "derivative_under_jitter",
     "empirical_bias",
     "first_order_samples",
+    "jumps_along",
     "mean_interval",
     "onset_resolution",
     "phases",
