@@ -6,8 +6,8 @@ import pytest
 
 from mjxgrad.diagnostics import jumps_along
 
-BOX_ON_BOX = """<mujoco><option gravity="0 0 0"/><default><geom condim="1" type="box" size=".1 .1 .1"/></default><worldbody><geom/>
-<body><freejoint/><geom {shape}/></body></worldbody></mujoco>"""
+BOX_ON_BOX = """<mujoco><option gravity="0 0 0"/><default><geom condim="1" type="box" size=".1 .1 .1"/></default><worldbody>
+<geom/><body><freejoint/><geom {shape}/></body></worldbody></mujoco>"""
 
 
 def static_force(shape, depth):
@@ -45,6 +45,11 @@ def test_what_is_steep_is_no_jump(function):
     assert len(found.places) == 0
     assert found.largest == -1
     assert found.steepest > 40  # the grid alone shows 127 and 11
+
+
+def test_a_slope_is_no_jump_however_few_the_rounds():
+    """After one division of 17 parts it still changes by 3 % of the largest value, but has shrunk."""
+    assert len(jumps_along(lambda x: np.tanh(100 * (x - 0.3)), (-1.0, 1.0), num_refinements=1).places) == 0
 
 
 def test_a_jump_is_measured_by_the_larger_side():
