@@ -1,6 +1,7 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
+from mjxgrad.diagnostics import check_omissions
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
@@ -23,7 +24,7 @@ from mjxgrad.rollout import (
     initial_state,
     rollout,
 )
-from mjxgrad.scene import Scene, load_scene
+from mjxgrad.scene import LeaveOut, Scene, load_scene
 from mjxgrad.smoothing import Smoothing
 from mjxgrad.softness import Softness
 
@@ -31,6 +32,7 @@ __all__ = [
     "Convergence",
     "DivergedError",
     "History",
+    "LeaveOut",
     "Objective",
     "Optimisation",
     "Plateau",
@@ -43,6 +45,7 @@ __all__ = [
     "Trajectory",
     "TrustRegion",
     "baselines",
+    "check_omissions",
     "check_trajectory",
     "closed_loop",
     "diagnostics",

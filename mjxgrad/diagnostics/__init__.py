@@ -7,6 +7,7 @@ from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, fi
 from mjxgrad.diagnostics.jitter import JitterComparison, derivative_under_jitter
 from mjxgrad.diagnostics.judgement import AgainstSlope
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
+from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, unused
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
@@ -29,6 +30,8 @@ __all__ = [
     "JitterComparison",
     "Jumps",
     "Landscape",
+    "Missed",
+    "OmissionCheck",
     "OnsetResolution",
     "Rollouts",
     "Seconds",
@@ -39,6 +42,7 @@ __all__ = [
     "binomial_bound",
     "binomial_interval",
     "bootstrap_variance_interval",
+    "check_omissions",
     "chi_square_variance_interval",
     "compare",
     "compare_to_slope",
@@ -51,5 +55,6 @@ __all__ = [
     "onset_resolution",
     "phases",
     "root_mean_square_interval",
+    "unused",
     "variance_interval",
 ]

@@ -15,7 +15,8 @@ import mujoco
 from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contacts import contact_pairs
 from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
-from mjxgrad.scene.omissions import leave_out
+from mjxgrad.scene.leave_out import LeaveOut, omit
+from mjxgrad.scene.omissions import switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneWarning
 from mjxgrad.softness import Softness, softness_warnings
@@ -32,6 +33,7 @@ def load_scene(
     source: str | os.PathLike[str] | mujoco.MjModel,
     *,
     softness: Softness | None = None,
+    leave_out: LeaveOut | None = None,
     keep_everything: bool = False,
     timestep: float | None = None,
 ) -> Scene:
@@ -44,6 +46,7 @@ def load_scene(
     Args:
         source: path of an MJCF file, MJCF as a string, or a C model, which is not changed.
         softness: contact softness to set, instead of that in the file.
+        leave_out: contacts and limits to do without on top of that; see `LeaveOut`.
         keep_everything: leave out nothing, and keep the solver tolerance and the storage of
             matrices as in the file. The motion is the same to rounding.
         timestep: in s, instead of that in the file.
@@ -55,10 +58,13 @@ def load_scene(
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if the path is a folder.
         TypeError: if the source is none of the three.
-        ValueError: if `timestep` is not positive, or as `Softness.apply`.
+        ValueError: if `timestep` is not positive, `leave_out` does not fit the scene or is given beside
+            `keep_everything`, or as `Softness.apply`.
         SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or MJX cannot simulate
             it; all unsupported features are named at once.
     """
+    if keep_everything and leave_out is not None:
+        raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
     mj_model, name = _compile(source)
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
@@ -73,14 +79,14 @@ def load_scene(
 
     stepped = copy.deepcopy(mj_model)
     conversions += list(drop_sensors(stepped))
-    omissions = ()
+    omitted, omissions = omit(stepped, leave_out) if leave_out is not None else ((), ())
     if not keep_everything:
-        omissions = leave_out(stepped)
+        omissions += switch_off(stepped)
         conversions += _fit_solver(stepped)
+    pairs = contact_pairs(stepped)
     model, data = _put(stepped, name)
 
-    pairs = contact_pairs(mj_model)
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name)
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
     inexact = [c for c in conversions if not c.exact]
     messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in inexact]
     if softness is not None:

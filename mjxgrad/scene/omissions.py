@@ -26,7 +26,7 @@ class Omission:
     reason: str
 
 
-def leave_out(model: mujoco.MjModel) -> tuple[Omission, ...]:
+def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
     """Switch off what a scene does not need, and list all that a step of it leaves out.
 
     Most stages cost nothing once the model has no element for them, for their arrays have no

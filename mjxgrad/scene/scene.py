@@ -12,6 +12,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contacts import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.scene.contact_check import contact_warnings
 from mjxgrad.scene.conversions import Conversion
+from mjxgrad.scene.leave_out import OmittedPair
 from mjxgrad.scene.omissions import Omission
 from mjxgrad.scene.summary import summarise
 from mjxgrad.softness import Softness, softness_warnings
@@ -35,6 +36,7 @@ class Scene(eqx.Module):
         omissions: what a step leaves out, and why.
         conversions: settings replaced by others, and why.
         pairs: geoms that can touch, in the order of `contact_parameters`.
+        omitted_pairs: geoms whose contact is left out although the file has it, as `LeaveOut` asked.
         name: where the scene came from.
     """
 
@@ -44,6 +46,7 @@ class Scene(eqx.Module):
     omissions: tuple[Omission, ...] = eqx.field(static=True)
     conversions: tuple[Conversion, ...] = eqx.field(static=True)
     pairs: tuple[ContactPair, ...] = eqx.field(static=True)
+    omitted_pairs: tuple[OmittedPair, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
     def contact_parameters(self) -> ContactParameters:
@@ -82,7 +85,20 @@ class Scene(eqx.Module):
             return []
         if np.ndim(self.model.geom_solref) != 2 or np.ndim(self.model.opt.timestep) != 0:
             return []
-        return contact_warnings(self.model, self.pairs)
+        return contact_warnings(self.model, self.pairs) + self._margin_warnings()
+
+    def _margin_warnings(self) -> list[str]:
+        proven = [one for one in self.omitted_pairs if one.distance is not None]
+        if not proven:
+            return []
+        with jax.ensure_compile_time_eval():
+            margins = np.asarray(contact_parameters(self.model, tuple(one.pair for one in proven)).margin)
+        return [
+            f"contact of {one.pair} is left out, proven {1e3 * one.distance:.3g} mm apart, which its margin of "
+            f"{1e3 * margin:.3g} mm exceeds; load the scene with a larger clearance in leave_out"
+            for one, margin in zip(proven, margins.tolist(), strict=True)
+            if one.distance is not None and margin >= one.distance
+        ]
 
     def to_mujoco(self) -> mujoco.MjModel:
         """Copy of the C model with the present values of `model`, softness included.
