@@ -184,7 +184,7 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
     """
     pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)
-    stiffness, damping = _resolve_solref(model, solref)
+    stiffness, damping = resolve_solref(model, solref)
     low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
     return ContactParameters(
         stiffness=stiffness,
@@ -264,7 +264,7 @@ def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array
     return jnp.select([neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total)
 
 
-def _resolve_solref(model: mjx.Model, solref: Array) -> tuple[Array, Array]:
+def resolve_solref(model: mjx.Model, solref: Array) -> tuple[Array, Array]:
     """Stiffness and damping of either format, after `refsafe`."""
     time_constant, damping_ratio = solref[:, 0], solref[:, 1]
     if not int(model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_REFSAFE.value:

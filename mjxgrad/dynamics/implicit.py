@@ -36,13 +36,14 @@ def solve(
 ) -> Float[Array, " nv"]:
     """Return the acceleration that minimises `problem`, differentiable with respect to it."""
     acceleration, _ = newton.minimise(layout, problem, start, tolerance, max_iterations)
-    return checkpoint_name(acceleration, CHECKPOINT_NAME)
+    return acceleration
 
 
 @solve.defjvp
 def _solve_jvp(layout, max_iterations, primals, tangents):
     problem, start, tolerance = primals
-    acceleration = solve(layout, max_iterations, problem, start, tolerance)
+    # Named here, where reverse mode reads it: the name inside the call is not seen from outside.
+    acceleration = checkpoint_name(solve(layout, max_iterations, problem, start, tolerance), CHECKPOINT_NAME)
     _, change = jax.jvp(lambda p: p.at(layout, acceleration).gradient, (problem,), (tangents[0],))
     hessian = problem.hessian(layout, problem.at(layout, acceleration).x)
     return acceleration, -linear.solve_positive_definite(hessian, change)
