@@ -265,7 +265,7 @@ def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array
 
 
 def resolve_solref(model: mjx.Model, solref: Array) -> tuple[Array, Array]:
-    """Stiffness and damping of either format, after `refsafe`."""
+    """Give stiffness (1/s²) and damping (1/s) of rows of `solref`, of either format, after `refsafe`."""
     time_constant, damping_ratio = solref[:, 0], solref[:, 1]
     if not int(model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_REFSAFE.value:
         time_constant = jnp.maximum(time_constant, 2 * model.opt.timestep)

@@ -63,10 +63,10 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
     messages: dict[str, list[ContactPair]] = {}
-    for pair, (first, second), k, b in zip(pairs, solref, stiffness, damping, strict=True):
+    for pair, first, k, b in zip(pairs, solref[:, 0], stiffness, damping, strict=True):
         for message in (
-            _altered_by_refsafe(first, second, b, timestep),
-            _beyond_stability(k, b, timestep, integrator),
+            altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
+            beyond_stability(k, b, timestep, integrator),
         ):
             if message:
                 messages.setdefault(message, []).append(pair)
@@ -110,20 +110,40 @@ def format_number(x: float) -> str:
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
 
 
-def _altered_by_refsafe(time_constant: float, damping_ratio: float, damping: float, timestep: float) -> str | None:
+def altered_by_refsafe(time_constant: float, damping: float, timestep: float, remedy: str) -> str | None:
+    """Say that `refsafe` replaces a time constant, if it does.
+
+    Args:
+        time_constant: as given, in s; negative for the direct format.
+        damping: that it has the effect of, in 1/s.
+        timestep: in s.
+        remedy: what to do instead of shortening the time step.
+
+    Returns:
+        The end of a sentence, or None.
+    """
     # A relative margin, because float32 rounds a time constant of exactly two steps.
     if time_constant <= 0 or 2.0 / damping <= time_constant * (1 + 1e-5):
         return None
     return (
         f"its time constant {time_constant:g} s is below two time steps, so refsafe replaces it by "
         f"{2 * timestep:g} s and smaller values have no effect; use a time step of at most "
-        f"{time_constant / 2:g} s, or Softness, which writes the format that refsafe leaves alone"
+        f"{time_constant / 2:g} s, or {remedy}"
     )
 
 
-def _beyond_stability(
-    stiffness: float, damping: float, timestep: float, integrator: mujoco.mjtIntegrator
-) -> str | None:
+def beyond_stability(stiffness: float, damping: float, timestep: float, integrator: mujoco.mjtIntegrator) -> str | None:
+    """Say that a spring and damper gains energy at a time step, if it does.
+
+    Args:
+        stiffness: $k$, in 1/s².
+        damping: $b$, in 1/s.
+        timestep: in s.
+        integrator: of the model.
+
+    Returns:
+        The end of a sentence, or None.
+    """
     if stiffness <= 0:
         return None
     frequency = np.sqrt(stiffness)

@@ -1,0 +1,152 @@
+"""How a rollout and its derivative turned out, told from numbers that any simulator gives.
+
+The thresholds are coarse on purpose: a class is a kind of behaviour, not an accuracy.
+"""
+
+import enum
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+UNSOLVED = 1e-3
+"""Share of the forces that may remain unbalanced after a solve."""
+GAIN = 0.05
+"""Share by which kinetic energy may exceed what there was to draw on."""
+AT_REST = 1e-3
+"""Share of that energy below which a body has settled."""
+BOUNCE = 0.05
+"""Error of the restitution, itself between 0 and 1, up to which a bounce is right."""
+
+
+class Motion(enum.IntEnum):
+    """What a rollout did; the larger, the worse. Those from `GAINS_ENERGY` on are failures."""
+
+    SETTLES = 0
+    MOVES = 1
+    BOUNCES_RIGHT = 2
+    BOUNCES_OTHERWISE = 3
+    GAINS_ENERGY = 4
+    TUNNELS = 5
+    UNSOLVED = 6
+    DIVERGES = 7
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        return _MOTIONS[self]
+
+    @property
+    def rank(self) -> int:
+        """For comparing: all that are fine have rank 0."""
+        return max(0, int(self) - int(Motion.BOUNCES_RIGHT))
+
+
+_MOTIONS = {
+    Motion.SETTLES: "settles",
+    Motion.MOVES: "moves on",
+    Motion.BOUNCES_RIGHT: "bounces right",
+    Motion.BOUNCES_OTHERWISE: "bounces otherwise",
+    Motion.GAINS_ENERGY: "gains energy",
+    Motion.TUNNELS: "tunnels",
+    Motion.UNSOLVED: "not solved",
+    Motion.DIVERGES: "diverges",
+}
+
+
+class Derivative(enum.IntEnum):
+    """What a derivative turned out to be; `UNJUDGED` where the truth is not known well enough."""
+
+    RIGHT = 0
+    UNJUDGED = 1
+    WRONG = 2
+    EXPLODES = 3
+    NON_FINITE = 4
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        return self.name.lower().replace("_", "-")
+
+
+class MotionRecord(eqx.Module):
+    """What `classify_motion` looks at, one entry per rollout.
+
+    Attributes:
+        is_sound: whether all states were finite and below the velocity limit.
+        residual: largest share of the forces left unbalanced by a solve.
+        gain: largest kinetic energy over what there was to draw on: that of the start, of gravity and of springs
+            compressed at the start.
+        rest: final kinetic energy over the same.
+        has_crossed: whether bodies ended on the wrong side of each other.
+        restitution: speed after a single bounce over that before; NaN without one, or while it lasts.
+        expected: the restitution of the motion itself; NaN where it is not known.
+    """
+
+    is_sound: Bool[np.ndarray, " points"]
+    residual: Float[np.ndarray, " points"]
+    gain: Float[np.ndarray, " points"]
+    rest: Float[np.ndarray, " points"]
+    has_crossed: Bool[np.ndarray, " points"]
+    restitution: Float[np.ndarray, " points"]
+    expected: Float[np.ndarray, " points"]
+
+
+def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:
+    """Say of each rollout what it did; of several failures the worst.
+
+    Args:
+        record: of the rollouts.
+
+    Returns:
+        Values of `Motion`.
+    """
+    knows = np.isfinite(record.restitution) & np.isfinite(record.expected)
+    with np.errstate(invalid="ignore"):
+        is_right = np.abs(record.restitution - record.expected) <= BOUNCE
+    # A comparison with NaN is false, so each question is asked in the form that NaN fails.
+    answers = (
+        (~record.is_sound, Motion.DIVERGES),
+        (~(record.residual <= UNSOLVED), Motion.UNSOLVED),
+        (record.has_crossed, Motion.TUNNELS),
+        (~(record.gain <= 1 + GAIN), Motion.GAINS_ENERGY),
+        (knows & is_right, Motion.BOUNCES_RIGHT),
+        (knows, Motion.BOUNCES_OTHERWISE),
+        (record.rest <= AT_REST, Motion.SETTLES),
+    )
+    conditions, classes = zip(*answers, strict=True)
+    return np.select(conditions, [int(one) for one in classes], int(Motion.MOVES))
+
+
+def classify_derivative(
+    derivative: Float[np.ndarray, " points"],
+    is_finite: Bool[np.ndarray, " points"],
+    truth: Float[np.ndarray, " points"],
+    truth_error: Float[np.ndarray, " points"],
+    *,
+    largest: float,
+    tolerance: float,
+) -> Int[np.ndarray, " points"]:
+    """Say of each derivative whether it is right.
+
+    Args:
+        derivative: of one number by one direction.
+        is_finite: whether the whole gradient that it was taken from is finite.
+        truth: what it should be.
+        truth_error: by how much the truth may be off; where that exceeds the tolerance, nothing is judged.
+        largest: beyond which a derivative explodes, right or wrong.
+        tolerance: error allowed, as a share of the larger of the truth and one.
+
+    Returns:
+        Values of `Derivative`.
+    """
+    scale = tolerance * np.maximum(np.abs(truth), 1.0)
+    with np.errstate(invalid="ignore"):
+        answers = (
+            (~is_finite | ~np.isfinite(derivative), Derivative.NON_FINITE),
+            (np.abs(derivative) > largest, Derivative.EXPLODES),
+            (~(truth_error <= scale), Derivative.UNJUDGED),
+            (np.abs(derivative - truth) <= scale + truth_error, Derivative.RIGHT),
+        )
+    conditions, classes = zip(*answers, strict=True)
+    return np.select(conditions, [int(one) for one in classes], int(Derivative.WRONG))

@@ -1,0 +1,84 @@
+"""Whether a gradient is one: finite, of a rollout that did not diverge, and not exploding.
+
+`Trajectory.diverged` speaks of the motion. A derivative can overflow while the motion is fine, and it is zero or stale
+where a rollout diverged and its state was held. Estimators leave such samples out and count them; whoever calls
+`jax.grad` on a rollout can ask here.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+
+class UnsoundGradientError(FloatingPointError):
+    """A gradient that must not be used."""
+
+
+class Soundness(eqx.Module):
+    """What there is to say of a gradient; under `jax.vmap` every field gains leading axes.
+
+    Attributes:
+        is_sound: whether it can be used: all that follows is well.
+        num_nonfinite: of its numbers.
+        largest: largest finite magnitude in it.
+        explodes: whether that exceeds the bound.
+        diverged: whether the rollout did.
+    """
+
+    is_sound: Bool[Array, ""]
+    num_nonfinite: Int[Array, ""]
+    largest: Float[Array, ""]
+    explodes: Bool[Array, ""]
+    diverged: Bool[Array, ""]
+
+
+def soundness(gradient: PyTree, diverged: Bool[ArrayLike, ""] = False, *, bound: float | None = None) -> Soundness:
+    """Look at a gradient of a rollout, inside or outside of `jax.jit`.
+
+    Args:
+        gradient: any pytree of floating-point arrays, as `jax.grad` returns it.
+        diverged: of the trajectory that it belongs to.
+        bound: beyond which a magnitude counts as exploding; None asks for finite numbers only.
+
+    Returns:
+        What was found.
+
+    Raises:
+        ValueError: if the gradient has no floating-point numbers.
+    """
+    leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(gradient)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    if not leaves:
+        raise ValueError("gradient must hold floating-point arrays, got none")
+    numbers = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+    is_finite = jnp.isfinite(numbers)
+    largest = jnp.max(jnp.where(is_finite, jnp.abs(numbers), 0.0), initial=0.0)
+    num_nonfinite = jnp.sum(~is_finite)
+    explodes = largest > (jnp.inf if bound is None else bound)
+    diverged = jnp.asarray(diverged, bool)
+    return Soundness(~diverged & (num_nonfinite == 0) & ~explodes, num_nonfinite, largest, explodes, diverged)
+
+
+def check_soundness(found: Soundness) -> None:
+    """Raise if any gradient, batched or not, is unsound. Call it on the host.
+
+    Args:
+        found: by `soundness`.
+
+    Raises:
+        UnsoundGradientError: naming how many are unsound, and why.
+    """
+    unsound = ~np.atleast_1d(found.is_sound)
+    if not unsound.any():
+        return
+    counts = (
+        (np.atleast_1d(found.diverged), "belong to rollouts that diverged"),
+        (np.atleast_1d(found.num_nonfinite) > 0, "are not finite"),
+        (np.atleast_1d(found.explodes), f"exceed the bound, up to {np.max(found.largest):.3g}"),
+    )
+    reasons = ", ".join(f"{is_so.sum()} {what}" for is_so, what in counts if is_so.any())
+    raise UnsoundGradientError(
+        f"{unsound.sum()} of {unsound.size} gradients must not be used: {reasons}; shorten the time step, soften the "
+        "contact, shorten the horizon, or leave these samples out"
+    )
