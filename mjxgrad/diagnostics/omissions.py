@@ -216,7 +216,7 @@ def _beyond_limit(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     beyond = np.full(model.njnt, -np.inf)
     for joint in np.flatnonzero(model.jnt_limited):
         address, (low, high) = int(model.jnt_qposadr[joint]), model.jnt_range[joint]
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+        if mujoco.mjtJoint(int(model.jnt_type[joint])) == mujoco.mjtJoint.mjJNT_BALL:
             turn = np.zeros(3)
             mujoco.mju_quat2Vel(turn, qpos[address : address + 4] / np.linalg.norm(qpos[address : address + 4]), 1.0)
             distance = max(low, high) - np.linalg.norm(turn)

@@ -29,25 +29,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+from mjxgrad.scene.volume import Carried, Volume, distance_from, rotation_matrix, volume_of
+
+_JOINT = mujoco.mjtJoint
 _MAX_BOXES = 20_000  # tried for one pair before giving up; a proof through three hinges takes some hundreds
 _BATCH = 2048
-
-
-@dataclass(frozen=True)
-class _Volume:
-    """A capsule, or a half-space: its boundary point and that plus the outer normal."""
-
-    ends: Float[np.ndarray, "2 3"]
-    radius: float
-    is_plane: bool = False
-
-    @property
-    def ball(self) -> tuple[Float[np.ndarray, " 3"], float]:
-        """Centre and radius of a ball around it."""
-        if self.is_plane:
-            return self.ends[0], np.inf
-        return self.ends.mean(axis=0), float(np.linalg.norm(self.ends[1] - self.ends[0]) / 2 + self.radius)
 
 
 @dataclass(frozen=True)
@@ -88,17 +74,29 @@ def proven_distance(
     moves = _path(model, geom1, geom2, beyond_limits)
     if moves is None:
         return None
-    first, second = _volume(model, geom1), _volume(model, geom2)
-    joints = [move for move in moves if move.kind in ("hinge", "slide")]
-    reach = np.minimum(_reaches(first, moves), _reaches(second, [move.inverse() for move in reversed(moves)])[::-1])
-    if not np.isfinite(reach).all():
-        return None  # two planes, or a plane and a ball joint
+    first, second = volume_of(model, geom1), volume_of(model, geom2)
+    proven = _proven(first, moves, second, at_least)
+    if proven is None and any(move.kind == "ball" for move in moves):
+        # A ball joint makes a ball of what is carried through it, which may be much more than the other geom becomes.
+        proven = _proven(second, _reversed(moves), first, at_least)
+    return proven
+
+
+def _proven(first: Volume, moves: list[_Move], second: Volume, at_least: float) -> float | None:
+    if first.is_plane and (second.is_plane or any(move.kind == "ball" for move in moves)):
+        return None
+    reach = np.minimum(_reaches(first, moves), _reaches(second, _reversed(moves))[::-1])
 
     def distance(positions: Float[np.ndarray, "boxes joints"]) -> Float[np.ndarray, " boxes"]:
-        return _distance(_carried(first, moves, positions), second)
+        return distance_from(_carried(first, moves, positions), second)
 
-    low, high = np.array([move.interval for move in joints]).reshape(-1, 2).T
+    intervals = [move.interval for move in moves if move.kind in ("hinge", "slide")]
+    low, high = np.array(intervals).reshape(-1, 2).T
     return _branch_and_bound(distance, (low + high) / 2, (high - low) / 2, reach, at_least)
+
+
+def _reversed(moves: list[_Move]) -> list[_Move]:
+    return [move.inverse() for move in reversed(moves)]
 
 
 def _branch_and_bound(distance, centre, half, reach, at_least: float) -> float | None:
@@ -116,10 +114,9 @@ def _branch_and_bound(distance, centre, half, reach, at_least: float) -> float |
         bound = found - width @ reach
         is_done = bound >= at_least
         proven = min(proven, bound[is_done].min(initial=np.inf))
-        batch, width = batch[~is_done], width[~is_done]
-        # The last ones first: depth before breadth keeps few boxes in memory and meets a touching position sooner.
-        boxes, halves = (np.concatenate(x) for x in ((_split(batch, width, reach)[0], boxes[_BATCH:]),
-                                                     (_split(batch, width, reach)[1], halves[_BATCH:])))  # fmt: skip
+        # The halves first: depth before breadth keeps few boxes in memory and meets a touching position sooner.
+        split, narrower = _split(batch[~is_done], width[~is_done], reach)
+        boxes, halves = np.concatenate([split, boxes[_BATCH:]]), np.concatenate([narrower, halves[_BATCH:]])
     return float(proven)
 
 
@@ -149,7 +146,7 @@ def _path(model: mujoco.MjModel, geom1: int, geom2: int, beyond_limits: float | 
             if found is None:
                 return None
             legs += found
-        moves += legs if side is up else [move.inverse() for move in reversed(legs)]
+        moves += legs if side is up else _reversed(legs)
     return moves
 
 
@@ -171,11 +168,12 @@ def _body_moves(model: mujoco.MjModel, body: int, beyond_limits: float | None) -
         if move is None:
             return None
         moves.append(move)
-    return [*moves, _Move("fixed", model.body_pos[body].copy(), np.zeros(3), _matrix(model.body_quat[body]))]
+    return [*moves, _Move("fixed", model.body_pos[body].copy(), np.zeros(3), rotation_matrix(model.body_quat[body]))]
 
 
 def _joint_move(model: mujoco.MjModel, joint: int, beyond_limits: float | None) -> _Move | None:
-    kind, axis, anchor = model.jnt_type[joint], model.jnt_axis[joint].copy(), model.jnt_pos[joint].copy()
+    kind = _JOINT(int(model.jnt_type[joint]))
+    axis, anchor = model.jnt_axis[joint].copy(), model.jnt_pos[joint].copy()
     if kind == _JOINT.mjJNT_FREE:
         return None
     if kind == _JOINT.mjJNT_BALL:
@@ -196,40 +194,7 @@ def _ignores_limits(model: mujoco.MjModel) -> bool:
     return bool(model.opt.disableflags & (bits.mjDSBL_LIMIT.value | bits.mjDSBL_CONSTRAINT.value))
 
 
-def _volume(model: mujoco.MjModel, geom: int) -> _Volume:
-    """A capsule around a geom, in the frame of its body; for a plane its half-space."""
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    centre, axis = np.zeros(3), np.array([0.0, 0.0, 1.0])
-    if kind == _GEOM.mjGEOM_PLANE:
-        ends, radius = np.stack([centre, axis]), 0.0
-    else:
-        if kind == _GEOM.mjGEOM_SPHERE:
-            half, radius = 0.0, float(size[0])
-        elif kind in (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER):
-            half, radius = float(size[1]), float(size[0])
-        elif kind == _GEOM.mjGEOM_ELLIPSOID:
-            order = np.argsort(size)
-            axis = np.eye(3)[order[2]]
-            # b² - (x - a + b)² is at least b² (1 - x² / a²) from x = a - b on, so the caps hold the ends.
-            half, radius = float(size[order[2]] - size[order[1]]), float(size[order[1]])
-        else:
-            # Boxes, meshes and height fields by their box; the axis along its longest edge.
-            centre, extent = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            longest = int(np.argmax(extent))
-            axis, half = np.eye(3)[longest], float(extent[longest])
-            radius = float(np.linalg.norm(np.delete(extent, longest)))
-        ends = np.stack([centre - half * axis, centre + half * axis])
-    placed = ends @ _matrix(model.geom_quat[geom]).T + model.geom_pos[geom]
-    return _Volume(placed, radius, kind == _GEOM.mjGEOM_PLANE)
-
-
-def _matrix(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.ascontiguousarray(quaternion, dtype=float))
-    return matrix.reshape(3, 3)
-
-
-def _reaches(volume: _Volume, moves: list[_Move]) -> Float[np.ndarray, " joints"]:
+def _reaches(volume: Volume, moves: list[_Move]) -> Float[np.ndarray, " joints"]:
     """By how much a unit of each joint moves a point of the volume at most, in the order of the path."""
     (centre, radius), reaches = volume.ball, []
     for move in moves:
@@ -247,8 +212,8 @@ def _reaches(volume: _Volume, moves: list[_Move]) -> Float[np.ndarray, " joints"
     return np.array(reaches)
 
 
-def _carried(volume: _Volume, moves: list[_Move], positions: Float[np.ndarray, "boxes joints"]):
-    """The volume in the frame at the end of the path: its ends (boxes, 2, 3) and its radius in each box."""
+def _carried(volume: Volume, moves: list[_Move], positions: Float[np.ndarray, "boxes joints"]) -> Carried:
+    """The volume in the frame at the end of the path, at the positions in the middle of each box."""
     ends = np.broadcast_to(volume.ends, (len(positions), 2, 3))
     radius = np.full(len(positions), volume.radius)
     columns = iter(positions.T)
@@ -266,35 +231,4 @@ def _carried(volume: _Volume, moves: list[_Move], positions: Float[np.ndarray, "
         else:
             radius = radius + np.linalg.norm(ends - move.anchor, axis=-1).max(axis=1)
             ends = np.broadcast_to(move.anchor, ends.shape)
-    return ends, radius, volume.is_plane
-
-
-def _distance(first, second: _Volume) -> Float[np.ndarray, " boxes"]:
-    """Distance of a carried volume from one at rest; where they overlap, at most zero."""
-    ends, radius, is_plane = first
-    if is_plane:
-        normal = ends[:, 1] - ends[:, 0]
-        height = np.einsum("bi,bei->be", normal, second.ends[None] - ends[:, :1])
-        return height.min(axis=1) - second.radius
-    if second.is_plane:
-        return ((ends - second.ends[0]) @ (second.ends[1] - second.ends[0])).min(axis=1) - radius
-    return _segment_distance(ends, np.broadcast_to(second.ends, ends.shape)) - radius - second.radius
-
-
-def _segment_distance(one: Float[np.ndarray, "n 2 3"], two: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
-    """Distance of segments: where the lines are closest, if that is within both, else at an end of one of them."""
-    from_end = [_point_distance(one[:, i], two) for i in (0, 1)] + [_point_distance(two[:, i], one) for i in (0, 1)]
-    u, v, w = one[:, 1] - one[:, 0], two[:, 1] - two[:, 0], one[:, 0] - two[:, 0]
-    uu, vv, uv, uw, vw = (np.einsum("ni,ni->n", *pair) for pair in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    determinant = uu * vv - uv**2
-    scale = np.where(determinant > 0, determinant, 1.0)
-    s, t = np.clip((uv * vw - vv * uw) / scale, 0, 1), np.clip((uu * vw - uv * uw) / scale, 0, 1)
-    between = np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)
-    return np.min([*from_end, between], axis=0)
-
-
-def _point_distance(point: Float[np.ndarray, "n 3"], segment: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
-    along, arm = segment[:, 1] - segment[:, 0], point - segment[:, 0]
-    length = np.einsum("ni,ni->n", along, along)
-    share = np.einsum("ni,ni->n", arm, along) / np.where(length > 0, length, 1.0)
-    return np.linalg.norm(arm - np.clip(share, 0, 1)[:, None] * along, axis=1)
+    return Carried(ends, radius, volume.is_plane)
