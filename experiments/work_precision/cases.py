@@ -1,0 +1,281 @@
+"""The scenes: where they start, which velocities are uncertain, and what is asked of the end."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from experiments.landing.cases import case as landing_case
+from mjxgrad.tasks.files import scene_path
+
+
+@dataclass(frozen=True)
+class Case:
+    """A motion from uncertain starts.
+
+    Attributes:
+        title: for headings.
+        model: of C MuJoCo, with its own contact, integrator and time step.
+        duration: in s.
+        moved: the two velocities that are uncertain, by index: the parameters of the gradient.
+        stddev: of that uncertainty (m/s or rad/s).
+        outcome: what is differentiated, as weights of the final positions, by index.
+        qpos: start positions that differ from the model's, by index.
+        qvel: start velocities that differ from zero, by index.
+        ctrl: constant controls; zero unless given.
+    """
+
+    title: str
+    model: mujoco.MjModel
+    duration: float
+    moved: tuple[int, int]
+    stddev: float
+    outcome: Mapping[int, float]
+    qpos: Mapping[int, float] = field(default_factory=dict)
+    qvel: Mapping[int, float] = field(default_factory=dict)
+    ctrl: tuple[float, ...] = ()
+
+    @property
+    def start(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]:
+        """Positions and velocities in the middle of the uncertainty."""
+        qpos, qvel = self.model.qpos0.copy(), np.zeros(self.model.nv)
+        for index, value in self.qpos.items():
+            qpos[index] = value
+        for index, value in self.qvel.items():
+            qvel[index] = value
+        return qpos, qvel
+
+    @property
+    def controls(self) -> Float[np.ndarray, " nu"]:
+        """Controls, constant in time."""
+        return np.array(self.ctrl) if self.ctrl else np.zeros(self.model.nu)
+
+    @property
+    def weights(self) -> Float[np.ndarray, " nq"]:
+        """Weights of the final positions in the outcome."""
+        weights = np.zeros(self.model.nq)
+        for index, value in self.outcome.items():
+            weights[index] = value
+        return weights
+
+    @property
+    def directions(self) -> Float[np.ndarray, "2 nv"]:
+        """Unit vectors of the uncertain velocities."""
+        return np.eye(self.model.nv)[list(self.moved)]
+
+
+def case(name: str) -> Case:
+    """Build a motion.
+
+    Args:
+        name: one of `experiments.work_precision.settings.SceneName`.
+
+    Returns:
+        The motion.
+    """
+    return _BUILDERS[name]()
+
+
+_PENDULUM = """
+<mujoco model="pendulum">
+  <option timestep="0.005"/>
+  <default><joint type="hinge" axis="0 1 0"/><geom type="capsule" size="0.03" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="upper">
+      <joint name="upper"/>
+      <geom fromto="0 0 0 0 0 -0.4"/>
+      <body name="lower" pos="0 0 -0.4">
+        <joint name="lower"/>
+        <geom fromto="0 0 0 0 0 -0.4"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def _pendulum() -> Case:
+    return Case(
+        "Double pendulum, no contact",
+        mujoco.MjModel.from_xml_string(_PENDULUM),
+        duration=0.8,
+        moved=(0, 1),
+        stddev=0.3,
+        outcome={0: 1.0, 1: 0.5},
+        qpos={0: 1.5, 1: 1.0},
+    )
+
+
+_BALL = """
+<mujoco model="ball">
+  <option timestep="0.002"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1" condim="{condim}" friction="{friction} 0.005 0.0001"/>
+    <body name="ball" pos="0 0 {height}">
+      <freejoint/>
+      <geom name="ball" type="sphere" size="0.05" condim="{condim}" friction="{friction} 0.005 0.0001"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def _bounce() -> Case:
+    """Thrown down obliquely without spin: it bounces once, under the default contact."""
+    return Case(
+        "Bouncing ball, one contact",
+        mujoco.MjModel.from_xml_string(_BALL.format(condim=3, friction=0.5, height=0.15)),
+        duration=0.16,
+        moved=(0, 2),
+        stddev=0.1,
+        outcome={0: 1.0, 2: 1.0},
+        qvel={0: 1.0, 2: -1.5},
+    )
+
+
+def _slide() -> Case:
+    """Slides without spin, askew to the axes of the friction pyramid, until it rolls."""
+    return Case(
+        "Sliding ball, friction",
+        mujoco.MjModel.from_xml_string(_BALL.format(condim=3, friction=0.3, height=0.0499)),
+        duration=0.2,
+        moved=(0, 1),
+        stddev=0.1,
+        outcome={0: 1.0, 1: 1.0},
+        qvel={0: 1.0, 1: 0.4},
+    )
+
+
+def _cube() -> Case:
+    """The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands."""
+    return Case(
+        "Tumbling cube",
+        mujoco.MjModel.from_xml_path(str(scene_path("cube_toss"))),
+        duration=0.3,
+        moved=(1, 2),
+        stddev=0.05,
+        outcome={1: 1.0, 2: 1.0},
+        qpos={2: 0.12},
+        qvel={1: 0.3, 2: -0.5},
+    )
+
+
+_ARM = """
+<mujoco model="arm">
+  <option timestep="0.004"/>
+  <default>
+    <joint type="hinge" axis="0 1 0"/>
+    <geom type="capsule" size="0.03" density="500"/>
+    <position kp="60" kv="4"/>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1" friction="0.6"/>
+    <body name="upper" pos="0 0 0.5">
+      <joint name="shoulder"/>
+      <geom fromto="0 0 0 0.4 0 0" contype="0" conaffinity="0"/>
+      <body name="lower" pos="0.4 0 0">
+        <joint name="elbow"/>
+        <geom fromto="0 0 0 0.3 0 0" contype="0" conaffinity="0"/>
+        <body name="hand" pos="0.3 0 0">
+          <joint name="wrist"/>
+          <geom name="hand" type="sphere" pos="0.08 0 0" size="0.05"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder"/>
+    <position name="elbow" joint="elbow"/>
+    <position name="wrist" joint="wrist" kp="20" kv="1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def _arm() -> Case:
+    """Three links under position servos with damping; the hand strikes the floor and presses on it."""
+    return Case(
+        "Servo arm on the floor, articulated",
+        mujoco.MjModel.from_xml_string(_ARM),
+        duration=0.4,
+        moved=(0, 1),
+        stddev=0.3,
+        outcome={0: 1.0, 1: 0.5},
+        qpos={0: 0.1, 1: 0.5, 2: 0.2},
+        ctrl=(0.7, 0.4, 0.0),
+    )
+
+
+def _landing(name: str, title: str, duration: float, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
+    """One of gymnasium's bodies landing, as in the experiment on impacts, but thrown down so that it lands sooner."""
+    given = landing_case(name)
+    return Case(
+        title,
+        given.model,
+        duration=duration,
+        moved=moved,
+        stddev=0.1,
+        outcome=outcome,
+        qpos=given.qpos,
+        qvel={**given.qvel, given.moved: -1.0},
+    )
+
+
+def _push() -> Case:
+    """`mjcf/push.xml` with a contact a hundred times as stiff as the stiffest published: the balls knock."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("push")))
+    model.pair_solref[:] = (-1e5, 0.0)
+    return Case(
+        "Stiff pushing",
+        model,
+        duration=0.4,
+        moved=(0, 1),
+        stddev=0.1,
+        outcome={0: 0.3, 1: 1.0},
+        qpos={0: -0.02},
+        qvel={0: 0.5},
+        ctrl=(0.3,),
+    )
+
+
+_HEAP = """
+<mujoco model="heap">
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    {balls}
+  </worldbody>
+</mujoco>
+"""
+_HEAP_BALL = '<body pos="{} {} {}"><freejoint/><geom type="sphere" size="0.05"/></body>'
+# A column that leans, so that each ball rolls off the one below.
+_HEAP_PLACES = ((0.0, 0.0, 0.06), (0.03, 0.01, 0.17), (0.0, 0.03, 0.28), (-0.02, 0.01, 0.39), (0.02, -0.02, 0.5))
+
+
+def _heap() -> Case:
+    balls = "\n    ".join(_HEAP_BALL.format(*place) for place in _HEAP_PLACES)
+    return Case(
+        "Five falling balls, many bodies",
+        mujoco.MjModel.from_xml_string(_HEAP.format(balls=balls)),
+        duration=0.24,
+        moved=(6, 8),
+        stddev=0.1,
+        outcome={7: 1.0, 9: 1.0, 16: 0.5},
+    )
+
+
+_BUILDERS = {
+    "pendulum": _pendulum,
+    "bounce": _bounce,
+    "slide": _slide,
+    "cube": _cube,
+    "arm": _arm,
+    "hopper": lambda: _landing("hopper", "Hopper landing", 0.24, (0, 1), {0: 1.0, 1: 1.0}),
+    "half_cheetah": lambda: _landing("half_cheetah", "Half cheetah landing", 0.24, (0, 1), {0: 1.0, 1: 1.0, 2: 0.3}),
+    "push": _push,
+    "heap": _heap,
+    "walker2d": lambda: _landing("walker2d", "Walker2d landing", 0.24, (0, 1), {0: 1.0, 1: 1.0}),
+    "ant": lambda: _landing("ant", "Ant landing", 0.24, (0, 2), {0: 1.0, 2: 1.0}),
+}

@@ -1,0 +1,94 @@
+"""From settings to numbers."""
+
+import time
+
+from experiments.work_precision import gradient, simulation
+from experiments.work_precision.cases import Case, case
+from experiments.work_precision.native import has_own_implicit
+from experiments.work_precision.outcome import Course, Outcome
+from experiments.work_precision.programs import Variant, compiled
+from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.workspace import Workspace
+
+
+def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
+    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed.
+
+    Args:
+        settings: of the run.
+        workspace: for the clock.
+
+    Returns:
+        The numbers.
+    """
+    cases = {name: case(name) for name in settings.scene_names}
+    courses = []
+    with workspace.stage("scenes", "scenes", len(cases)) as advance_to:
+        for name, one in cases.items():
+            courses.append(_course(name, one, settings))
+            advance_to(len(courses))
+    return Outcome(settings, tuple(courses))
+
+
+def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
+    """Say for what a scene is compiled, the longest compilations first.
+
+    A cone makes no difference without friction, and implicitfast none where Euler's implicit damping is all there is.
+
+    Args:
+        one: the scene.
+        settings: of the run.
+
+    Returns:
+        The variants, without repetition.
+    """
+    batch, everything = settings.sizes.batch, settings.sizes.has_all_variants
+    own = simulation.own_cone(one)
+    cones = [own, *({"pyramidal", "elliptic"} - {own})] if has_friction(one) else [own]
+    has_contact = has_contacts(one)
+    libraries = ("mjx", "mg")
+    found = [Variant("mg", cone=own, batch=batch, derivative=name) for name in ("event", "discrete")[not has_contact :]]
+    for library in libraries:
+        found += [Variant(library, cone=own, precision=p, batch=batch) for p in ("float64", "float32")]
+        found += [Variant(library, cone=own, precision="float32")]
+        if library == "mg" or everything:
+            found += [Variant(library, "RK4", own, batch=batch)]
+            found += [Variant(library, cone=cone, batch=batch) for cone in cones[1:]]
+            found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
+        if everything:
+            found += [Variant(library, "RK4", own, "float32", batch)]
+    return found
+
+
+def has_contacts(one: Case) -> bool:
+    """Say whether anything can touch."""
+    return bool(one.model.npair) or bool(((one.model.geom_contype != 0) | (one.model.geom_conaffinity != 0)).any())
+
+
+def has_friction(one: Case) -> bool:
+    """Say whether a contact has friction."""
+    model = one.model
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return bool((model.geom_condim[touching] > 1).any()) or bool((model.pair_dim > 1).any())
+
+
+def _course(name: str, one: Case, settings: WorkPrecisionSettings) -> Course:
+    begun = time.perf_counter()
+    programs = compiled(one, variants(one, settings))
+    compiling = time.perf_counter() - begun
+    qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
+    right = simulation.truths(one, programs, qvel, settings.threads)
+    points = simulation.measured(one, programs, qvel, right, settings)
+    gradient_reference, estimates = gradient.measured(one, programs, settings)
+    return Course(
+        name=name,
+        title=one.title,
+        timestep=one.model.opt.timestep,
+        cone=simulation.own_cone(one),
+        points=tuple(points),
+        references=tuple(truth.found for truth in right.values()),
+        estimates=tuple(estimates),
+        gradient_reference=gradient_reference,
+        num_programs=len(programs),
+        compile_wall_seconds=compiling,
+    )

@@ -1,0 +1,86 @@
+"""C MuJoCo on the same starts, on some threads."""
+
+import time
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Float
+
+from experiments.work_precision.cases import Case
+from experiments.work_precision.programs import Ends, Knobs, c_model, steps
+
+
+def simulate(
+    case: Case,
+    qvel: Float[np.ndarray, "batch nv"],
+    knobs: Knobs,
+    *,
+    integrator: str = "Euler",
+    cone: str = "pyramidal",
+    iterations: int | None = None,
+    threads: int = 1,
+) -> tuple[Ends, float]:
+    """Simulate a batch.
+
+    Args:
+        case: the scene.
+        qvel: start velocities.
+        knobs: time step and solver tolerance; softening is left aside.
+        integrator: its name.
+        cone: its name.
+        iterations: of the solver at most; None lets it converge.
+        threads: of the rollout.
+
+    Returns:
+        Final positions and velocities, and the wall time.
+    """
+    model = c_model(case, integrator, cone)
+    model.opt.timestep, model.opt.tolerance = knobs.timestep, knobs.tolerance
+    if iterations is not None:
+        model.opt.iterations = iterations
+    num_steps, batch = steps(case, knobs.timestep), len(qvel)
+    initial = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    initial[:, 1 : 1 + model.nq] = case.start[0]
+    initial[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
+    control = np.broadcast_to(case.controls, (batch, num_steps, model.nu)).copy() if model.nu else None
+    workers = [mujoco.MjData(model) for _ in range(threads)]
+    with mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+        begun = time.perf_counter()
+        states, _ = pool.rollout([model] * batch, workers, initial, control, nstep=num_steps)
+        seconds = time.perf_counter() - begun
+    final = states[:, -1]
+    return (final[:, 1 : 1 + model.nq], final[:, 1 + model.nq : 1 + model.nq + model.nv]), seconds
+
+
+def has_own_implicit(case: Case) -> bool:
+    """Say whether implicitfast does anything that Euler, with its implicit joint damping, does not.
+
+    Args:
+        case: the scene.
+
+    Returns:
+        False where both end in the same state but for rounding.
+    """
+    knobs = Knobs(case.model.opt.timestep, 1e-10)
+    ends = [simulate(case, case.start[1][None], knobs, integrator=name)[0][0] for name in ("Euler", "implicitfast")]
+    return not np.allclose(*ends, rtol=0, atol=1e-7)
+
+
+def differences(model: mujoco.MjModel, start: Ends, end: Ends) -> Float[np.ndarray, "batch nv"]:
+    """Give position differences as `mj_differentiatePos` does, in m and rad, one per degree of freedom.
+
+    Args:
+        model: of C MuJoCo.
+        start: states.
+        end: states.
+
+    Returns:
+        What takes each start to its end; NaN where one is not finite.
+    """
+    found = np.full((len(end[0]), model.nv), np.nan)
+    for row, (one, other) in enumerate(zip(start[0], end[0], strict=True)):
+        if np.isfinite(one).all() and np.isfinite(other).all():
+            mujoco.mj_differentiatePos(model, found[row], 1.0, one, other)
+    return found
+

@@ -1,0 +1,97 @@
+"""What an experiment on error against run time can be told; imports nothing heavy."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from experiments.config import Positive, RunSettings
+
+SceneName = Literal[
+    "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
+]
+_DEFAULT_SCENES: tuple[SceneName, ...] = (
+    "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Attributes:
+        scenes: by name.
+        refinements: by what a scene's own time step is divided, coarse to fine.
+        tolerances: of the solver, beside the tight one of every other run.
+        batch: starts that are simulated together, and over which the error is taken.
+        num_rollouts: simulated for the gradient, from which samples are drawn; a multiple of 8 times the batch or a
+            divisor of it.
+        num_samples: of an estimate.
+        gradient_refinements: as `refinements`, of gradients.
+        softenings: factors on the contacts' time constant, beside 1.
+        repeats: at most, of every timing.
+        seconds: after which a timing is not repeated again, once it has been repeated.
+        has_all_variants: whether MJX is run with every integrator and cone, and single precision too.
+    """
+
+    scenes: tuple[SceneName, ...]
+    refinements: tuple[float, ...]
+    tolerances: tuple[float, ...]
+    batch: int
+    num_rollouts: int
+    num_samples: tuple[int, ...]
+    gradient_refinements: tuple[float, ...]
+    softenings: tuple[float, ...]
+    repeats: int
+    seconds: float
+    has_all_variants: bool
+
+
+SIZES = {
+    "quick": Sizes(
+        ("bounce", "push"), (0.5, 1.0, 2.0, 4.0), (1e-2,), 32, 128, (8, 32), (1.0, 2.0), (2.0,), 3, 0.1, False
+    ),
+    "default": Sizes(
+        _DEFAULT_SCENES, (0.5, 1.0, 2.0, 4.0, 8.0), (1e-2, 1e-4, 1e-6), 64, 256, (8, 32, 128), (0.5, 1.0, 2.0),
+        (2.0, 4.0), 5, 0.4, False,
+    ),
+    "full": Sizes(
+        (*_DEFAULT_SCENES, "walker2d", "ant"), (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), (1e-2, 1e-4, 1e-6, 1e-8), 1024, 4096,
+        (8, 32, 128, 512), (0.5, 1.0, 2.0, 4.0), (2.0, 4.0, 8.0), 7, 3.0, True,
+    ),
+}  # fmt: skip
+
+
+class WorkPrecisionSettings(RunSettings):
+    """Error of motions and gradients against the time that they take, by scene."""
+
+    size: Literal["quick", "default", "full"] = "default"
+    """How much is measured: two scenes in a minute or two, nine in a quarter of an hour on two cores, all on a GPU."""
+    scenes: tuple[SceneName, ...] | None = None
+    """Which scenes, in place of those of the size."""
+    targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (0.05, 1e-3)
+    """Relative errors for which a setting is recommended."""
+    threads: Annotated[int, Field(ge=1, le=64)] = 2
+    """Of C MuJoCo's rollout."""
+    tight_tolerance: Positive = 1e-8
+    """Of the solver where tolerance is not what is varied; in single precision at least 1e-6, which is what it resolves."""
+
+    @property
+    def sizes(self) -> Sizes:
+        """Give the numbers that the size stands for."""
+        return SIZES[self.size]
+
+    @property
+    def scene_names(self) -> tuple[SceneName, ...]:
+        """Give the scenes to run."""
+        return self.sizes.scenes if self.scenes is None else self.scenes
+
+    @model_validator(mode="after")
+    def _check(self) -> "WorkPrecisionSettings":
+        if self.precision != "float64":
+            raise ValueError("precision must be float64: both precisions are compared within the run")
+        if self.scenes is not None and not self.scenes:
+            raise ValueError("scenes must name at least one scene, got none")
+        if self.scenes is not None and len(set(self.scenes)) < len(self.scenes):
+            raise ValueError(f"scenes must not repeat, got {list(self.scenes)}")
+        return self

@@ -1,0 +1,215 @@
+"""Error of the motion against run time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.work_precision.cases import Case
+from experiments.work_precision.native import differences, simulate
+from experiments.work_precision.outcome import MG, MJX, C, Point, Reference, relative_errors, rms
+from experiments.work_precision.programs import CONES, Ends, Knobs, Program, Variant, timed
+from experiments.work_precision.settings import WorkPrecisionSettings
+
+# The classical rule for references: where nothing switches it is exact to rounding, elsewhere all rules are of first order.
+# C MuJoCo affords more steps.
+_FINEST = {(C, "RK4"): 128, (MG, "RK4"): 32, (MG, "Euler"): 64}
+# Ends closer than this after the same steps are of the same motion; so are those ten times closer than the reference is known.
+_SAME_MOTION = 1e-6
+_REFERENCE_TOLERANCE = 1e-12
+_SINGLE_TOLERANCE = 1e-6
+_NAMES = {"mg": MG, "mjx": MJX}
+_FEW_ITERATIONS = (1, 3)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The state that motions are compared with, and in what units.
+
+    Attributes:
+        ends: final positions and velocities.
+        scales: way gone and speed, root mean square over the states.
+        found: what is known about it.
+    """
+
+    ends: Ends
+    scales: tuple[float, float]
+    found: Reference
+
+    def errors(self, case: Case, ends: Ends) -> tuple[float, float]:
+        """Compare a batch of ends, or its first states."""
+        count = len(ends[0])
+        right = self.ends[0][:count], self.ends[1][:count]
+        return relative_errors(differences(case.model, right, ends), ends[1] - right[1], self.scales)
+
+
+def starts(case: Case, batch: int, seed: int) -> Float[np.ndarray, "batch nv"]:
+    """Draw start velocities."""
+    noise = np.random.default_rng(seed).normal(size=(batch, len(case.moved)))
+    return case.start[1] + case.stddev * noise @ case.directions
+
+
+def own_cone(case: Case) -> str:
+    """Give the name of the cone in the scene's file."""
+    return next(name for name, cone in CONES.items() if cone == case.model.opt.cone)
+
+
+def truths(
+    case: Case, programs: dict[Variant, Program], qvel: Float[np.ndarray, "batch nv"], threads: int
+) -> dict[tuple[str, str], Truth]:
+    """Simulate the references of every engine and cone.
+
+    MJX makes other contacts than C MuJoCo on some scenes, and then has a reference of its own. Where the same steps of
+    both end in the same states, C's serves both, for it is finer.
+
+    Args:
+        case: the scene.
+        programs: of the scene.
+        qvel: start velocities.
+        threads: of C MuJoCo.
+
+    Returns:
+        By engine (that of `mg.step`, which is MJX's too, or C MuJoCo's) and cone.
+    """
+    found: dict[tuple[str, str], Truth] = {}
+    own, same = own_cone(case), Knobs(case.model.opt.timestep, _REFERENCE_TOLERANCE)
+    for cone in sorted({variant.cone for variant in programs}, key=lambda name: name != own):
+
+        def by_c(knobs: Knobs, integrator: str = "RK4", cone: str = cone) -> Ends:
+            return simulate(case, qvel, knobs, integrator=integrator, cone=cone, threads=threads)[0]
+
+        native = _truth(case, qvel, by_c, (C, cone, "RK4"), found.get((C, own)))
+        euler = next(v for v in programs if v == Variant("mg", cone=cone, batch=len(qvel)))
+        apart = max(_between(case, by_c(same, "Euler"), programs[euler].run(qvel, same), native.scales))
+        if apart < max(_SAME_MOTION, native.found.error / 10):
+            shared = replace(native, found=replace(native.found, engine=MG, distance_to_c=apart))
+        else:
+            finer = next((v for v in programs if v == replace(euler, integrator="RK4")), euler)
+            shared = _truth(
+                case, qvel, lambda at, v=finer: programs[v].run(qvel, at), (MG, cone, finer.integrator), found.get((MG, own))
+            )
+            far = max(_between(case, native.ends, shared.ends, native.scales))
+            shared = replace(shared, found=replace(shared.found, distance_to_c=far))
+        found |= {(C, cone): native, (MG, cone): shared}
+    return found
+
+
+def _truth(
+    case: Case,
+    qvel: Float[np.ndarray, "batch nv"],
+    run: Callable[[Knobs], Ends],
+    names: tuple[str, str, str],
+    of_own_cone: Truth | None,
+) -> Truth:
+    """Simulate at a fine step, at two and at four times it."""
+    engine, cone, integrator = names
+    finest = case.model.opt.timestep / _FINEST[engine, integrator]
+    runs = [run(Knobs(factor * finest, _REFERENCE_TOLERANCE)) for factor in (1, 2, 4)]
+    scales = _scales(case, qvel, runs[0])
+    apart = [max(_between(case, fine, coarse, scales)) for fine, coarse in zip(runs, runs[1:], strict=False)]
+    distance = 0.0 if of_own_cone is None else max(_between(case, of_own_cone.ends, runs[0], of_own_cone.scales))
+    return Truth(runs[0], scales, Reference(engine, cone, integrator, finest, *apart, distance))
+
+
+def measured(
+    case: Case,
+    programs: dict[Variant, Program],
+    qvel: Float[np.ndarray, "batch nv"],
+    right: dict[tuple[str, str], Truth],
+    settings: WorkPrecisionSettings,
+) -> list[Point]:
+    """Simulate in every way.
+
+    Args:
+        case: the scene.
+        programs: of the scene.
+        qvel: start velocities.
+        right: references.
+        settings: of the run.
+
+    Returns:
+        The points.
+    """
+    points = []
+    for variant, program in programs.items():
+        if variant.derivative is None:
+            points += _of_program(program, qvel[: variant.batch], right[MG, variant.cone], settings)
+    return points + _of_c(case, qvel, right, settings)
+
+
+def _of_program(
+    program: Program, qvel: Float[np.ndarray, "batch nv"], truth: Truth, settings: WorkPrecisionSettings
+) -> list[Point]:
+    case, variant, sizes = program.case, program.variant, settings.sizes
+    is_main = variant.integrator == "Euler" and variant.batch > 1 and variant.cone == own_cone(case)
+    points = []
+    for knobs in _knobs(case, settings, with_tolerances=is_main, is_single=variant.precision == "float32"):
+        program.run(qvel, knobs)
+        ends, seconds = timed(lambda at=knobs: program.run(qvel, at), repeats=sizes.repeats, seconds=sizes.seconds)
+        points.append(
+            Point(
+                _NAMES[variant.library], variant.integrator, variant.cone, variant.precision, knobs.timestep,
+                knobs.tolerance, int(program.model.opt.iterations), variant.batch, *truth.errors(case, ends),
+                tuple(taken / (variant.batch * case.duration) for taken in seconds),
+                program.trace_seconds + program.compile_seconds,
+            )
+        )  # fmt: skip
+    return points
+
+
+def _of_c(
+    case: Case,
+    qvel: Float[np.ndarray, "batch nv"],
+    right: dict[tuple[str, str], Truth],
+    settings: WorkPrecisionSettings,
+) -> list[Point]:
+    ways: list[tuple[str, str, int, int | None, list[Knobs]]] = []
+    plain, varied = (_knobs(case, settings, with_tolerances=flag, is_single=False) for flag in (False, True))
+    for _, cone in [key for key in right if key[0] == C]:
+        ways += [(name, cone, len(qvel), None, plain) for name in ("implicitfast", "RK4")]
+        ways += [("Euler", cone, len(qvel), None, varied)]
+    own = own_cone(case)
+    ways += [("Euler", own, len(qvel), count, plain) for count in _FEW_ITERATIONS]
+    ways += [("Euler", own, 1, None, plain)]
+    points = []
+    for integrator, cone, batch, iterations, all_knobs in ways:
+        for knobs in all_knobs:
+            given = {"integrator": integrator, "cone": cone, "iterations": iterations}
+            threads = settings.threads if batch > 1 else 1
+            seconds = []
+            while len(seconds) < 3:
+                ends, taken = simulate(case, qvel[:batch], knobs, threads=threads, **given)
+                seconds.append(taken / (batch * case.duration))
+            points.append(
+                Point(
+                    C, integrator, cone, "float64", knobs.timestep, knobs.tolerance, iterations or 100, batch,
+                    *right[C, cone].errors(case, ends), tuple(seconds),
+                )
+            )  # fmt: skip
+    return points
+
+
+def _knobs(case: Case, settings: WorkPrecisionSettings, *, with_tolerances: bool, is_single: bool) -> list[Knobs]:
+    tight = max(settings.tight_tolerance, _SINGLE_TOLERANCE) if is_single else settings.tight_tolerance
+    own = case.model.opt.timestep
+    knobs = [Knobs(own / refinement, tight) for refinement in settings.sizes.refinements]
+    if with_tolerances:
+        knobs += [
+            Knobs(own / refinement, tolerance)
+            for tolerance in settings.sizes.tolerances
+            if tolerance > tight
+            for refinement in (1.0, 4.0)
+        ]
+    return knobs
+
+
+def _scales(case: Case, qvel: Float[np.ndarray, "batch nv"], ends: Ends) -> tuple[float, float]:
+    start = np.tile(case.start[0], (len(qvel), 1)), qvel
+    way = rms(differences(case.model, start, ends))
+    return way, float(np.sqrt((rms(qvel) ** 2 + rms(ends[1]) ** 2) / 2))
+
+
+def _between(case: Case, fine: Ends, coarse: Ends, scales: tuple[float, float]) -> tuple[float, float]:
+    return relative_errors(differences(case.model, fine, coarse), coarse[1] - fine[1], scales)
+
