@@ -153,8 +153,7 @@ def unused(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01, lim
     """
     full = scene.to_mujoco()
     qpos, qvel, _ = _rollouts(full, trajectory)
-    # Whichever of sum and maximum makes a pair's margin, it has grown by the clearance at least.
-    full.geom_margin[:] += clearance
+    full.geom_margin[:] += clearance / 2  # margins of a pair are added
     data, near, reached = mujoco.MjData(full), set(), np.zeros(full.njnt, bool)
     for position, velocity in zip(qpos.reshape(-1, full.nq), qvel.reshape(-1, full.nv), strict=True):
         data.qpos[:], data.qvel[:] = position, velocity
@@ -235,7 +234,8 @@ def _rollouts(model: mujoco.MjModel, trajectory: Trajectory) -> tuple[np.ndarray
             raise ValueError(f"trajectory.{name} must have {size} columns in this scene, got {value.shape[-1]}")
         if not np.isfinite(value).all():
             raise ValueError(f"trajectory.{name} must be finite, got numbers that are not")
-        parts.append(value.reshape(-1, *value.shape[-2:]))
+        rollouts = int(np.prod(value.shape[:-2]))
+        parts.append(value.reshape(rollouts, *value.shape[-2:]))
     return tuple(parts)
 
 
