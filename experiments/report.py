@@ -56,6 +56,7 @@ class Report:
         video: relative to the output folder, or None.
         video_caption: what it shows; without a video, why there is none.
         warnings: what a reader must know before trusting the numbers.
+        summary: a table to stand before the figures, if there is one.
     """
 
     verdict: str
@@ -66,6 +67,7 @@ class Report:
     video: str | None = None
     video_caption: str = ""
     warnings: Sequence[str] = field(default_factory=tuple)
+    summary: Table | None = None
 
 
 def quantity(value: float, error: float | None = None) -> str:
@@ -124,6 +126,7 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
         else "",
         _warnings(report.warnings),
         _video(report, folder),
+        _table(report.summary) if report.summary is not None else "",
         *(_figure(figure, folder, number) for number, figure in enumerate(report.figures, start=1)),
         *(_table(table) for table in report.tables),
         '<section class="about">',
