@@ -1,0 +1,193 @@
+"""The pictures: error against run time, one panel per scene, with what no other way beats."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from experiments.report import Figure
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.work_precision.outcome import MG, MJX, C, Course, Estimate, Outcome, Point, pareto_front
+
+_COLOURS = {MG: ZEROTH, MJX: FIRST, C: "#009e73"}
+_MARKERS = {"Euler": "o", "implicitfast": "s", "RK4": "^"}
+_ESTIMATORS = {
+    "zeroth order": ZEROTH,
+    "first order, discrete": FIRST,
+    "first order, event": "#009e73",
+    "α-order, event": DEFAULT,
+}
+# Errors of smooth motions in double precision fall to rounding; nobody chooses by what lies below this.
+_SMALLEST = 1e-9
+_LARGEST = 10.0
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw two figures per scene.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by name: motion, gradient, and the same for later scenes.
+
+    Returns:
+        The figures in order of reading.
+    """
+    figures = []
+    for number, course in enumerate(outcome.courses):
+        later = "_next" if number else ""
+        for kind, make in (("motion", motion), ("gradient", gradient)):
+            file = save(make(course, outcome), folder, f"{kind}_{course.name}")
+            figures.append(Figure(file, f"{course.title}: {kind}", captions[f"{kind}{later}"]))
+    return figures
+
+
+def motion(course: Course, outcome: Outcome):
+    """Error of the final state against wall time: libraries and integrators on the left, other settings of the solver right."""
+    figure, axes = subplots(1, 2, height=4.3, sharey=True, sharex=True)
+    tight = [one for one in course.in_batch() if _is_tight(one, outcome)]
+    others = [one for one in course.points if one not in tight and one.batch == tight[0].batch]
+    front = pareto_front([one.cost for one in tight], [one.error for one in tight])
+    _front(axes[0, 0], tight, front)
+    for axis, shown in zip(axes[0], (tight, others), strict=True):
+        for line in _lines(shown):
+            _motion_line(axis, line, course)
+        for library in (MG, C):
+            floor = max(course.floor(library), _SMALLEST)
+            axis.axhline(floor, color=_COLOURS[library], lw=0.9, ls=(0, (2, 3)), zorder=0)
+        for target in outcome.settings.targets:
+            axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
+        axis.set(xscale="log", yscale="log", xlabel="wall-clock seconds per simulated second and state")
+    axes[0, 0].set_ylabel("error of the final state, relative")
+    axes[0, 0].set_title("integrator, precision, time step")
+    axes[0, 1].set_title("solver tolerance and iterations, the other cone")
+    _limit(axes[0, 0], [one.error for one in course.points])
+    handles = _motion_legend(tight, others)
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    figure.suptitle(course.title, fontsize=10.5)
+    return figure
+
+
+def gradient(course: Course, outcome: Outcome):
+    """Error of the estimate against its wall time, and against its rollouts."""
+    figure, axes = subplots(1, 2, height=4.3, sharey=True)
+    estimates = [one for one in course.estimates if np.isfinite(one.error)]
+    own = [one for one in estimates if one.timestep == course.timestep and one.softening == 1]
+    costs = {"seconds": [one.cost for one in estimates], "rollouts": [one.num_samples for one in estimates]}
+    for axis, (name, cost) in zip(axes[0], costs.items(), strict=True):
+        front = pareto_front(cost, [one.error for one in estimates])
+        best = sorted((c, one.error) for c, one, keep in zip(cost, estimates, front, strict=True) if keep)
+        axis.step(*zip(*best, strict=True), where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+        for line in _lines(estimates):
+            _gradient_line(axis, line, name, is_own=line[0] in own, own_step=course.timestep)
+        axis.axhline(max(course.gradient_reference.error, 1e-6), color=REFERENCE, lw=0.9, ls=(0, (2, 3)), zorder=0)
+        for target in outcome.settings.targets:
+            axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
+        axis.set(xscale="log", yscale="log")
+    axes[0, 0].set(xlabel="wall-clock seconds of one estimate", ylabel="error of the gradient, relative")
+    axes[0, 1].set(xlabel="rollouts of one estimate")
+    errors = [one.error for one in estimates]
+    low = min([*errors, course.gradient_reference.error, *outcome.settings.targets])
+    axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e3))
+    present = {one.estimator for one in estimates}
+    handles = [Line2D([], [], color=c, marker="o", ms=4, label=n) for n, c in _ESTIMATORS.items() if n in present]
+    handles += [
+        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="<", ms=4, label="coarser step"),
+        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker=">", ms=4, label="finer step"),
+        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="D", ms=4, label="softer contact"),
+        Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="no other is better"),
+        Line2D([], [], color=REFERENCE, lw=0.9, ls=(0, (2, 3)), label="known of the reference"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    figure.suptitle(course.title, fontsize=10.5)
+    return figure
+
+
+def _is_tight(point: Point, outcome: Outcome) -> bool:
+    return point.tolerance <= max(outcome.settings.tight_tolerance, 1e-6) and point.iterations >= 100 and (
+        point.precision == "float32" or point.tolerance <= outcome.settings.tight_tolerance
+    )  # fmt: skip
+
+
+def _lines(measured: Iterable[Any]) -> list[list[Any]]:
+    lines: dict[tuple[Any, ...], list[Any]] = {}
+    for one in measured:
+        lines.setdefault(one.line, []).append(one)
+    return list(lines.values())
+
+
+def _motion_line(axis: Axes, line: Sequence[Point], course: Course) -> None:
+    shown = sorted((one for one in line if one.error <= _LARGEST), key=lambda one: one.timestep)
+    if not shown:
+        return
+    first = shown[0]
+    colour = _COLOURS[first.library]
+    errors = [max(one.error, _SMALLEST) for one in shown]
+    style = {"ls": (0, (4, 2))} if first.precision == "float32" or first.cone != course.cone else {}
+    marker, face = _look(first, course)
+    axis.plot([one.cost for one in shown], errors, color=colour, lw=1.1, **style)
+    axis.errorbar(
+        [one.cost for one in shown], errors,
+        xerr=np.array([[one.cost - min(one.seconds), max(one.seconds) - one.cost] for one in shown]).T,
+        fmt=marker, color=colour, ms=4.5, mfc=face or colour, elinewidth=0.7, alpha=0.9,
+    )  # fmt: skip
+
+
+def _look(point: Point, course: Course) -> tuple[str, str | None]:
+    if point.cone != course.cone:
+        return "D", "white"
+    if point.iterations < 100:
+        return "x", None
+    if point.tolerance > 1e-6 and point.precision == "float64" or point.tolerance > 1.1e-6:
+        return "v", "white"
+    return _MARKERS[point.integrator], "white" if point.precision == "float32" else None
+
+
+def _motion_legend(tight: Sequence[Point], others: Sequence[Point]) -> list[Line2D]:
+    libraries = [Line2D([], [], color=c, lw=2, label=f"{name}") for name, c in _COLOURS.items()]
+    present = {one.integrator for one in tight}
+    marks = [
+        Line2D([], [], color=MUTED, marker=m, ls="", ms=5, label=n) for n, m in _MARKERS.items() if n in present
+    ]
+    marks.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls=(0, (4, 2)), ms=5, label="float32"))
+    if any(one.tolerance > 1e-6 for one in others):
+        marks.append(Line2D([], [], color=MUTED, marker="v", mfc="white", ls="", ms=5, label="looser tolerance"))
+    marks.append(Line2D([], [], color=MUTED, marker="x", ls="", ms=5, label="1 or 3 iterations"))
+    if len({one.cone for one in others}) > 1:
+        marks.append(Line2D([], [], color=MUTED, marker="D", mfc="white", ls=(0, (4, 2)), ms=5, label="other cone"))
+    marks.append(Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="no other is better"))
+    marks.append(Line2D([], [], color=MUTED, lw=0.9, ls=(0, (2, 3)), label="known of the reference"))
+    return libraries + marks
+
+
+def _front(axis: Axes, points: Sequence[Point], front: np.ndarray) -> None:
+    best = sorted((p.cost, max(p.error, _SMALLEST)) for p, keep in zip(points, front, strict=True) if keep)
+    if best:
+        axis.step(*zip(*best, strict=True), where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+
+
+def _gradient_line(axis: Axes, line: Sequence[Estimate], against: str, *, is_own: bool, own_step: float) -> None:
+    first = line[0]
+    colour = _ESTIMATORS[first.estimator]
+    places = [one.cost if against == "seconds" else one.num_samples for one in line]
+    errors = np.array([one.error for one in line])
+    marker = "o" if is_own else "D" if first.softening != 1 else "<" if first.timestep > own_step else ">"
+    axis.plot(
+        places, errors, color=colour, lw=1.6 if is_own else 0.7, marker=marker,
+        ms=5 if is_own else 3.5, mfc=colour if is_own else "white", alpha=1.0 if is_own else 0.65,
+    )  # fmt: skip
+    if is_own:
+        low, high = np.array([one.spread for one in line]).T
+        axis.vlines(places, low, high, color=colour, lw=3.5, alpha=0.25)
+
+
+def _limit(axis: Axes, errors: Sequence[float]) -> None:
+    finite = [min(max(one, _SMALLEST), _LARGEST) for one in errors if np.isfinite(one)]
+    if finite:
+        axis.set_ylim(min(*finite, 1e-3) / 2, max(*finite, 1e-1) * 2)
+
+
+

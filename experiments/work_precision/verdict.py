@@ -1,0 +1,223 @@
+"""The answer in words, computed from the numbers."""
+
+import numpy as np
+
+from experiments.report import Table
+from experiments.work_precision.outcome import MG, MJX, C, Choice, Course, Outcome, Point, cheapest, fastest
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say how the libraries stand at the largest target, over all scenes.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        A few sentences.
+    """
+    target = max(outcome.settings.targets)
+    sentences = []
+    for other, name in ((MJX, "mjx.step"), (C, f"C MuJoCo on {_threads(outcome)}")):
+        ratios = _ratios(outcome, other, target)
+        if ratios:
+            sentences.append(
+                f"For {_percent(target)} error of the motion mg.step takes {_factor(np.median(ratios))} the time of {name} in the "
+                f"median of {len(ratios)} {'scene' if len(ratios) == 1 else 'scenes'} "
+                f"({_factor(min(ratios))} to {_factor(max(ratios))})."
+            )
+    chosen = [cheapest(course.estimates, target) for course in outcome.courses]
+    names = [choice.estimate.estimator for choice in chosen if choice is not None]
+    if names:
+        counts = {name: names.count(name) for name in dict.fromkeys(names)}
+        listed = ", ".join(f"{name} on {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+        sentences.append(f"For {_percent(target)} error of the gradient the soonest is {listed}.")
+    lost = len(outcome.courses) - len(names)
+    if lost:
+        sentences.append(f"On {lost} of {len(outcome.courses)} no way of estimating it is known to get there.")
+    return " ".join(sentences) or "No setting reached a target on any scene."
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Recommend, scene by scene, and say what is not known.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        Sentences.
+    """
+    sentences = [_recommendation(course, outcome) for course in outcome.courses]
+    loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]
+    if loose:
+        sentences.append(
+            "Halving the step did not bring the reference nearer, so that the dotted line is all that is known: "
+            f"{'; '.join(loose)}."
+        )
+    apart = [(c.title, c.reference(MG, c.cone)) for c in outcome.courses]
+    apart = [(title, one) for title, one in apart if one.distance_to_c > max(1e-5, 3 * one.error)]
+    if apart:
+        listed = "; ".join(f"{title}, {_percent(one.distance_to_c)} apart" for title, one in apart)
+        sentences.append(f"MJX makes other contacts than C MuJoCo, so that each has its own reference: {listed}.")
+    doubtful = [course.title for course in outcome.courses if not course.gradient_reference.agrees]
+    if doubtful:
+        sentences.append(
+            "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful: "
+            f"{'; '.join(doubtful)}."
+        )
+    programs = sum(course.num_programs for course in outcome.courses)
+    seconds = sum(course.compile_wall_seconds for course in outcome.courses)
+    sentences.append(
+        f"{programs} programs were compiled, two at a time, in {seconds:.0f} s (less where a former run had compiled them)."
+    )
+    return sentences
+
+
+def summary(outcome: Outcome) -> Table:
+    """Tabulate what to take for which error, scene by scene."""
+    targets = sorted(outcome.settings.targets, reverse=True)
+    columns = ["scene", "reference known to"]
+    for target in targets:
+        percent = _percent(target)
+        columns += [f"motion to {percent}", f"ms per s; mjx.step; C MuJoCo", f"gradient to {percent}"]  # noqa: F541
+    rows = []
+    for course in outcome.courses:
+        row = [course.title, _percent(course.floor(MG))]
+        for target in targets:
+            best = {name: _best(course, name, target) for name in (MG, MJX, C)}
+            costs = "; ".join(_milliseconds(best[name]) for name in (MG, MJX, C))
+            row += [_way(best[MG], course, target), costs, _choice(cheapest(course.estimates, target))]
+        rows.append(row)
+    caption = (
+        "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one state in a "
+        f"batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
+        f"{_threads(outcome)}; of the gradient with its rollouts and the time they take. A dash: no setting that was tried gets "
+        "there; a question mark: the reference is not known so well."
+    )
+    return Table(columns, rows, caption)
+
+
+def batches(outcome: Outcome) -> Table:
+    """Tabulate time for one state and for a batch, compilation, and what cone and contact model make of the motion."""
+    rows = []
+    for course in outcome.courses:
+        row = [course.title]
+        for library, precision in ((MG, "float32"), (MJX, "float32"), (C, "float64")):
+            of_it = [
+                p for p in course.points
+                if (p.library, p.precision, p.integrator, p.cone, p.timestep) == (library, precision, "Euler", course.cone, course.timestep)
+                and p.iterations >= 100 and p.tolerance <= 1e-6
+            ]  # fmt: skip
+            alone = min((p.cost for p in of_it if p.batch == 1), default=np.nan)
+            together = min((p.cost for p in of_it if p.batch > 1), default=np.nan)
+            row.append(f"{1e3 * alone:.3g}; {1e3 * together:.3g}")
+        for library in (MG, MJX):
+            seconds = [p.compile_seconds for p in course.points if p.library == library and p.integrator == "Euler"]
+            row.append(f"{np.median(seconds):.1f}")
+        others = [one for one in course.references if one.cone != course.cone and one.engine == MG]
+        row.append(_percent(others[0].distance) if others else "no friction")
+        row.append(_percent(course.reference(MG, course.cone).distance_to_c))
+        found = course.gradient_reference
+        row.append(f"{_percent(found.standard_error)}; {_percent(found.step_error)}; {_percent(found.difference)}")
+        rows.append(row)
+    columns = (
+        "scene", "mg.step: alone; in batch", "mjx.step: alone; in batch", "C MuJoCo: alone; in batch",
+        "to compile mg.step, s", "mjx.step, s", "cone changes the motion by", "MJX from C MuJoCo",
+        "reference gradient: chance; step; other way",
+    )  # fmt: skip
+    caption = (
+        "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone and "
+        f"in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). The figures are about "
+        "batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a time. Then "
+        "how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference gradient: standard "
+        "error, change with the last halving of the step, distance to the same gradient by differences of smoothed outcomes."
+    )
+    return Table(columns, rows, caption)
+
+
+def _recommendation(course: Course, outcome: Outcome) -> str:
+    targets = sorted(outcome.settings.targets, reverse=True)
+    motions, gradients = [], []
+    for target in targets:
+        best = _best(course, MG, target)
+        native = _best(course, C, target)
+        if best is None:
+            motions.append(f"for {_percent(target)} {_absence(course, target)}")
+        else:
+            beside = f", C MuJoCo {_milliseconds(native)}" if native is not None else ""
+            motions.append(
+                f"for {_percent(target)} take mg.step, {_setting(best)} ({_milliseconds(best)} ms per simulated second and state{beside})"
+            )
+        choice = cheapest(course.estimates, target)
+        known = course.gradient_reference.error
+        if choice is None:
+            gradients.append(f"for {_percent(target)} none is known to get there (reference known to {_percent(known)})")
+        elif known > target:
+            gradients.append(f"for {_percent(target)} it cannot be told (reference known to {_percent(known)})")
+        else:
+            gradients.append(f"for {_percent(target)} take {_choice(choice)}")
+    return f"{course.title}, motion: {'; '.join(motions)}. Gradient: {'; '.join(gradients)}."
+
+
+def _best(course: Course, library: str, target: float) -> Point | None:
+    """Give the fastest way of a library, unless the reference is not known that well."""
+    if course.floor(library) > target:
+        return None
+    return fastest((point for point in course.in_batch() if point.library == library), target)
+
+
+def _ratios(outcome: Outcome, other: str, target: float) -> list[float]:
+    pairs = [(_best(course, MG, target), _best(course, other, target)) for course in outcome.courses]
+    return [one.cost / two.cost for one, two in pairs if one is not None and two is not None]
+
+
+def _absence(course: Course, target: float) -> str:
+    if course.floor(MG) > target:
+        return f"it cannot be told (reference known to {_percent(course.floor(MG))})"
+    return "no setting that was tried is enough"
+
+
+def _way(point: Point | None, course: Course, target: float) -> str:
+    if point is None:
+        return "?" if course.floor(MG) > target else "–"
+    return _setting(point)
+
+
+def _setting(point: Point) -> str:
+    tolerance = f", tolerance {point.tolerance:g}" if point.tolerance > 1e-6 else ""
+    return f"{point.integrator}, {point.precision}, {1e3 * point.timestep:g} ms{tolerance}"
+
+
+def _choice(choice: Choice | None) -> str:
+    if choice is None:
+        return "–"
+    one = choice.estimate
+    soft = f", contact {one.softening:g} times softer" if one.softening != 1 else ""
+    return (
+        f"{one.estimator}, {1e3 * one.timestep:g} ms{soft}, {choice.num_samples:.0f} rollouts, "
+        f"{_milliseconds_of(choice.seconds)} ms"
+    )
+
+
+def _milliseconds(point: Point | None) -> str:
+    return "–" if point is None else _milliseconds_of(point.cost)
+
+
+def _milliseconds_of(seconds: float) -> str:
+    return f"{1e3 * seconds:.2g}" if seconds < 1e-2 else f"{1e3 * seconds:.0f}"
+
+
+def _factor(ratio: float) -> str:
+    return f"{ratio:.2g} times"
+
+
+def _threads(outcome: Outcome) -> str:
+    count = outcome.settings.threads
+    return f"{count} threads" if count > 1 else "one thread"
+
+
+def _percent(share: float) -> str:
+    if not np.isfinite(share):
+        return "not finite"
+    if share == 0 or share >= 1e-5:
+        return f"{100 * share:.2g} %"
+    return f"{100 * share:.0e} %".replace("e-0", "e-").replace("-", "−")
