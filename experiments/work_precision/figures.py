@@ -23,6 +23,8 @@ _ESTIMATORS = {
 # Errors of smooth motions in double precision fall to rounding; nobody chooses by what lies below this.
 _SMALLEST = 1e-9
 _LARGEST = 10.0
+# The tolerance that single precision is given; what is beyond it is loose.
+_RESOLVED = 1e-6
 
 
 def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
@@ -52,6 +54,7 @@ def motion(course: Course, outcome: Outcome):
     others = [one for one in course.points if one not in tight and one.batch == tight[0].batch]
     front = pareto_front([one.cost for one in tight], [one.error for one in tight])
     _front(axes[0, 0], tight, front)
+    _ring(axes[0, 0], [one for one in tight if one.library != C])
     for axis, shown in zip(axes[0], (tight, others), strict=True):
         for line in _lines(shown):
             _motion_line(axis, line, course)
@@ -89,6 +92,9 @@ def gradient(course: Course, outcome: Outcome):
         axis.set(xscale="log", yscale="log")
     axes[0, 0].set(xlabel="wall-clock seconds of one estimate", ylabel="error of the gradient, relative")
     axes[0, 1].set(xlabel="rollouts of one estimate")
+    ticks = sorted({one.num_samples for one in estimates})
+    axes[0, 1].set_xticks(ticks, [str(tick) for tick in ticks])
+    axes[0, 1].minorticks_off()
     errors = [one.error for one in estimates]
     low = min([*errors, course.gradient_reference.error, *outcome.settings.targets])
     axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e3))
@@ -98,7 +104,7 @@ def gradient(course: Course, outcome: Outcome):
         Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="<", ms=4, label="coarser step"),
         Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker=">", ms=4, label="finer step"),
         Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="D", ms=4, label="softer contact"),
-        Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="no other is better"),
+        Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="none is better"),
         Line2D([], [], color=REFERENCE, lw=0.9, ls=(0, (2, 3)), label="known of the reference"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
@@ -107,9 +113,9 @@ def gradient(course: Course, outcome: Outcome):
 
 
 def _is_tight(point: Point, outcome: Outcome) -> bool:
-    return point.tolerance <= max(outcome.settings.tight_tolerance, 1e-6) and point.iterations >= 100 and (
-        point.precision == "float32" or point.tolerance <= outcome.settings.tight_tolerance
-    )  # fmt: skip
+    tight = outcome.settings.tight_tolerance
+    tight = max(tight, _RESOLVED) if point.precision == "float32" else tight
+    return point.tolerance <= tight and point.iterations >= 100
 
 
 def _lines(measured: Iterable[Any]) -> list[list[Any]]:
@@ -125,14 +131,13 @@ def _motion_line(axis: Axes, line: Sequence[Point], course: Course) -> None:
         return
     first = shown[0]
     colour = _COLOURS[first.library]
-    errors = [max(one.error, _SMALLEST) for one in shown]
-    style = {"ls": (0, (4, 2))} if first.precision == "float32" or first.cone != course.cone else {}
+    costs, errors = np.array([one.cost for one in shown]), np.array([max(one.error, _SMALLEST) for one in shown])
     marker, face = _look(first, course)
-    axis.plot([one.cost for one in shown], errors, color=colour, lw=1.1, **style)
+    axis.plot(costs, errors, color=colour, lw=1.1, ls="--" if face == "white" else "-")
+    low, high = (np.array([pick(one.seconds) for one in shown]) for pick in (min, max))
     axis.errorbar(
-        [one.cost for one in shown], errors,
-        xerr=np.array([[one.cost - min(one.seconds), max(one.seconds) - one.cost] for one in shown]).T,
-        fmt=marker, color=colour, ms=4.5, mfc=face or colour, elinewidth=0.7, alpha=0.9,
+        costs, errors, xerr=np.array([costs - low, high - costs]), fmt=marker, color=colour, ms=4.5,
+        mfc=face or colour, elinewidth=0.7, alpha=0.9,
     )  # fmt: skip
 
 
@@ -141,7 +146,7 @@ def _look(point: Point, course: Course) -> tuple[str, str | None]:
         return "D", "white"
     if point.iterations < 100:
         return "x", None
-    if point.tolerance > 1e-6 and point.precision == "float64" or point.tolerance > 1.1e-6:
+    if point.tolerance > _RESOLVED:
         return "v", "white"
     return _MARKERS[point.integrator], "white" if point.precision == "float32" else None
 
@@ -149,16 +154,15 @@ def _look(point: Point, course: Course) -> tuple[str, str | None]:
 def _motion_legend(tight: Sequence[Point], others: Sequence[Point]) -> list[Line2D]:
     libraries = [Line2D([], [], color=c, lw=2, label=f"{name}") for name, c in _COLOURS.items()]
     present = {one.integrator for one in tight}
-    marks = [
-        Line2D([], [], color=MUTED, marker=m, ls="", ms=5, label=n) for n, m in _MARKERS.items() if n in present
-    ]
+    marks = [Line2D([], [], color=MUTED, marker=m, ls="", ms=5, label=n) for n, m in _MARKERS.items() if n in present]
     marks.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls=(0, (4, 2)), ms=5, label="float32"))
-    if any(one.tolerance > 1e-6 for one in others):
+    if any(one.tolerance > _RESOLVED for one in others):
         marks.append(Line2D([], [], color=MUTED, marker="v", mfc="white", ls="", ms=5, label="looser tolerance"))
     marks.append(Line2D([], [], color=MUTED, marker="x", ls="", ms=5, label="1 or 3 iterations"))
     if len({one.cone for one in others}) > 1:
         marks.append(Line2D([], [], color=MUTED, marker="D", mfc="white", ls=(0, (4, 2)), ms=5, label="other cone"))
-    marks.append(Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="no other is better"))
+    marks.append(Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="none is better"))
+    marks.append(Line2D([], [], mec=REFERENCE, mfc="none", marker="o", ls="", ms=9, label="none on JAX is better"))
     marks.append(Line2D([], [], color=MUTED, lw=0.9, ls=(0, (2, 3)), label="known of the reference"))
     return libraries + marks
 
@@ -167,6 +171,13 @@ def _front(axis: Axes, points: Sequence[Point], front: np.ndarray) -> None:
     best = sorted((p.cost, max(p.error, _SMALLEST)) for p, keep in zip(points, front, strict=True) if keep)
     if best:
         axis.step(*zip(*best, strict=True), where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+
+
+def _ring(axis: Axes, points: Sequence[Point]) -> None:
+    """Mark what no other way on JAX beats."""
+    front = pareto_front([one.cost for one in points], [one.error for one in points])
+    best = [(p.cost, max(p.error, _SMALLEST)) for p, keep in zip(points, front, strict=True) if keep]
+    axis.plot(*zip(*best, strict=True), "o", mfc="none", mec=REFERENCE, ms=9, mew=0.9, zorder=3)
 
 
 def _gradient_line(axis: Axes, line: Sequence[Estimate], against: str, *, is_own: bool, own_step: float) -> None:
@@ -188,6 +199,3 @@ def _limit(axis: Axes, errors: Sequence[float]) -> None:
     finite = [min(max(one, _SMALLEST), _LARGEST) for one in errors if np.isfinite(one)]
     if finite:
         axis.set_ylim(min(*finite, 1e-3) / 2, max(*finite, 1e-1) * 2)
-
-
-

@@ -109,9 +109,7 @@ def measured(
         The reference, and the estimates.
     """
     sizes, own = settings.sizes, case.model.opt.timestep
-    simulate = next(
-        p for v, p in programs.items() if v == Variant("mg", cone=p.variant.cone, batch=sizes.batch)
-    )
+    simulate = next(p for v, p in programs.items() if v == Variant("mg", cone=p.variant.cone, batch=sizes.batch))
     noise = quasi_random(sizes.num_rollouts, len(case.moved), settings.seed) * case.stddev
     reference = _reference(case, simulate, noise, settings)
     ways = [(own / refinement, 1.0) for refinement in sizes.gradient_refinements]
@@ -119,7 +117,9 @@ def measured(
     estimates = []
     for timestep, softening in ways:
         knobs = Knobs(timestep, settings.tight_tolerance, softening)
-        estimates += _estimates(case, _record(case, programs, simulate, noise, knobs, settings), knobs, reference, settings)
+        estimates += _estimates(
+            case, _record(case, programs, simulate, noise, knobs, settings), knobs, reference, settings
+        )
     return reference, estimates
 
 
@@ -135,9 +135,7 @@ def quasi_random(count: int, dim: int, seed: int) -> Float[np.ndarray, "count di
         The points; consecutive eighths are independent.
     """
     seeds = np.random.SeedSequence(seed).spawn(_SCRAMBLES)
-    parts = [
-        scipy.stats.qmc.Sobol(dim, seed=np.random.default_rng(one)).random(count // _SCRAMBLES) for one in seeds
-    ]
+    parts = [scipy.stats.qmc.Sobol(dim, rng=np.random.default_rng(one)).random(count // _SCRAMBLES) for one in seeds]
     return scipy.stats.norm.ppf(np.concatenate(parts))
 
 
@@ -240,47 +238,60 @@ def _estimates(
 ) -> list[Estimate]:
     right = np.array(reference.value)
     size = float(np.linalg.norm(right))
+    keys = jax.random.split(jax.random.key(settings.seed), _REPEATS)
     found = []
     for name, (function, derivative) in ESTIMATORS.items():
         if derivative is not None and derivative not in records.gradients:
             continue
         gradients = np.zeros_like(records.noise) if derivative is None else records.gradients[derivative]
+        dim = records.noise.shape[1]
         objective = Recorded(
-            jnp.asarray(records.costs), jnp.asarray(gradients), jnp.asarray(records.noise),
-            jnp.full(records.noise.shape[1], case.stddev), records.noise.shape[1],
-        )  # fmt: skip
+            costs=jnp.asarray(records.costs),
+            gradients=jnp.asarray(gradients),
+            noise=jnp.asarray(records.noise),
+            stddev=jnp.full(dim, case.stddev),
+            dim=dim,
+        )
         for num_samples in settings.sizes.num_samples:
-            keys = jax.random.split(jax.random.key(settings.seed), _REPEATS)
             values = np.asarray(_repeated(objective, keys, function, num_samples))
+            centre, chance = _expectation(function, records, gradients, values, case.stddev)
+            offset = float(np.linalg.norm(centre - right) / size)
+            chance = float(np.linalg.norm(chance) / size)
+            bias = float(np.sqrt(max(0.0, offset**2 - chance**2)))
+            variance = float(values.var(axis=0, ddof=1).sum() / size**2)
+            low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
             found.append(
                 Estimate(
-                    name, num_samples, knobs.timestep, knobs.softening, *_statistics(values, right, size, len(records.costs)),
-                    tuple(num_samples * one for one in records.seconds[derivative]),
-                    records.compile_seconds[derivative],
+                    estimator=name,
+                    num_samples=num_samples,
+                    timestep=knobs.timestep,
+                    softening=knobs.softening,
+                    error=float(np.hypot(bias, np.sqrt(variance))),
+                    spread=(low, high),
+                    bias=bias,
+                    bias_error=chance,
+                    variance=variance,
+                    seconds=tuple(num_samples * one for one in records.seconds[derivative]),
+                    compile_seconds=records.compile_seconds[derivative],
                 )
-            )  # fmt: skip
+            )
     return found
+
+
+def _expectation(
+    function: str, records: Records, gradients: np.ndarray, values: Float[np.ndarray, "repeats dim"], stddev: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give what an estimator has in the mean, and the standard error of that, from all rollouts where it is linear in them."""
+    if function == "zeroth_order":
+        return smoothed_gradient(records.costs, records.noise, stddev)
+    if function == "first_order":
+        parts = gradients.reshape(_SCRAMBLES, -1, gradients.shape[1]).mean(axis=1)
+        return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)
+    return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def _repeated(objective: Recorded, keys: Array, function: str, num_samples: int) -> Float[Array, "repeats dim"]:
     estimator = getattr(mg.estimators, function)
-    params = jnp.zeros(objective.dim)
+    params = jnp.zeros_like(objective.stddev)
     return jax.vmap(lambda key: estimator(objective, params, key, num_samples=num_samples).value)(keys)
-
-
-def _statistics(
-    values: Float[np.ndarray, "repeats dim"], right: np.ndarray, size: float, num_rollouts: int
-) -> tuple[float, tuple[float, float], float, float, float]:
-    """Give error, its quartiles, bias, what chance makes of it, and variance, relative."""
-    if not np.isfinite(values).all():
-        return np.inf, (np.inf, np.inf), np.inf, np.inf, np.inf
-    distances = np.linalg.norm(values - right, axis=1) / size
-    variance = float(values.var(axis=0, ddof=1).sum() / size**2)
-    chance = variance / len(values)
-    bias = float(np.sum((values.mean(axis=0) - right) ** 2) / size**2)
-    quartiles = tuple(np.quantile(distances, (0.25, 0.75)).tolist())
-    return float(np.sqrt(np.mean(distances**2))), quartiles, float(np.sqrt(max(0.0, bias - chance))), chance**0.5, variance
-
-
-

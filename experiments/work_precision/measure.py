@@ -6,7 +6,7 @@ from experiments.work_precision import gradient, simulation
 from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
 from experiments.work_precision.outcome import Course, Outcome
-from experiments.work_precision.programs import Variant, compiled
+from experiments.work_precision.programs import CONES, Library, Variant, compiled, own_cone
 from experiments.work_precision.settings import WorkPrecisionSettings
 from experiments.workspace import Workspace
 
@@ -43,17 +43,16 @@ def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
         The variants, without repetition.
     """
     batch, everything = settings.sizes.batch, settings.sizes.has_all_variants
-    own = simulation.own_cone(one)
-    cones = [own, *({"pyramidal", "elliptic"} - {own})] if has_friction(one) else [own]
-    has_contact = has_contacts(one)
-    libraries = ("mjx", "mg")
-    found = [Variant("mg", cone=own, batch=batch, derivative=name) for name in ("event", "discrete")[not has_contact :]]
+    own = own_cone(one)
+    found = [Variant("mg", cone=own, batch=batch, derivative="event")] if has_contacts(one) else []
+    found += [Variant("mg", cone=own, batch=batch, derivative="discrete")]
+    libraries: tuple[Library, ...] = ("mjx", "mg")
     for library in libraries:
-        found += [Variant(library, cone=own, precision=p, batch=batch) for p in ("float64", "float32")]
+        found += [Variant(library, cone=own, batch=batch), Variant(library, cone=own, precision="float32", batch=batch)]
         found += [Variant(library, cone=own, precision="float32")]
         if library == "mg" or everything:
             found += [Variant(library, "RK4", own, batch=batch)]
-            found += [Variant(library, cone=cone, batch=batch) for cone in cones[1:]]
+            found += [Variant(library, cone=name, batch=batch) for name in CONES if name != own and has_friction(one)]
             found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
         if everything:
             found += [Variant(library, "RK4", own, "float32", batch)]
@@ -84,7 +83,7 @@ def _course(name: str, one: Case, settings: WorkPrecisionSettings) -> Course:
         name=name,
         title=one.title,
         timestep=one.model.opt.timestep,
-        cone=simulation.own_cone(one),
+        cone=own_cone(one),
         points=tuple(points),
         references=tuple(truth.found for truth in right.values()),
         estimates=tuple(estimates),

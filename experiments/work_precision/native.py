@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.work_precision.cases import Case
-from experiments.work_precision.programs import Ends, Knobs, c_model, steps
+from experiments.work_precision.programs import Cone, Ends, Integrator, Knobs, c_model, steps
 
 
 def simulate(
@@ -16,8 +16,8 @@ def simulate(
     qvel: Float[np.ndarray, "batch nv"],
     knobs: Knobs,
     *,
-    integrator: str = "Euler",
-    cone: str = "pyramidal",
+    integrator: Integrator = "Euler",
+    cone: Cone = "pyramidal",
     iterations: int | None = None,
     threads: int = 1,
 ) -> tuple[Ends, float]:
@@ -49,7 +49,7 @@ def simulate(
         begun = time.perf_counter()
         states, _ = pool.rollout([model] * batch, workers, initial, control, nstep=num_steps)
         seconds = time.perf_counter() - begun
-    final = states[:, -1]
+    final = np.asarray(states)[:, -1]
     return (final[:, 1 : 1 + model.nq], final[:, 1 + model.nq : 1 + model.nq + model.nv]), seconds
 
 
@@ -63,8 +63,9 @@ def has_own_implicit(case: Case) -> bool:
         False where both end in the same state but for rounding.
     """
     knobs = Knobs(case.model.opt.timestep, 1e-10)
-    ends = [simulate(case, case.start[1][None], knobs, integrator=name)[0][0] for name in ("Euler", "implicitfast")]
-    return not np.allclose(*ends, rtol=0, atol=1e-7)
+    velocity = case.start[1][None]
+    explicit, implicit = (simulate(case, velocity, knobs, integrator=name)[0][0] for name in ("Euler", "implicitfast"))
+    return not np.allclose(explicit, implicit, rtol=0, atol=1e-7)
 
 
 def differences(model: mujoco.MjModel, start: Ends, end: Ends) -> Float[np.ndarray, "batch nv"]:
@@ -83,4 +84,3 @@ def differences(model: mujoco.MjModel, start: Ends, end: Ends) -> Float[np.ndarr
         if np.isfinite(one).all() and np.isfinite(other).all():
             mujoco.mj_differentiatePos(model, found[row], 1.0, one, other)
     return found
-

@@ -109,11 +109,11 @@ class Estimate:
         num_samples: per estimate.
         timestep: in s.
         softening: factor on the contacts' time constant.
-        error: root mean square over repetitions of the distance to the reference, over its norm.
-        spread: quartiles of that distance.
-        bias: norm of the mean's distance, what chance explains taken off; over the reference's norm.
+        error: root of squared bias and variance.
+        spread: quartiles over repetitions of the distance to the reference, over its norm.
+        bias: distance of the mean to the reference, what chance explains taken off; over the reference's norm.
         bias_error: what chance would make of a bias of zero.
-        variance: of one estimate, the trace, over the reference's squared norm.
+        variance: of one estimate over repetitions, the trace; over the reference's squared norm.
         seconds: wall time of one estimate, by the rollouts that it takes, of each repetition.
         compile_seconds: to trace and compile the rollouts.
     """

@@ -7,7 +7,6 @@ set, and compiled in another, two at a time, since XLA compiles one on a single 
 import contextlib
 import copy
 import functools
-import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -30,12 +29,15 @@ Cone = Literal["pyramidal", "elliptic"]
 Precision = Literal["float32", "float64"]
 Ends = tuple[Float[np.ndarray, "batch nq"], Float[np.ndarray, "batch nv"]]
 
-INTEGRATORS = {
+INTEGRATORS: dict[Integrator, mujoco.mjtIntegrator] = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
 }
-CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+CONES: dict[Cone, mujoco.mjtCone] = {
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+}
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 _ITERATIONS = 100
 _AT_A_TIME = 2
@@ -167,7 +169,7 @@ def softened(model: mjx.Model, factor: float) -> mjx.Model:
     return model.replace(geom_solref=changed(model.geom_solref), pair_solref=changed(model.pair_solref))
 
 
-def c_model(case: Case, integrator: str, cone: str) -> mujoco.MjModel:
+def c_model(case: Case, integrator: Integrator, cone: Cone) -> mujoco.MjModel:
     """Give the C model of a scene with another integrator and cone, its solver run to convergence.
 
     Args:
@@ -195,7 +197,7 @@ def timed(function: Callable[[], Any], *, repeats: int, seconds: float) -> tuple
     Returns:
         What it returned last, and the wall time of each call.
     """
-    taken: list[float] = []
+    result, taken = None, []
     while len(taken) < 2 or (len(taken) < repeats and sum(taken) < seconds):
         begun = time.perf_counter()
         result = function()
@@ -203,9 +205,9 @@ def timed(function: Callable[[], Any], *, repeats: int, seconds: float) -> tuple
     return result, tuple(taken)
 
 
-def median(values: Sequence[float]) -> float:
-    """Give the median of some times."""
-    return statistics.median(values)
+def own_cone(case: Case) -> Cone:
+    """Give the name of the cone in the scene's file."""
+    return next(name for name, cone in CONES.items() if cone == case.model.opt.cone)
 
 
 def _compile(lowered: jax.stages.Lowered) -> tuple[Callable[..., Any], float]:

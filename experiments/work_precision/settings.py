@@ -69,7 +69,10 @@ class WorkPrecisionSettings(RunSettings):
     """How much is measured: two scenes in a minute or two, nine in a quarter of an hour on two cores, all on a GPU."""
     scenes: tuple[SceneName, ...] | None = None
     """Which scenes, in place of those of the size."""
-    targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (0.05, 1e-3)
+    targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (
+        0.05,
+        1e-3,
+    )
     """Relative errors for which a setting is recommended."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
     """Of C MuJoCo's rollout."""

@@ -1,5 +1,7 @@
 """Error of the motion against run time."""
 
+import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -9,7 +11,17 @@ from jaxtyping import Float
 from experiments.work_precision.cases import Case
 from experiments.work_precision.native import differences, simulate
 from experiments.work_precision.outcome import MG, MJX, C, Point, Reference, relative_errors, rms
-from experiments.work_precision.programs import CONES, Ends, Knobs, Program, Variant, timed
+from experiments.work_precision.programs import (
+    CONES,
+    Cone,
+    Ends,
+    Integrator,
+    Knobs,
+    Program,
+    Variant,
+    own_cone,
+    timed,
+)  # fmt: skip
 from experiments.work_precision.settings import WorkPrecisionSettings
 
 # The classical rule for references: where nothing switches it is exact to rounding, elsewhere all rules are of first order.
@@ -21,6 +33,7 @@ _REFERENCE_TOLERANCE = 1e-12
 _SINGLE_TOLERANCE = 1e-6
 _NAMES = {"mg": MG, "mjx": MJX}
 _FEW_ITERATIONS = (1, 3)
+_REPEATS_OF_C = 3
 
 
 @dataclass(frozen=True)
@@ -50,14 +63,9 @@ def starts(case: Case, batch: int, seed: int) -> Float[np.ndarray, "batch nv"]:
     return case.start[1] + case.stddev * noise @ case.directions
 
 
-def own_cone(case: Case) -> str:
-    """Give the name of the cone in the scene's file."""
-    return next(name for name, cone in CONES.items() if cone == case.model.opt.cone)
-
-
 def truths(
     case: Case, programs: dict[Variant, Program], qvel: Float[np.ndarray, "batch nv"], threads: int
-) -> dict[tuple[str, str], Truth]:
+) -> dict[tuple[str, Cone], Truth]:
     """Simulate the references of every engine and cone.
 
     MJX makes other contacts than C MuJoCo on some scenes, and then has a reference of its own. Where the same steps of
@@ -72,23 +80,22 @@ def truths(
     Returns:
         By engine (that of `mg.step`, which is MJX's too, or C MuJoCo's) and cone.
     """
-    found: dict[tuple[str, str], Truth] = {}
+    found: dict[tuple[str, Cone], Truth] = {}
     own, same = own_cone(case), Knobs(case.model.opt.timestep, _REFERENCE_TOLERANCE)
-    for cone in sorted({variant.cone for variant in programs}, key=lambda name: name != own):
-
-        def by_c(knobs: Knobs, integrator: str = "RK4", cone: str = cone) -> Ends:
-            return simulate(case, qvel, knobs, integrator=integrator, cone=cone, threads=threads)[0]
-
-        native = _truth(case, qvel, by_c, (C, cone, "RK4"), found.get((C, own)))
-        euler = next(v for v in programs if v == Variant("mg", cone=cone, batch=len(qvel)))
-        apart = max(_between(case, by_c(same, "Euler"), programs[euler].run(qvel, same), native.scales))
+    compiled_for = {variant.cone for variant in programs}
+    cones: list[Cone] = [own, *(one for one in CONES if one in compiled_for and one != own)]
+    for cone in cones:
+        native_run = functools.partial(simulate, case, qvel, cone=cone, threads=threads)
+        native = _truth(case, qvel, lambda at, run=native_run: run(at, integrator="RK4")[0], (C, cone, "RK4"), found)
+        euler = Variant("mg", cone=cone, batch=len(qvel))
+        apart = max(_between(case, native_run(same)[0], programs[euler].run(qvel, same), native.scales))
         if apart < max(_SAME_MOTION, native.found.error / 10):
             shared = replace(native, found=replace(native.found, engine=MG, distance_to_c=apart))
         else:
-            finer = next((v for v in programs if v == replace(euler, integrator="RK4")), euler)
-            shared = _truth(
-                case, qvel, lambda at, v=finer: programs[v].run(qvel, at), (MG, cone, finer.integrator), found.get((MG, own))
-            )
+            has_finer = replace(euler, integrator="RK4") in programs
+            finer = replace(euler, integrator="RK4") if has_finer else euler
+            run = functools.partial(programs[finer].run, qvel)
+            shared = _truth(case, qvel, run, (MG, cone, finer.integrator), found)
             far = max(_between(case, native.ends, shared.ends, native.scales))
             shared = replace(shared, found=replace(shared.found, distance_to_c=far))
         found |= {(C, cone): native, (MG, cone): shared}
@@ -99,24 +106,25 @@ def _truth(
     case: Case,
     qvel: Float[np.ndarray, "batch nv"],
     run: Callable[[Knobs], Ends],
-    names: tuple[str, str, str],
-    of_own_cone: Truth | None,
+    names: tuple[str, Cone, Integrator],
+    found: dict[tuple[str, Cone], Truth],
 ) -> Truth:
     """Simulate at a fine step, at two and at four times it."""
     engine, cone, integrator = names
     finest = case.model.opt.timestep / _FINEST[engine, integrator]
     runs = [run(Knobs(factor * finest, _REFERENCE_TOLERANCE)) for factor in (1, 2, 4)]
     scales = _scales(case, qvel, runs[0])
-    apart = [max(_between(case, fine, coarse, scales)) for fine, coarse in zip(runs, runs[1:], strict=False)]
-    distance = 0.0 if of_own_cone is None else max(_between(case, of_own_cone.ends, runs[0], of_own_cone.scales))
-    return Truth(runs[0], scales, Reference(engine, cone, integrator, finest, *apart, distance))
+    error, coarser = (max(_between(case, fine, coarse, scales)) for fine, coarse in itertools.pairwise(runs))
+    first = found.get((engine, own_cone(case)))
+    distance = 0.0 if first is None else max(_between(case, first.ends, runs[0], first.scales))
+    return Truth(runs[0], scales, Reference(engine, cone, integrator, finest, error, coarser, distance))
 
 
 def measured(
     case: Case,
     programs: dict[Variant, Program],
     qvel: Float[np.ndarray, "batch nv"],
-    right: dict[tuple[str, str], Truth],
+    right: dict[tuple[str, Cone], Truth],
     settings: WorkPrecisionSettings,
 ) -> list[Point]:
     """Simulate in every way.
@@ -161,13 +169,14 @@ def _of_program(
 def _of_c(
     case: Case,
     qvel: Float[np.ndarray, "batch nv"],
-    right: dict[tuple[str, str], Truth],
+    right: dict[tuple[str, Cone], Truth],
     settings: WorkPrecisionSettings,
 ) -> list[Point]:
-    ways: list[tuple[str, str, int, int | None, list[Knobs]]] = []
+    ways: list[tuple[Integrator, Cone, int, int | None, list[Knobs]]] = []
     plain, varied = (_knobs(case, settings, with_tolerances=flag, is_single=False) for flag in (False, True))
-    for _, cone in [key for key in right if key[0] == C]:
-        ways += [(name, cone, len(qvel), None, plain) for name in ("implicitfast", "RK4")]
+    cones: list[Cone] = [name for name in CONES if (C, name) in right]
+    for cone in cones:
+        ways += [("implicitfast", cone, len(qvel), None, plain), ("RK4", cone, len(qvel), None, plain)]
         ways += [("Euler", cone, len(qvel), None, varied)]
     own = own_cone(case)
     ways += [("Euler", own, len(qvel), count, plain) for count in _FEW_ITERATIONS]
@@ -175,16 +184,17 @@ def _of_c(
     points = []
     for integrator, cone, batch, iterations, all_knobs in ways:
         for knobs in all_knobs:
-            given = {"integrator": integrator, "cone": cone, "iterations": iterations}
-            threads = settings.threads if batch > 1 else 1
-            seconds = []
-            while len(seconds) < 3:
-                ends, taken = simulate(case, qvel[:batch], knobs, threads=threads, **given)
-                seconds.append(taken / (batch * case.duration))
+            runs = [
+                simulate(
+                    case, qvel[:batch], knobs, integrator=integrator, cone=cone, iterations=iterations,
+                    threads=settings.threads if batch > 1 else 1,
+                )
+                for _ in range(_REPEATS_OF_C)
+            ]  # fmt: skip
             points.append(
                 Point(
                     C, integrator, cone, "float64", knobs.timestep, knobs.tolerance, iterations or 100, batch,
-                    *right[C, cone].errors(case, ends), tuple(seconds),
+                    *right[C, cone].errors(case, runs[0][0]), tuple(taken / (batch * case.duration) for _, taken in runs),
                 )
             )  # fmt: skip
     return points
@@ -212,4 +222,3 @@ def _scales(case: Case, qvel: Float[np.ndarray, "batch nv"], ends: Ends) -> tupl
 
 def _between(case: Case, fine: Ends, coarse: Ends, scales: tuple[float, float]) -> tuple[float, float]:
     return relative_errors(differences(case.model, fine, coarse), coarse[1] - fine[1], scales)
-

@@ -21,8 +21,8 @@ def verdict(outcome: Outcome) -> str:
         ratios = _ratios(outcome, other, target)
         if ratios:
             sentences.append(
-                f"For {_percent(target)} error of the motion mg.step takes {_factor(np.median(ratios))} the time of {name} in the "
-                f"median of {len(ratios)} {'scene' if len(ratios) == 1 else 'scenes'} "
+                f"For {_percent(target)} error of the motion mg.step takes {_factor(np.median(ratios))} the time of {name} "
+                f"in the median of {len(ratios)} {'scene' if len(ratios) == 1 else 'scenes'} "
                 f"({_factor(min(ratios))} to {_factor(max(ratios))})."
             )
     chosen = [cheapest(course.estimates, target) for course in outcome.courses]
@@ -76,9 +76,8 @@ def summary(outcome: Outcome) -> Table:
     """Tabulate what to take for which error, scene by scene."""
     targets = sorted(outcome.settings.targets, reverse=True)
     columns = ["scene", "reference known to"]
-    for target in targets:
-        percent = _percent(target)
-        columns += [f"motion to {percent}", f"ms per s; mjx.step; C MuJoCo", f"gradient to {percent}"]  # noqa: F541
+    for percent in map(_percent, targets):
+        columns += [f"motion to {percent}", "ms per s; mjx.step; C MuJoCo", f"gradient to {percent}"]
     rows = []
     for course in outcome.courses:
         row = [course.title, _percent(course.floor(MG))]
@@ -88,8 +87,8 @@ def summary(outcome: Outcome) -> Table:
             row += [_way(best[MG], course, target), costs, _choice(cheapest(course.estimates, target))]
         rows.append(row)
     caption = (
-        "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one state in a "
-        f"batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
+        "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one "
+        f"state in a batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
         f"{_threads(outcome)}; of the gradient with its rollouts and the time they take. A dash: no setting that was tried gets "
         "there; a question mark: the reference is not known so well."
     )
@@ -100,16 +99,7 @@ def batches(outcome: Outcome) -> Table:
     """Tabulate time for one state and for a batch, compilation, and what cone and contact model make of the motion."""
     rows = []
     for course in outcome.courses:
-        row = [course.title]
-        for library, precision in ((MG, "float32"), (MJX, "float32"), (C, "float64")):
-            of_it = [
-                p for p in course.points
-                if (p.library, p.precision, p.integrator, p.cone, p.timestep) == (library, precision, "Euler", course.cone, course.timestep)
-                and p.iterations >= 100 and p.tolerance <= 1e-6
-            ]  # fmt: skip
-            alone = min((p.cost for p in of_it if p.batch == 1), default=np.nan)
-            together = min((p.cost for p in of_it if p.batch > 1), default=np.nan)
-            row.append(f"{1e3 * alone:.3g}; {1e3 * together:.3g}")
+        row = [course.title, *(_alone_and_together(course, name) for name in (MG, MJX, C))]
         for library in (MG, MJX):
             seconds = [p.compile_seconds for p in course.points if p.library == library and p.integrator == "Euler"]
             row.append(f"{np.median(seconds):.1f}")
@@ -125,13 +115,24 @@ def batches(outcome: Outcome) -> Table:
         "reference gradient: chance; step; other way",
     )  # fmt: skip
     caption = (
-        "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone and "
-        f"in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). The figures are about "
-        "batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a time. Then "
+        "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
+        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). The figures "
+        "are about batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a time. Then "
         "how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference gradient: standard "
         "error, change with the last halving of the step, distance to the same gradient by differences of smoothed outcomes."
     )
     return Table(columns, rows, caption)
+
+
+def _alone_and_together(course: Course, library: str) -> str:
+    """Give milliseconds per simulated second of a state at the scene's own step."""
+    costs: dict[bool, float] = {}
+    for one in course.points:
+        is_plain = one.integrator == "Euler" and one.cone == course.cone and one.timestep == course.timestep
+        is_converged = one.iterations >= 100 and one.tolerance <= 1e-6
+        if one.library == library and is_plain and is_converged and (library == C or one.precision == "float32"):
+            costs[one.batch > 1] = 1e3 * one.cost
+    return f"{costs[False]:.3g}; {costs[True]:.3g}"
 
 
 def _recommendation(course: Course, outcome: Outcome) -> str:
@@ -144,13 +145,14 @@ def _recommendation(course: Course, outcome: Outcome) -> str:
             motions.append(f"for {_percent(target)} {_absence(course, target)}")
         else:
             beside = f", C MuJoCo {_milliseconds(native)}" if native is not None else ""
-            motions.append(
-                f"for {_percent(target)} take mg.step, {_setting(best)} ({_milliseconds(best)} ms per simulated second and state{beside})"
-            )
+            price = f"{_milliseconds(best)} ms per simulated second and state{beside}"
+            motions.append(f"for {_percent(target)} take mg.step, {_setting(best)} ({price})")
         choice = cheapest(course.estimates, target)
         known = course.gradient_reference.error
         if choice is None:
-            gradients.append(f"for {_percent(target)} none is known to get there (reference known to {_percent(known)})")
+            gradients.append(
+                f"for {_percent(target)} none is known to get there (reference known to {_percent(known)})"
+            )
         elif known > target:
             gradients.append(f"for {_percent(target)} it cannot be told (reference known to {_percent(known)})")
         else:
