@@ -92,12 +92,14 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
 
 
 def _call(run: Run, workspace: Workspace) -> Report:
-    """Run the experiment; what the library warns of goes into the report, not to the terminal."""
+    """Run the experiment; what the library warns of, and what it finds unstable, goes into the report, not to the terminal."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         report = EXPERIMENTS[run.settings.experiment].load()(run.settings, workspace)
-    sentences = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, UserWarning))
-    return Report(**{**vars(report), "warnings": [*report.warnings, *sentences]})
+    said = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+    # A scene warns of some of it when it is loaded.
+    sentences = dict.fromkeys([*report.warnings, *said, *workspace.warnings])
+    return Report(**{**vars(report), "warnings": list(sentences)})
 
 
 def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> None:

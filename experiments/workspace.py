@@ -6,8 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from mjxgrad.scene import Scene
 
 
 class Workspace:
@@ -18,11 +22,25 @@ class Workspace:
 
     Attributes:
         seconds: wall time by stage.
+        warnings: what a reader must know of the scenes that were checked.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
         self.seconds: dict[str, float] = {}
+        self.warnings: list[str] = []
+
+    def check(self, scene: "Scene", *, speed: float | None = None) -> None:
+        """Note what the time step of a scene does not follow; it becomes part of the report.
+
+        Args:
+            scene: that is simulated, with known values.
+            speed: at which its bodies meet, in m/s.
+        """
+        # A configuration is checked before anything heavy is imported.
+        from mjxgrad.diagnostics.stability import check_stability
+
+        self.warnings += [f"{scene.name}: {text}" for text in check_stability(scene, speed=speed).warnings]
 
     @contextlib.contextmanager
     def stage(self, name: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:

@@ -1,7 +1,7 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
-from mjxgrad.diagnostics import check_omissions
+from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
@@ -46,6 +46,7 @@ __all__ = [
     "TrustRegion",
     "baselines",
     "check_omissions",
+    "check_stability",
     "check_trajectory",
     "closed_loop",
     "diagnostics",

@@ -32,6 +32,8 @@ def measure(problem: Problem, settings: BiasVarianceSettings, workspace: Workspa
         ExperimentError: if at some stiffness and angle there is no estimate, for hardly any rollout was finite.
     """
     rows = len(problem.stiffness)
+    if problem.task is not None:
+        workspace.check(problem.task.scene)
     with workspace.stage("gradients", "stiffnesses", rows) as advance_to:
         measured = bias_variance(
             problem.objective,

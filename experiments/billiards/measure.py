@@ -29,6 +29,7 @@ def measure(settings: BilliardsSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     task = billiards(num_pieces=settings.num_pieces)
+    workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)
     runs = []
     with workspace.stage("descents", "methods", len(settings.methods)) as advance_to:

@@ -51,6 +51,7 @@ def measure(settings: CubeTossSettings, workspace: Workspace) -> Outcome:
         programs = _programs(settings)
         for contact in settings.contacts:
             task = cube_toss(contact)
+            workspace.check(task.scene)
             reference, _, failed = programs["reference"](task, speeds, jnp.asarray(_TOLERANCE))
             if bool(np.any(failed)):
                 raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")

@@ -34,6 +34,7 @@ def measure(settings: KernelsSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     scene = _scene(settings, settings.impedance, settings.impedance)
+    workspace.check(scene, speed=settings.speed)
     profiles = _profiles(settings)
     motions, linear = {}, {}
     hard, hard_slope = _smoothed_motion(scene, settings, None)

@@ -61,6 +61,7 @@ def measure(settings: LandingSettings, workspace: Workspace) -> Outcome:
     cases = {name: case(name) for name in settings.cases}
     for name, one in cases.items():
         _check(name, one, settings)
+        workspace.check(mg.load_scene(one.model))
     groups = []
     total = len(cases) * len(settings.refinements)
     with workspace.stage("rollouts", "motions", total) as advance_to:

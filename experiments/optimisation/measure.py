@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mjxgrad as mg
-from experiments.optimisation.methods import estimator, problem, runner
+from experiments.optimisation.methods import estimator, problem, runner, scene
 from experiments.optimisation.outcome import Outcome, Run
 from experiments.optimisation.settings import MethodSettings, OptimisationSettings
 from experiments.workspace import Workspace
@@ -25,6 +25,8 @@ def measure(settings: OptimisationSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     task = problem(settings)
+    if (simulated := scene(settings)) is not None:
+        workspace.check(simulated)
     run_key, error_key = jax.random.split(jax.random.key(settings.seed))
     runs = []
     with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:

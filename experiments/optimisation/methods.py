@@ -41,6 +41,15 @@ def problem(settings: OptimisationSettings) -> Published:
     return dataclasses.replace(found, **chosen, reference={}) if chosen else found
 
 
+def scene(settings: OptimisationSettings) -> mg.Scene | None:
+    """Give the scene of the task; None under the published equations, which have none.
+
+    Args:
+        settings: of the run.
+    """
+    return None if settings.dynamics == "published" else _SCENES[settings.task]().scene
+
+
 def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
     """Give an estimator, to be called with `num_samples`.
 

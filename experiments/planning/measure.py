@@ -44,6 +44,7 @@ def measure(settings: PlanningSettings, workspace: Workspace) -> Outcome:
         The plans.
     """
     task = planar_pusher(finger=settings.finger, goal=settings.goal)
+    workspace.check(task.system.scene)
     attempts, polished = [], None
     num_seeds = settings.tree.num_seeds if settings.method == "tree" else 1
     with workspace.stage("planning", "attempts", len(settings.models) * num_seeds) as advance_to:

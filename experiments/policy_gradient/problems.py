@@ -59,6 +59,7 @@ class Problem:
     Attributes:
         name: in the settings.
         title: for headings.
+        scene: that it moves in.
         objective: of a gradient ("discrete" or "event") and a standard deviation of the noise.
         stddev: of the noise at the points.
         points: where gradients are compared.
@@ -69,6 +70,7 @@ class Problem:
 
     name: str
     title: str
+    scene: mg.Scene
     objective: Callable[[str, Float[Array, ""]], mg.Objective]
     stddev: float
     points: Sequence[Point]
@@ -111,6 +113,7 @@ def _throw(name: str, settings: PolicyGradientSettings) -> Problem:
     return Problem(
         name=name,
         title="Throw, default contact" if is_default else "Throw, gentle contact",
+        scene=task.scene,
         objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
         stddev=settings.angle_stddev,
         points=points,
@@ -126,6 +129,7 @@ def _push(name: str) -> Problem:
     return Problem(
         name=name,
         title=f"Push, {stiffness:g} N/m",
+        scene=task.scene,
         objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
         stddev=task.settings.stddev,
         points=[Point("start", task.initial_params())],
@@ -140,6 +144,7 @@ def _hopper(settings: PolicyGradientSettings) -> Problem:
     return Problem(
         name="hopper",
         title="Hopper",
+        scene=task.scene,
         objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
         stddev=0.1,
         points=[Point("start", start)],

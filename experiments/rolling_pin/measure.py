@@ -65,6 +65,7 @@ def measure(settings: RollingPinSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     task = rolling_pin()
+    workspace.check(task.scene)
     groups = _groups(settings)
     key = jax.random.key(settings.seed)
     start = jnp.zeros(task.horizon * task.num_controls)

@@ -11,6 +11,14 @@ from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
+from mjxgrad.diagnostics.stability import (
+    Soundness,
+    StabilityReport,
+    UnsoundGradientError,
+    check_soundness,
+    check_stability,
+    soundness,
+)
 from mjxgrad.diagnostics.statistics import (
     bias_interval,
     binomial_bound,
@@ -36,6 +44,9 @@ __all__ = [
     "Rollouts",
     "Seconds",
     "SlopeComparison",
+    "Soundness",
+    "StabilityReport",
+    "UnsoundGradientError",
     "VarianceInterval",
     "bias_interval",
     "bias_variance",
@@ -43,6 +54,8 @@ __all__ = [
     "binomial_interval",
     "bootstrap_variance_interval",
     "check_omissions",
+    "check_soundness",
+    "check_stability",
     "chi_square_variance_interval",
     "compare",
     "compare_to_slope",
@@ -55,6 +68,7 @@ __all__ = [
     "onset_resolution",
     "phases",
     "root_mean_square_interval",
+    "soundness",
     "unused",
     "variance_interval",
 ]

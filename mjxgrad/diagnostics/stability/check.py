@@ -49,8 +49,10 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
         return
     parameters = scene.contact_parameters()
     columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
+    slots = [frozenset(geoms) for geoms in np.asarray(scene.data._impl.contact.geom).tolist()]
     for pair, *row in zip(scene.pairs, *(np.asarray(column, float) for column in columns), strict=True):
-        yield _spring(scene, "contact", str(pair), *row, _thickness(scene, pair))
+        count = slots.count(frozenset((pair.geom1, pair.geom2)))
+        yield _spring(scene, "contact", str(pair), *row, _thickness(scene, pair), max(count, 1))
 
 
 def _others(scene: Scene) -> Iterator[Spring]:
@@ -86,7 +88,9 @@ def _others(scene: Scene) -> Iterator[Spring]:
             )
 
 
-def _spring(scene: Scene, kind: str, name: str, stiffness, damping, impedance, width, solref, size: float) -> Spring:
+def _spring(
+    scene: Scene, kind: str, name: str, stiffness, damping, impedance, width, solref, size: float, num_rows: int = 1
+) -> Spring:
     return Spring(
         kind,
         name,
@@ -98,6 +102,7 @@ def _spring(scene: Scene, kind: str, name: str, stiffness, damping, impedance, w
         float(scene.model.opt.timestep),
         mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
         size,
+        num_rows,
     )
 
 

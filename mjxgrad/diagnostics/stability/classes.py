@@ -55,13 +55,17 @@ _MOTIONS = {
 
 
 class Derivative(enum.IntEnum):
-    """What a derivative turned out to be; `UNJUDGED` where the truth is not known well enough."""
+    """What a derivative turned out to be.
+
+    `UNJUDGED` where the truth is not known well enough, `NONE` where the rollout diverged and has no derivative.
+    """
 
     RIGHT = 0
     UNJUDGED = 1
     WRONG = 2
     EXPLODES = 3
     NON_FINITE = 4
+    NONE = 5
 
     @property
     def label(self) -> str:
@@ -121,6 +125,7 @@ def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:
 def classify_derivative(
     derivative: Float[np.ndarray, " points"],
     is_finite: Bool[np.ndarray, " points"],
+    is_sound: Bool[np.ndarray, " points"],
     truth: Float[np.ndarray, " points"],
     truth_error: Float[np.ndarray, " points"],
     *,
@@ -132,6 +137,7 @@ def classify_derivative(
     Args:
         derivative: of one number by one direction.
         is_finite: whether the whole gradient that it was taken from is finite.
+        is_sound: whether the rollout did not diverge.
         truth: what it should be.
         truth_error: by how much the truth may be off; where that exceeds the tolerance, nothing is judged.
         largest: beyond which a derivative explodes, right or wrong.
@@ -143,6 +149,7 @@ def classify_derivative(
     scale = tolerance * np.maximum(np.abs(truth), 1.0)
     with np.errstate(invalid="ignore"):
         answers = (
+            (~is_sound, Derivative.NONE),
             (~is_finite | ~np.isfinite(derivative), Derivative.NON_FINITE),
             (np.abs(derivative) > largest, Derivative.EXPLODES),
             (~(truth_error <= scale), Derivative.UNJUDGED),

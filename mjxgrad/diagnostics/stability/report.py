@@ -15,8 +15,8 @@ STEPS_IN_CONTACT = 6.0
 _WIDTH = 118  # characters; what a laptop's terminal shows
 _COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
 _LEGEND = (
-    "load: time step over the largest that gains no energy, unstable from 1 on. coupled: the same where several rows hold "
-    "one body. steps: that a bounce lasts. asked: time constant in the file, where refsafe replaces it."
+    "load: time step over the largest that gains no energy, unstable from 1 on. coupled: the same where all contacts "
+    "of the pair act at once. steps: that a bounce lasts. asked: time constant in the file, where refsafe replaces it."
 )
 _SPEED_COLUMNS = ("depth", "rise, steps")
 
@@ -46,7 +46,7 @@ class StabilityReport:
 
     @property
     def is_stable(self) -> bool:
-        """Whether no spring gains energy, even where several rows hold one body."""
+        """Whether no spring gains energy, even where all contacts of a pair act at once."""
         return all(spring.coupled_load < 1 for spring in self.springs)
 
     @property
@@ -184,8 +184,8 @@ def _unstable_together(spring: Spring) -> str | None:
     if spring.load >= 1 or spring.coupled_load < 1:
         return None
     return (
-        f"stable alone, at {spring.load:.2g} of the largest time step, but not where several contacts hold one body or its "
-        f"mass is underestimated, up to {spring.coupled_load:.2g}; use a time step below "
+        f"stable alone, at {spring.load:.2g} of the largest time step, but not where {spring.num_rows} contacts act at once, "
+        f"at {spring.coupled_load:.2g} of it; use a time step below "
         f"{format_number(spring.timestep / spring.coupled_load)} s, or an impedance nearer to 1"
     )
 

@@ -4,9 +4,9 @@ Contacts, limits and equalities have one law: at full impedance $\ddot r = -k r 
 row's effective mass. Semi-implicit Euler follows it without gaining energy while $h^2 k + 2 h b < 4$, which in MuJoCo's
 standard format is $h / t_c < 2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$, $t_c = 2 / b$.
 
-That is one row alone, at the impedance $d_w$. Rows that hold the same body add up: n of them have the impedance
-$n d / (1 + (n - 1) d)$, and so has one row whose mass is larger than MuJoCo's estimate of it. In the limit the row gets
-the whole of its reference acceleration, $k / d_w$ and $b / d_w$. A scene is beyond doubt only while that is stable.
+That is one row alone, at the impedance $d_w$. The n contacts of a box that lands flat add up to the impedance
+$n d / (1 + (n - 1) d)$, and pull with $n / (1 + (n - 1) d_w)$ times $k$ and $b$; contacts with other bodies add to it, up to
+$1 / d_w$ times, where a row gets the whole of the acceleration that it asks for.
 """
 
 from dataclasses import dataclass
@@ -34,6 +34,7 @@ class Spring:
         integrator: of the model.
         size: by how much it may be passed in one step and still be found: what a ball may move through another body, or
             the range of a limit, in m (rad); infinite for planes and equalities.
+        num_rows: contacts that the pair can make at once.
     """
 
     kind: str
@@ -46,6 +47,7 @@ class Spring:
     timestep: float
     integrator: mujoco.mjtIntegrator
     size: float
+    num_rows: int = 1
 
     def __str__(self) -> str:
         """The name, as messages print it."""
@@ -68,8 +70,8 @@ class Spring:
 
     @property
     def coupled_load(self) -> float:
-        """The same where so many rows hold the body that the impedance is one; never below `load`."""
-        return self._load(1 / self.impedance[1])
+        """The same where all contacts of the pair hold the body at once; never below `load`."""
+        return self._load(self.num_rows / (1 + (self.num_rows - 1) * self.impedance[1]))
 
     def _load(self, factor: float) -> float:
         stiffness, damping = factor * self.stiffness, factor * self.damping

@@ -1,0 +1,1 @@
+"""Where the step is stable, and where its gradient is."""

@@ -1,0 +1,134 @@
+"""The pictures of an experiment on stability."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure as Picture
+from matplotlib.patches import Patch
+
+from experiments.report import Figure
+from experiments.stability.grid import AXES
+from experiments.stability.limits import limit_curve
+from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
+from experiments.theme import REFERENCE, power, save, subplots
+from mjxgrad.diagnostics.stability import Derivative, Motion
+
+MOTION_COLOURS = {
+    Motion.SETTLES: "#c9e3f4",
+    Motion.MOVES: "#9ccbe8",
+    Motion.BOUNCES_RIGHT: "#56b4e9",
+    Motion.BOUNCES_OTHERWISE: "#0072b2",
+    Motion.GAINS_ENERGY: "#f0c36d",
+    Motion.TUNNELS: "#cc79a7",
+    Motion.UNSOLVED: "#d55e00",
+    Motion.DIVERGES: "#22262e",
+}
+DERIVATIVE_COLOURS = {
+    Derivative.RIGHT: "#56b4e9",
+    Derivative.UNJUDGED: "#e8eaed",
+    Derivative.WRONG: "#d55e00",
+    Derivative.EXPLODES: "#f0c36d",
+    Derivative.NON_FINITE: "#cc79a7",
+    Derivative.NONE: "#22262e",
+}
+_NAMES = {
+    "timestep": "time step, s",
+    "time_constant": "time constant, s",
+    "damping_ratio": "damping ratio",
+    "stiffness": "direct stiffness, 1/s²",
+    "impedance_first": "impedance at the surface",
+    "width": "width, m",
+    "mass_ratio": "mass ratio",
+    "speed": "speed, m/s",
+    "friction": "friction",
+    "depth": "depth at the start, radii",
+    "margin": "margin, m",
+}
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw a figure per kind of scene: the planes of its first scene, C MuJoCo beside mjxgrad.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by the name of the scene.
+
+    Returns:
+        The figures in order of reading.
+    """
+    shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
+    return [
+        Figure(save(_planes(one, outcome), folder, _file(one)), one.scene.name.capitalize(), captions[one.scene.name])
+        for one in reversed(shown.values())
+    ]
+
+
+def _file(one: SceneOutcome) -> str:
+    return "".join(c if c.isalnum() else "_" for c in one.scene.name)
+
+
+def _planes(one: SceneOutcome, outcome: Outcome) -> Picture:
+    """One row per plane: motion in C MuJoCo, in mjxgrad by precision, and the gradient by precision."""
+    precisions = outcome.settings.precisions
+    columns = [(C_MUJOCO, "motion")] + [(name, what) for what in ("motion", "derivative") for name in precisions]
+    rows = len(one.points.planes)
+    figure, axes = subplots(rows, len(columns), height=0.9 + 2.05 * rows, sharey="row", sharex="row")
+    for i, (across, up) in enumerate(one.points.planes):
+        for j, (name, what) in enumerate(columns):
+            axis = axes[i, j]
+            values = one.plane(i, getattr(one.behaviour[name], what))
+            _image(axis, values, MOTION_COLOURS if what == "motion" else DERIVATIVE_COLOURS)
+            _scales(axis, across, up, values.shape[0])
+            _limit(axis, one, i)
+            if i == 0:
+                where = name if name == C_MUJOCO else f"mjxgrad, {name}"
+                axis.set_title(f"{'Motion' if what == 'motion' else 'Gradient'}\n{where}", fontsize=9)
+            axis.set_xlabel(_NAMES[across], fontsize=8)
+        axes[i, 0].set_ylabel(_NAMES[up], fontsize=8)
+    _legend(figure, one)
+    return figure
+
+
+def _image(axis: Axes, values: np.ndarray, colours: dict) -> None:
+    palette = ListedColormap(list(colours.values()))
+    norm = BoundaryNorm(np.arange(len(colours) + 1) - 0.5, len(colours))
+    axis.imshow(values, cmap=palette, norm=norm, origin="lower", aspect="auto", interpolation="nearest")
+    axis.grid(visible=False)
+
+
+def _scales(axis: Axes, across: str, up: str, count: int) -> None:
+    """Ticks at a few of the values that the squares stand for."""
+    at = np.unique(np.linspace(0, count - 1, 4).round().astype(int))
+    for name, put in ((across, axis.set_xticks), (up, axis.set_yticks)):
+        values = AXES[name](np.linspace(0, 1, count))[at]
+        put(at, [_short(value) for value in values])
+    axis.tick_params(labelsize=7)
+
+
+def _short(value: float) -> str:
+    if value == 0 or 0.01 <= value < 1000:
+        return f"{value:.2g}" if value != round(value) else f"{value:g}"
+    exponent = int(np.floor(np.log10(value)))
+    return power(10.0**exponent * round(value / 10.0**exponent))
+
+
+def _limit(axis: Axes, one: SceneOutcome, index: int) -> None:
+    """Draw the analytic limit, in the coordinates of the squares."""
+    curve = limit_curve(one.scene, one.points, index)
+    if curve is not None:
+        axis.contour(curve, levels=[1.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+
+
+def _legend(figure: Picture, one: SceneOutcome) -> None:
+    kinds = np.unique(np.concatenate([behaviour.motion for behaviour in one.behaviour.values()]))
+    slopes = np.unique(np.concatenate([behaviour.derivative for behaviour in one.behaviour.values()]))
+    handles = [Patch(color=MOTION_COLOURS[Motion(k)], label=Motion(k).label) for k in kinds]
+    handles += [
+        Patch(color=DERIVATIVE_COLOURS[Derivative(k)], label=f"gradient {Derivative(k).label}")
+        for k in slopes
+        if k != Derivative.NONE
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)

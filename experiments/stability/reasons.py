@@ -1,0 +1,38 @@
+"""Why mjxgrad does worse than C MuJoCo on a point, told from the numbers of that point."""
+
+import numpy as np
+
+from experiments.stability.limits import load
+from experiments.stability.outcome import C_MUJOCO, SceneOutcome
+from mjxgrad.diagnostics.stability import Motion
+
+UNEXPLAINED = "unexplained"
+_SAME_MOTION = 1e-3
+"""Difference of final positions, over what a body flies in the rollout, up to which two motions are one."""
+
+
+def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
+    """Give the reason of every point at which mjxgrad does worse.
+
+    Args:
+        one: a scene.
+        precision: of mjxgrad.
+
+    Returns:
+        By index of the point; `UNEXPLAINED` where no reason is found.
+    """
+    values, ours, theirs = one.points.values, one.behaviour[precision], one.behaviour[C_MUJOCO]
+    is_fine_in_double = ~one.worse("float64")
+    takes_other_impedance = (values["width"] == 0) & (values["impedance_first"] != values["impedance_last"])
+    rules = (
+        (ours.motion == Motion.UNSOLVED, "the solve does not converge"),
+        (takes_other_impedance, "width 0: C MuJoCo takes the mean of both impedances, MJX the second"),
+        (one.apart[precision] <= _SAME_MOTION, "the same motion, on either side of the bound between two classes"),
+        (is_fine_in_double & (precision == "float32"), "single precision: right in float64"),
+        (np.full(len(one.points), one.scene.family == "box"), "box on plane: MJX keeps other corners than C MuJoCo"),
+        (theirs.motion >= Motion.GAINS_ENERGY, "C MuJoCo fails, too, in another way"),
+        (load(one.scene, one.points) >= 1, "beyond the explicit limit, where rounding grows"),
+    )
+    conditions, names = zip(*rules, strict=True)
+    chosen = np.select(list(conditions), list(range(len(names))), len(names))
+    return {int(i): (*names, UNEXPLAINED)[chosen[i]] for i in np.flatnonzero(one.worse(precision))}

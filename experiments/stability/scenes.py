@@ -1,0 +1,293 @@
+"""The scenes of an experiment on stability, and how a point of its grid becomes a model and a state."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+RADIUS = 0.05  # m, of every ball, half the side of the box
+MASS = 1.0  # kg, of the lightest body
+GRAVITY = 9.81  # m/s²
+FLIGHT = 2.3  # steps before the first touch: no whole number, so that it falls inside a step
+FIELDS = (
+    "geom_solref", "geom_solimp", "geom_friction", "geom_margin", "jnt_solref", "jnt_solimp", "jnt_margin",
+    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0",
+)  # fmt: skip
+DEFAULTS = {
+    "timestep": 2e-3,
+    "time_constant": 0.02,
+    "damping_ratio": 1.0,
+    "stiffness": 0.0,
+    "impedance_first": 0.9,
+    "impedance_last": 0.95,
+    "width": 1e-3,
+    "mass_ratio": 1.0,
+    "speed": 1.0,
+    "friction": 1.0,
+    "depth": 0.0,
+    "margin": 0.0,
+}
+"""MuJoCo's own contact at its own time step. Stiffness, if any, stands for the direct format; depth is in radii."""
+
+Point = Mapping[str, float]
+State = tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]
+
+_HEAD = """
+<mujoco model="{name}">
+  <compiler angle="radian"/>
+  <option gravity="0 0 {gravity}" cone="{cone}" tolerance="1e-12" iterations="100"><flag {flags}/></option>
+  <default><geom condim="{condim}" mass="1"/></default>
+  <worldbody>
+"""
+_TAIL = "\n</worldbody></mujoco>"
+_PLANE = '<geom name="floor" type="plane" size="1 1 .1" mass="0"/>'
+_BALL = f'<geom name="{{0}}" size="{RADIUS}"/>'
+
+
+@dataclass(frozen=True)
+class StabilityScene:
+    """A scene with its own program; all that is not static is a point of the grid.
+
+    Attributes:
+        name: of the scene.
+        mjcf: of it.
+        family: what it shares with scenes that differ in cone or dimension.
+        start: from a point to positions and velocities.
+        masses: of all bodies but the world, from the mass ratio (kg).
+        outcome: weights of the positions in the number whose derivative is judged.
+        crossing: indices of two positions of which the first stays below the second unless the bodies tunnel.
+        spacing: of these two where their positions are equal (m).
+        depth_unit: what a depth of one is (m, or rad).
+        bounces: whether it is a single bounce, with a restitution in closed form.
+        has_refsafe: whether MuJoCo may replace time constants.
+        has_limits: whether the point's parameters are those of joint limits.
+    """
+
+    name: str
+    mjcf: str
+    family: str
+    start: Callable[[Point], State]
+    masses: Callable[[float], list[float]]
+    outcome: tuple[float, ...]
+    crossing: tuple[tuple[int, int], ...] = ()
+    spacing: float = 0.0
+    depth_unit: float = RADIUS
+    bounces: bool = False
+    has_refsafe: bool = True
+    has_limits: bool = False
+
+    def model(self) -> mujoco.MjModel:
+        """Compile it."""
+        return mujoco.MjModel.from_xml_string(self.mjcf)
+
+
+def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData, point: Point) -> None:
+    """Set a model to a point of the grid, with all that MuJoCo derives from masses.
+
+    Args:
+        scene: that the model is of.
+        model: changed in place.
+        data: of it, overwritten.
+        point: of the grid.
+    """
+    model.opt.timestep = point["timestep"]
+    if point["stiffness"] > 0:
+        frequency = np.sqrt(point["stiffness"])
+        solref = (-point["stiffness"], -2 * point["damping_ratio"] * frequency)
+    else:
+        solref = (point["time_constant"], point["damping_ratio"])
+    solimp = (point["impedance_first"], point["impedance_last"], point["width"])
+    kinds = (("jnt", model.jnt_solref, model.jnt_solimp),) if scene.has_limits else ()
+    for _, references, impedances in (*kinds, ("geom", model.geom_solref, model.geom_solimp)):
+        references[:] = solref
+        impedances[:, :3] = solimp
+    model.geom_friction[:] = point["friction"] * np.array([1.0, 0.1 * RADIUS, 0.01 * RADIUS])
+    # Margins of two geoms add.
+    model.geom_margin[:] = point["margin"] / 2
+    masses = np.array(scene.masses(point["mass_ratio"]))
+    model.body_inertia[1:] *= (masses / model.body_mass[1:])[:, None]
+    model.body_mass[1:] = masses
+    mujoco.mj_setConst(model, data)
+
+
+def effective(scene: StabilityScene, point: Point) -> tuple[float, float]:
+    """Give stiffness (1/s²) and damping (1/s) in effect.
+
+    Args:
+        scene: that the point is of.
+        point: of the grid.
+    """
+    if point["stiffness"] > 0:
+        return point["stiffness"], 2 * point["damping_ratio"] * np.sqrt(point["stiffness"])
+    constant = point["time_constant"]
+    if scene.has_refsafe:
+        constant = max(constant, 2 * point["timestep"])
+    return (constant * point["damping_ratio"]) ** -2, 2 / constant
+
+
+def catalogue() -> tuple[StabilityScene, ...]:
+    """List all scenes, those of one family one after another."""
+    return (*_balls(), *_spheres(), *_pairs(), _stack(), *_boxes(), _chain())
+
+
+def _mjcf(
+    name: str, body: str, *, gravity: float = 0.0, cone: str = "pyramidal", condim: int = 1, flags: str = ""
+) -> str:
+    flags = f'autoreset="disable" energy="enable" {flags}'
+    return _HEAD.format(name=name, gravity=-gravity, cone=cone, condim=condim, flags=flags) + body + _TAIL
+
+
+def _above(point: Point) -> float:
+    """Distance from touching at the start (m)."""
+    if point["depth"] > 0:
+        return -point["depth"] * RADIUS
+    return point["margin"] + FLIGHT * point["speed"] * point["timestep"]
+
+
+def _balls() -> list[StabilityScene]:
+    body = f"""{_PLANE}<body pos="0 0 {RADIUS}"><joint type="slide" axis="0 0 1"/>{_BALL.format("ball")}</body>"""
+
+    def start(point: Point) -> State:
+        return np.array([_above(point)]), np.array([-point["speed"]])
+
+    return [
+        StabilityScene(
+            name,
+            _mjcf("ball", body, flags=f'refsafe="{"enable" if has_refsafe else "disable"}"'),
+            "ball",
+            start,
+            lambda _: [MASS],
+            (1.0,),
+            bounces=True,
+            has_refsafe=has_refsafe,
+        )
+        for name, has_refsafe in (("ball", False), ("ball, refsafe", True))
+    ]
+
+
+def _spheres() -> list[StabilityScene]:
+    body = f"""{_PLANE}<body pos="0 0 {RADIUS}"><freejoint/>{_BALL.format("ball")}</body>"""
+
+    def start(point: Point) -> State:
+        speed = point["speed"]
+        qpos = np.array([0.0, 0.0, RADIUS + _above(point), 1.0, 0.0, 0.0, 0.0])
+        return qpos, np.array([0.5 * speed, 0.2 * speed, -speed, 0.0, 0.3 * speed / RADIUS, 0.1 * speed / RADIUS])
+
+    variants = [(1, "pyramidal"), *((dim, cone) for cone in ("pyramidal", "elliptic") for dim in (3, 4, 6))]
+    return [
+        StabilityScene(
+            f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else ""),
+            _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim),
+            "sphere",
+            start,
+            lambda _: [MASS],
+            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
+        )
+        for dim, cone in variants
+    ]
+
+
+def _pairs() -> list[StabilityScene]:
+    body = f"""
+      <body pos="0 0 0"><freejoint/>{_BALL.format("first")}</body>
+      <body pos="1 0 0"><freejoint/>{_BALL.format("second")}</body>"""
+
+    def start(point: Point) -> State:
+        distance = 2 * RADIUS + _above(point)
+        # Off centre by a tenth of the radius, but where the centres are to coincide.
+        aside = 0.1 * RADIUS if distance > 0 else 0.0
+        first = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        second = [distance, aside, 0.0, 1.0, 0.0, 0.0, 0.0]
+        return np.array(first + second), np.array([point["speed"]] + 11 * [0.0])
+
+    weights = (0.0, 0.3, 0.0) + 4 * (0.0,) + (1.0, 0.4, 0.1) + 4 * (0.0,)
+    return [
+        StabilityScene(
+            f"two balls, {cone}",
+            _mjcf("pair", body, cone=cone, condim=3),
+            "two balls",
+            start,
+            lambda ratio: [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)],
+            weights,
+            crossing=((0, 7),),
+        )
+        for cone in ("pyramidal", "elliptic")
+    ]
+
+
+def _stack() -> StabilityScene:
+    count = 4
+    balls = "".join(
+        f'<body pos="0 0 {(2 * i + 1) * RADIUS}"><joint type="slide" axis="0 0 1"/>{_BALL.format(f"ball{i}")}</body>'
+        for i in range(count)
+    )
+
+    def start(point: Point) -> State:
+        above = _above(point)
+        # Each ball rests on the one below; only the lowest is apart from the floor, or all are inside each other.
+        heights = above * np.arange(1, count + 1) if above < 0 else np.full(count, above)
+        return heights, np.full(count, -point["speed"])
+
+    def masses(ratio: float) -> list[float]:
+        powers = ratio ** (np.arange(count) / (count - 1))
+        return list(MASS * powers / powers.min())
+
+    mjcf = _mjcf("stack", _PLANE + balls, gravity=GRAVITY)
+    return StabilityScene(
+        "stack",
+        mjcf,
+        "stack",
+        start,
+        masses,
+        (0.2, 0.3, 0.5, 1.0),
+        crossing=tuple((i, i + 1) for i in range(count - 1)),
+        spacing=2 * RADIUS,
+    )
+
+
+def _boxes() -> list[StabilityScene]:
+    body = f"""{_PLANE}<body pos="0 0 {RADIUS}"><freejoint/>
+      <geom name="box" type="box" size="{RADIUS} {RADIUS} {RADIUS}"/></body>"""
+
+    def start(point: Point) -> State:
+        # Leaning by 0.02 rad, so that corners land one after another.
+        lean = 0.02
+        corner = RADIUS * (np.cos(lean) + np.sin(lean))
+        speed = point["speed"]
+        qpos = np.array([0.0, 0.0, corner + _above(point), np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
+        return qpos, np.array([0.3 * speed, 0.1 * speed, -speed, 0.0, 0.0, 0.0])
+
+    return [
+        StabilityScene(
+            f"box, {cone}",
+            _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3),
+            "box",
+            start,
+            lambda _: [MASS],
+            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
+        )
+        for cone in ("pyramidal", "elliptic")
+    ]
+
+
+def _chain() -> StabilityScene:
+    count, length = 3, 0.3
+    inner = ""
+    for i in reversed(range(count)):
+        inner = f"""<body pos="{0 if i == 0 else length} 0 0">
+          <joint type="hinge" axis="0 1 0" limited="true" range="-0.5 0.5"/>
+          <geom type="capsule" fromto="0 0 0 {length} 0 0" size="0.02" contype="0" conaffinity="0"/>{inner}</body>"""
+
+    def start(point: Point) -> State:
+        rate = point["speed"] / length
+        last = 0.5 + point["depth"] * 0.1 if point["depth"] > 0 else 0.5 - FLIGHT * rate * point["timestep"]
+        return np.array([0.1, 0.1, last]), np.array([0.0, 0.0, rate])
+
+    def masses(ratio: float) -> list[float]:
+        powers = ratio ** (np.arange(count) / (count - 1))
+        return list(MASS * powers / powers.min())
+
+    mjcf = _mjcf("chain", inner, gravity=GRAVITY)
+    return StabilityScene("chain", mjcf, "chain", start, masses, (0.3, 0.5, 1.0), depth_unit=0.1, has_limits=True)
