@@ -28,7 +28,7 @@ def captions(outcome: Outcome) -> dict[str, str]:
 def _caption(one: SceneOutcome, outcome: Outcome) -> str:
     return (
         f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all that "
-        f"is not on an axis is MuJoCo's default. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within {BOUNCE:g} of "
-        f"its restitution; energy is gained beyond {GAIN:.0%}. Gradients are judged by central differences in float64; where the "
-        "motion diverges there is none."
+        f"is not on an axis is MuJoCo's default. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within {BOUNCE:g} "
+        f"of its restitution; energy is gained beyond {GAIN:.0%}. Gradients are judged by central differences in float64; where "
+        "the motion diverges there is none."
     )
