@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.billiards.settings import BilliardsSettings
 from experiments.bounce.settings import BounceSettings
@@ -42,6 +43,9 @@ class Experiment:
 
 
 EXPERIMENTS = {
+    "artificial_discontinuity": Experiment(
+        ArtificialDiscontinuitySettings, "experiments.artificial_discontinuity.run:run"
+    ),
     "billiards": Experiment(BilliardsSettings, "experiments.billiards.run:run"),
     "cube_toss": Experiment(CubeTossSettings, "experiments.cube_toss.run:run"),
     "optimisation": Experiment(OptimisationSettings, "experiments.optimisation.run:run"),

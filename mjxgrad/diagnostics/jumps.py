@@ -169,4 +169,4 @@ def _changes(values: np.ndarray) -> np.ndarray:
 
 
 def _norm(values: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(values.reshape(len(values), -1), axis=1)
+    return np.sqrt((values**2).sum(axis=tuple(range(1, values.ndim))))

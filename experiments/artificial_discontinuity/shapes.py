@@ -1,0 +1,108 @@
+"""Bodies of about the same extent, built of different geoms, over a fixed cube."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+import mjxgrad as mg
+
+HALF = 0.1  # m, of every body and of the cube
+_BALL = 0.02  # m, radius of rounded parts: four times the depth
+_POINT = 0.001  # m, radius of what stands for a point
+# Of MuJoCo's default contact, 1 / (0.02 s)² and 2 / 0.02 s, which the points of a lattice share.
+_STIFFNESS, _DAMPING = 2500.0, 100.0
+# So little impedance over all points that each is a spring of its own, whatever the others carry; MuJoCo's least is 1e-4.
+_LATTICE_IMPEDANCE, _LEAST_IMPEDANCE = 0.05, 1e-4
+
+_CORNERS = HALF * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+_SCENE = """<mujoco><option gravity="0 0 0" timestep="0.002" tolerance="1e-10"/><default><geom condim="1" mass="0"/></default>
+{asset}<worldbody><geom name="cube" type="box" size=".1 .1 .1"/>
+<body name="body"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia=".00667 .00667 .00667"/>
+{geoms}</body></worldbody></mujoco>"""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A body over the cube; all have the same mass and inertia.
+
+    Attributes:
+        label: for figures and tables.
+        scene: in which it lies over the cube.
+        hull: centres of balls whose convex hull it is, in its frame (m).
+        radius: of these balls (m).
+        is_lattice: whether it is one of those that stand for a pressure field.
+    """
+
+    label: str
+    scene: mg.Scene
+    hull: Float[np.ndarray, "points 3"]
+    radius: float
+    is_lattice: bool = False
+
+    @property
+    def num_rows(self) -> int:
+        """Constraint rows of a step, the measure of its cost."""
+        return self.scene.data._impl.efc_J.shape[0]
+
+
+def shape(name: str) -> Shape:
+    """Build a body.
+
+    Args:
+        name: as in the settings.
+
+    Returns:
+        The body, 0.2 m in extent.
+    """
+    inner = _CORNERS * (HALF - _BALL) / HALF
+    if name == "box":
+        return Shape("box", _scene('<geom type="box" size=".1 .1 .1"/>'), _CORNERS, 0.0)
+    if name == "mesh":
+        vertices = " ".join(f"{x:g}" for x in _CORNERS.ravel())
+        asset = f'<asset><mesh name="cube" vertex="{vertices}"/></asset>'
+        return Shape("box as a mesh", _scene('<geom type="mesh" mesh="cube"/>', asset), _CORNERS, 0.0)
+    if name == "edges":
+        low = inner[inner[:, 2] < 0][[0, 1, 3, 2]]
+        ends = [(*a, *b) for a, b in zip(low, np.roll(low, -1, axis=0), strict=True)]
+        geoms = [f'<geom type="capsule" size="{_BALL}" fromto="{" ".join(f"{x:g}" for x in one)}"/>' for one in ends]
+        return Shape("4 capsules", _scene("".join(geoms)), inner, _BALL)
+    if name == "balls":
+        return Shape("8 balls at corners", _scene("".join(_ball(at, _BALL) for at in inner)), inner, _BALL)
+    if name == "ball":
+        return Shape("one ball", _scene(_ball(np.zeros(3), HALF)), np.zeros((1, 3)), HALF)
+    return Shape("4 × 4 balls", _scene("".join(_ball(at, _BALL) for at in _grid(4, _BALL))), _grid(4, _BALL), _BALL)
+
+
+def lattice(num_along_edge: int) -> Shape:
+    """Build a body that touches by points on its lower face, each with its share of the stiffness.
+
+    It stands for a pressure field: the force is the sum of what its points carry, each in proportion to its depth.
+
+    Args:
+        num_along_edge: points along an edge.
+
+    Returns:
+        The body.
+    """
+    count = num_along_edge**2
+    impedance = max(_LATTICE_IMPEDANCE / count, _LEAST_IMPEDANCE)
+    contact = f'solref="{-_STIFFNESS / count} {-_DAMPING / count}" solimp="{impedance} {impedance} .001" priority="1"'
+    points = _grid(num_along_edge, _POINT)
+    scene = _scene("".join(_ball(at, _POINT, contact) for at in points))
+    return Shape(f"{num_along_edge} × {num_along_edge} points", scene, points, _POINT, is_lattice=True)
+
+
+def _grid(num_along_edge: int, radius: float) -> Float[np.ndarray, "points 3"]:
+    """Return balls in the middles of equal squares of the lower face, flush with it."""
+    middles = HALF * (2 * (np.arange(num_along_edge) + 0.5) / num_along_edge - 1)
+    return np.array([(x, y, radius - HALF) for x in middles for y in middles])
+
+
+def _ball(at: np.ndarray, radius: float, contact: str = "") -> str:
+    return f'<geom size="{radius}" pos="{at[0]:.10g} {at[1]:.10g} {at[2]:.10g}" {contact}/>'
+
+
+def _scene(geoms: str, asset: str = "") -> mg.Scene:
+    return mg.load_scene(_SCENE.format(geoms=geoms, asset=asset))

@@ -1,0 +1,240 @@
+"""The answer of an experiment on artificial discontinuities in words, computed from its numbers."""
+
+import numpy as np
+
+from experiments.artificial_discontinuity.outcome import ARTIFICIAL, ONSET, REAL, TURN, WAYS, Outcome, largest, worst
+from experiments.report import Table, quantity
+
+# Standard errors from which a bias is beyond chance, of some dozens of estimates.
+_FAR = 4.0
+_SMALL = 1e-4
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say which bodies jump, and what to build contact of.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        A few sentences.
+    """
+    threshold = outcome.settings.threshold
+    bodies = [name for name in outcome.shapes if not outcome.of(name)[0].is_lattice]
+    most = {name: max(one.geometric for one in outcome.of(name)) for name in bodies}
+    plain = {name: max(one.worst for one in outcome.of(name)) for name in bodies}
+    smooth = [name for name in bodies if most[name] <= threshold]
+    rough = [f"{name} ({most[name]:.0%})" for name in bodies if most[name] > threshold]
+    sentences = []
+    if rough:
+        sentences.append(f"By its geometry alone the force jumps by more than {threshold:.0%} with {_listed(rough)}.")
+    if smooth:
+        best = min(smooth, key=lambda name: (outcome.of(name)[0].num_rows, most[name]))
+        sentences.append(
+            f"It does not with {_listed(smooth)}: to differentiate through contact build it of these; the fewest rows, "
+            f"{outcome.of(best)[0].num_rows}, has {best}."
+        )
+        if worse := [f"{name} ({plain[name]:.0%})" for name in smooth if plain[name] > threshold]:
+            sentences.append(
+                f"Under MuJoCo's default contact, whose force begins with a jump, {_listed(worse)} jump all the same where one "
+                "more part touches: let the impedance rise from zero (the first number of solimp)."
+            )
+    else:
+        sentences.append(f"None of the bodies is without; the least has {min(bodies, key=lambda name: most[name])}.")
+    kinds = [one.kind for one in outcome.judged if one.relative > threshold]
+    if kinds:
+        counts = [f"{kinds.count(kind)} {kind}" for kind in (REAL, TURN, ARTIFICIAL, ONSET) if kind in kinds]
+        sentences.append(
+            f"Of the box's {len(kinds)} such jumps, held against the gradient of the overlap volume: {_listed(counts)}."
+        )
+    return " ".join(sentences)
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Single findings, one sentence each.
+
+    Args:
+        outcome: the numbers.
+
+    Returns:
+        The sentences that the numbers support.
+    """
+    return [
+        sentence
+        for sentence in (
+            _lattices(outcome),
+            _biases(outcome),
+            _smoothing(outcome),
+            _same_in_c(outcome),
+            *_mating(outcome),
+            _friction(outcome),
+        )
+        if sentence
+    ]
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate jumps by body and path, the box's jumps one by one, and the estimates across them."""
+    return [_by_body(outcome), _by_jump(outcome), _by_estimate(outcome)]
+
+
+def _lattices(outcome: Outcome) -> str:
+    parts = []
+    for name, path in outcome.paths.items():
+        power, error = outcome.rate(name)
+        if np.isfinite(power):
+            parts.append(f"{path.title} {quantity(power, error)}")
+    if not parts:
+        return ""
+    return (
+        f"With ever more points the largest jump of a pressure field's stand-in falls as a power of their number along an edge: "
+        f"{_listed(parts)}."
+    )
+
+
+def _biases(outcome: Outcome) -> str:
+    jumping = [one for one in outcome.slopes if abs(one.jump) > abs(one.bias[0]) / 2 and one.deviation[0] > _FAR]
+    biased = [sum(one.deviation[way] > _FAR for one in outcome.slopes) for way in range(3)]
+    counts = _listed([f"{count} with {way}" for count, way in zip(biased, WAYS, strict=True)])
+    sentence = f"Beyond chance off the slope of the mean push: of {len(outcome.slopes)} estimates each, {counts}."
+    if not jumping:
+        return sentence
+    rest = [abs(one.bias[0] + one.jump) / abs(one.bias[0]) for one in jumping]
+    return (
+        f"{sentence} Where the push itself jumps ({len(jumping)} of them), the jump times the density of the noise makes up the "
+        f"discrete gradient's bias to {np.median(rest):.0%} in the median."
+    )
+
+
+def _smoothing(outcome: Outcome) -> str:
+    pairs = [(one.worst, worst(one.smoothed)) for one in outcome.statics if one.smoothed is not None]
+    before, after = np.array(pairs).T
+    threshold = outcome.settings.threshold
+    had = before > threshold
+    new = (~had & (after > threshold)).sum()
+    sentence = (
+        f"Smoothing by {1e3 * outcome.settings.smoothing:g} mm takes the jump below {threshold:.0%} at "
+        f"{(had & (after <= threshold)).sum()} of {had.sum()} bodies and paths that had one"
+    )
+    if new:
+        sentence += (
+            f", and makes one at {new} that had none: beyond the surface of a box MJX knows no distance, so that force at a "
+            "distance ends there"
+        )
+    return f"{sentence}."
+
+
+def _same_in_c(outcome: Outcome) -> str:
+    pairs = [(one.worst, worst(one.c_mujoco)) for one in outcome.statics]
+    threshold = outcome.settings.threshold
+    both = sum((a > threshold) == (b > threshold) for a, b in pairs)
+    sentence = f"C MuJoCo and MJX agree on whether a body jumps along a path in {both} of {len(pairs)} cases."
+    own = [one for one in outcome.statics if len(one.plain.places) > len(one.c_mujoco.places)]
+    if own:
+        copies = sum(bool(one.copies.max()) for one in own)
+        sentence += (
+            f" MJX has jumps that C has not at {len(own)}, some of them small; at {copies} of these it repeats contact points to "
+            "fill their number, which weighs some corners twice or three times."
+        )
+    return sentence
+
+
+def _mating(outcome: Outcome) -> list[str]:
+    found = []
+    for one in outcome.matings:
+        edge = f"{largest(one.depth) * 1e3:.2g} mm" if len(one.depth.places) else "nothing"
+        found.append(
+            f"Mating with {one.label}: {len(one.force.places)} jumps in the force on the held peg, the largest "
+            f"{worst(one.force):.0%} of it; the depth reached jumps at {len(one.depth.places)} offsets, by {edge} at most. There the slope under noise is "
+            f"{quantity(one.slopes.reference, one.slopes.reference_error)}, and first order says "
+            f"{quantity(one.slopes.estimates[0], one.slopes.errors[0])} (discrete), "
+            f"{quantity(one.slopes.estimates[1], one.slopes.errors[1])} (event), zeroth order "
+            f"{quantity(one.slopes.estimates[2], one.slopes.errors[2])}."
+        )
+    return found
+
+
+def _friction(outcome: Outcome) -> str:
+    jumps = outcome.friction
+    kind = f"jumps by {worst(jumps):.0%} at standstill" if len(jumps.places) else "has no jump left"
+    width = 2 * jumps.scale / jumps.steepest if jumps.steepest else np.nan
+    return (
+        f"Stick or slip, which is real, is no jump here: friction against sliding speed {kind}; the soft constraint turns it "
+        f"over {quantity(1e3 * width)} mm/s."
+    )
+
+
+def _by_body(outcome: Outcome) -> Table:
+    rows, emphasised = [], set()
+    for name in outcome.shapes:
+        statics = outcome.of(name)
+        cells = []
+        for i, one in enumerate(statics):
+            others = [one.gentle, one.smoothed, one.c_mujoco]
+            cells.append(
+                ", ".join([_percent(one.worst), *(_percent(worst(other)) for other in others if other is not None)])
+            )
+            if one.worst > outcome.settings.threshold:
+                emphasised.add((len(rows), 2 + i))
+        rows.append([name, str(statics[0].num_rows), *cells])
+    return Table(
+        ("body", "rows", *(path.title for path in outcome.paths.values())),
+        rows,
+        "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently, under "
+        "the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold beyond the "
+        "threshold.",
+        frozenset(emphasised),
+    )
+
+
+def _by_jump(outcome: Outcome) -> Table:
+    rows = [
+        [
+            outcome.paths[one.path].title,
+            f"{one.place:.4f} {outcome.paths[one.path].unit}".replace("-", "−"),
+            f"{one.from_contacts} → {one.to_contacts}",
+            _percent(one.relative),
+            _percent(one.reference_jump),
+            _percent(one.reference_change),
+            one.kind,
+        ]
+        for one in outcome.judged
+        if one.relative > _SMALL
+    ]
+    return Table(
+        ("path", "at", "contacts", "jump over force", "reference jumps by", "changes nearby by", "which is"),
+        rows,
+        "Every jump of the box. The reference is the gradient of the overlap volume; nearby is one penetration depth to each "
+        "side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The onset "
+        "of a contact is no jump where contact begins gently.",
+    )
+
+
+def _by_estimate(outcome: Outcome) -> Table:
+    rows, emphasised = [], set()
+    for one in outcome.slopes:
+        emphasised |= {(len(rows), 4 + int(way)) for way in np.flatnonzero(one.deviation > _FAR)}
+        rows.append(
+            [
+                one.shape,
+                outcome.paths[one.path].title,
+                quantity(one.jump),
+                quantity(one.reference, one.reference_error),
+                *(quantity(value, error) for value, error in zip(one.estimates, one.errors, strict=True)),
+            ]
+        )
+    return Table(
+        ("body", "path", "jumps × density", "slope", *WAYS),
+        rows,
+        f"Slope of the mean push by the start, from {outcome.settings.sizes.num_samples} rollouts each. In bold what is more "
+        f"than {_FAR:g} standard errors off.",
+        frozenset(emphasised),
+    )
+
+
+def _percent(share: float) -> str:
+    return "none" if share < _SMALL else f"{share:.3g}" if share >= 10 else f"{100 * share:.2g}%"
+
+
+def _listed(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
