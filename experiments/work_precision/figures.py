@@ -10,7 +10,8 @@ from matplotlib.lines import Line2D
 
 from experiments.report import Figure
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
-from experiments.work_precision.outcome import MG, MJX, C, Course, Estimate, Outcome, Point, pareto_front
+from experiments.work_precision.front import pareto_front
+from experiments.work_precision.outcome import MG, MJX, C, Course, Estimate, Outcome, Point
 
 _COLOURS = {MG: ZEROTH, MJX: FIRST, C: "#009e73"}
 _MARKERS = {"Euler": "o", "implicitfast": "s", "RK4": "^"}

@@ -1,12 +1,12 @@
 """The numbers of an experiment on error against run time, and what follows from them."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from experiments.work_precision.front import pareto_front
 from experiments.work_precision.settings import WorkPrecisionSettings
 
 C = "C MuJoCo"
@@ -241,86 +241,6 @@ class Outcome:
                     rows.append({"scene": course.name, "of": kind, **_flat(one), "on_front": bool(is_best)})
         names = list(dict.fromkeys(name for row in rows for name in row))
         return [{name: row.get(name, "") for name in names} for row in rows]
-
-
-def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> Bool[np.ndarray, " points"]:
-    """Say which points no other beats in cost and error at once.
-
-    Args:
-        costs: of the points.
-        errors: of the points; what is not finite is on no front.
-
-    Returns:
-        One truth value per point. Of equal points all are on the front.
-    """
-    cost, error = np.asarray(costs, float), np.asarray(errors, float)
-    is_beaten = np.zeros(len(cost), bool)
-    for at in range(len(cost)):
-        no_worse = (cost <= cost[at]) & (error <= error[at])
-        is_beaten[at] = (no_worse & ((cost < cost[at]) | (error < error[at]))).any()
-    return ~is_beaten & np.isfinite(error) & np.isfinite(cost)
-
-
-def fastest(points: Iterable[Point], target: float) -> Point | None:
-    """Give the fastest point from which on its line stays below an error; None if there is none.
-
-    One coarse point that is right by luck, between finer ones that are not, does not count.
-
-    Args:
-        points: of one scene.
-        target: error.
-
-    Returns:
-        The point.
-    """
-    lines: dict[tuple[Any, ...], list[Point]] = {}
-    for point in points:
-        lines.setdefault(point.line, []).append(point)
-    found = []
-    for line in lines.values():
-        for point in sorted(line, key=lambda one: one.knob):
-            if not point.error <= target:
-                break
-            found.append(point)
-    return min(found, key=lambda one: one.cost, default=None)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What to take for a gradient.
-
-    Attributes:
-        estimate: the way.
-        num_samples: that it needs.
-        seconds: that one estimate then takes.
-    """
-
-    estimate: Estimate
-    num_samples: float
-    seconds: float
-
-
-def cheapest(estimates: Iterable[Estimate], target: float) -> Choice | None:
-    """Give the estimate that reaches an error in the least time, its samples made as many as that takes.
-
-    Args:
-        estimates: of one scene; of those that differ in the number of samples alone the largest speaks, for it knows its
-            bias best.
-        target: error.
-
-    Returns:
-        The choice; None if every bias is beyond the target.
-    """
-    largest: dict[tuple[Any, ...], Estimate] = {}
-    for one in sorted(estimates, key=lambda one: one.num_samples):
-        largest[one.line] = one
-    choices = []
-    for one in largest.values():
-        count = one.samples_for(target)
-        # A bias is not known better than this: what chance could hide of it has to fit as well.
-        if np.isfinite(count) and one.bias_error <= target:
-            choices.append(Choice(one, count, one.cost * count / one.num_samples))
-    return min(choices, key=lambda one: one.seconds, default=None)
 
 
 def relative_errors(

@@ -39,7 +39,8 @@ CONES: dict[Cone, mujoco.mjtCone] = {
     "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
 }
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
-_ITERATIONS = 100
+# Of the solver, enough to converge.
+NUM_ITERATIONS = 100
 _AT_A_TIME = 2
 
 
@@ -182,7 +183,7 @@ def c_model(case: Case, integrator: Integrator, cone: Cone) -> mujoco.MjModel:
     """
     model = copy.deepcopy(case.model)
     model.opt.integrator, model.opt.cone = INTEGRATORS[integrator], CONES[cone]
-    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, _ITERATIONS
+    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, NUM_ITERATIONS
     return model
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from experiments.work_precision.native import differences, simulate
 from experiments.work_precision.outcome import MG, MJX, C, Point, Reference, relative_errors, rms
 from experiments.work_precision.programs import (
     CONES,
+    NUM_ITERATIONS,
     Cone,
     Ends,
     Integrator,
@@ -26,7 +27,7 @@ from experiments.work_precision.settings import WorkPrecisionSettings
 
 # The classical rule for references: where nothing switches it is exact to rounding, elsewhere all rules are of first order.
 # C MuJoCo affords more steps.
-_FINEST = {(C, "RK4"): 128, (MG, "RK4"): 32, (MG, "Euler"): 64}
+_FINEST = {(C, "RK4"): 64, (MG, "RK4"): 32, (MG, "Euler"): 64}
 # Ends closer than this after the same steps are of the same motion; so are those ten times closer than the reference is known.
 _SAME_MOTION = 1e-6
 _REFERENCE_TOLERANCE = 1e-12
@@ -155,14 +156,23 @@ def _of_program(
     for knobs in _knobs(case, settings, with_tolerances=is_main, is_single=variant.precision == "float32"):
         program.run(qvel, knobs)
         ends, seconds = timed(lambda at=knobs: program.run(qvel, at), repeats=sizes.repeats, seconds=sizes.seconds)
+        errors = truth.errors(case, ends)
         points.append(
             Point(
-                _NAMES[variant.library], variant.integrator, variant.cone, variant.precision, knobs.timestep,
-                knobs.tolerance, int(program.model.opt.iterations), variant.batch, *truth.errors(case, ends),
-                tuple(taken / (variant.batch * case.duration) for taken in seconds),
-                program.trace_seconds + program.compile_seconds,
+                library=_NAMES[variant.library],
+                integrator=variant.integrator,
+                cone=variant.cone,
+                precision=variant.precision,
+                timestep=knobs.timestep,
+                tolerance=knobs.tolerance,
+                iterations=NUM_ITERATIONS,
+                batch=variant.batch,
+                position_error=errors[0],
+                velocity_error=errors[1],
+                seconds=tuple(taken / (variant.batch * case.duration) for taken in seconds),
+                compile_seconds=program.trace_seconds + program.compile_seconds,
             )
-        )  # fmt: skip
+        )
     return points
 
 
@@ -172,31 +182,52 @@ def _of_c(
     right: dict[tuple[str, Cone], Truth],
     settings: WorkPrecisionSettings,
 ) -> list[Point]:
-    ways: list[tuple[Integrator, Cone, int, int | None, list[Knobs]]] = []
     plain, varied = (_knobs(case, settings, with_tolerances=flag, is_single=False) for flag in (False, True))
     cones: list[Cone] = [name for name in CONES if (C, name) in right]
-    for cone in cones:
-        ways += [("implicitfast", cone, len(qvel), None, plain), ("RK4", cone, len(qvel), None, plain)]
-        ways += [("Euler", cone, len(qvel), None, varied)]
-    own = own_cone(case)
-    ways += [("Euler", own, len(qvel), count, plain) for count in _FEW_ITERATIONS]
-    ways += [("Euler", own, 1, None, plain)]
     points = []
-    for integrator, cone, batch, iterations, all_knobs in ways:
-        for knobs in all_knobs:
-            runs = [
-                simulate(
-                    case, qvel[:batch], knobs, integrator=integrator, cone=cone, iterations=iterations,
-                    threads=settings.threads if batch > 1 else 1,
-                )
-                for _ in range(_REPEATS_OF_C)
-            ]  # fmt: skip
-            points.append(
-                Point(
-                    C, integrator, cone, "float64", knobs.timestep, knobs.tolerance, iterations or 100, batch,
-                    *right[C, cone].errors(case, runs[0][0]), tuple(taken / (batch * case.duration) for _, taken in runs),
-                )
-            )  # fmt: skip
+    for cone in cones:
+        find = functools.partial(_c_points, case, qvel, right[C, cone], settings, cone=cone)
+        points += [*find(plain, integrator="implicitfast"), *find(plain, integrator="RK4"), *find(varied)]
+        if cone == own_cone(case):
+            points += [point for count in _FEW_ITERATIONS for point in find(plain, iterations=count)]
+            points += _c_points(case, qvel[:1], right[C, cone], settings, plain, cone=cone)
+    return points
+
+
+def _c_points(
+    case: Case,
+    qvel: Float[np.ndarray, "batch nv"],
+    truth: Truth,
+    settings: WorkPrecisionSettings,
+    every: Sequence[Knobs],
+    *,
+    cone: Cone,
+    integrator: Integrator = "Euler",
+    iterations: int | None = None,
+) -> list[Point]:
+    threads, simulated = (settings.threads if len(qvel) > 1 else 1), len(qvel) * case.duration
+    points = []
+    for knobs in every:
+        runs = [
+            simulate(case, qvel, knobs, integrator=integrator, cone=cone, iterations=iterations, threads=threads)
+            for _ in range(_REPEATS_OF_C)
+        ]
+        errors = truth.errors(case, runs[0][0])
+        points.append(
+            Point(
+                library=C,
+                integrator=integrator,
+                cone=cone,
+                precision="float64",
+                timestep=knobs.timestep,
+                tolerance=knobs.tolerance,
+                iterations=iterations or NUM_ITERATIONS,
+                batch=len(qvel),
+                position_error=errors[0],
+                velocity_error=errors[1],
+                seconds=tuple(taken / simulated for _, taken in runs),
+            )
+        )
     return points
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from experiments.report import Table
-from experiments.work_precision.outcome import MG, MJX, C, Choice, Course, Outcome, Point, cheapest, fastest
+from experiments.work_precision.choice import Choice, cheapest, fastest
+from experiments.work_precision.outcome import MG, MJX, C, Course, Outcome, Point
 
 
 def verdict(outcome: Outcome) -> str:
@@ -117,9 +118,10 @@ def batches(outcome: Outcome) -> Table:
     caption = (
         "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
         f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). The figures "
-        "are about batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a time. Then "
-        "how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference gradient: standard "
-        "error, change with the last halving of the step, distance to the same gradient by differences of smoothed outcomes."
+        "are about batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a "
+        "time. Then how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference "
+        "gradient: standard error, change with the last halving of the step, distance to the same gradient by differences of "
+        "smoothed outcomes."
     )
     return Table(columns, rows, caption)
 

@@ -1,0 +1,199 @@
+"""What the experiment on error against run time is built of; a small run from its file to its folder is slow."""
+
+import csv
+import json
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import mjxgrad as mg
+from experiments.__main__ import main
+from experiments.config import load_runs
+from experiments.failure import ConfigurationError
+from experiments.work_precision import native
+from experiments.work_precision.cases import case
+from experiments.work_precision.choice import cheapest, fastest
+from experiments.work_precision.front import pareto_front
+from experiments.work_precision.gradient import Recorded, quasi_random, smoothed_gradient
+from experiments.work_precision.measure import variants
+from experiments.work_precision.outcome import Estimate, Point, relative_errors
+from experiments.work_precision.programs import Knobs, softened
+from experiments.work_precision.settings import SIZES, WorkPrecisionSettings
+
+STDDEV = 0.3
+
+
+def point(timestep, error, cost):
+    return Point(
+        "mg.step", "Euler", "pyramidal", "float64", timestep, 1e-8, 100, 64, error, error / 2, (cost, cost, cost)
+    )  # fmt: skip
+
+
+def estimate(name, bias, variance, cost, num_samples=100):
+    return Estimate(
+        name, num_samples, 0.002, 1.0, np.hypot(bias, variance**0.5), (0, 0), bias, 0.0, variance, (cost,), 0.0
+    )
+
+
+def test_the_front_holds_what_no_other_beats_in_both():
+    costs, errors = [1.0, 2.0, 3.0, 2.0, 4.0], [0.5, 0.2, 0.3, 0.2, np.inf]
+    # The third costs more than the second and errs more; the last is no number; equal ones both stand.
+    assert pareto_front(costs, errors).tolist() == [True, True, False, True, False]
+
+
+def test_a_coarse_step_that_is_right_by_luck_is_not_recommended():
+    found = [point(1e-3, 0.01, 4.0), point(2e-3, 0.04, 2.0), point(4e-3, 0.2, 1.0), point(8e-3, 0.03, 0.5)]
+    chosen = fastest(found, 0.05)
+    assert chosen is not None
+    assert chosen.timestep == 2e-3
+
+
+def test_a_diverged_state_makes_the_error_infinite():
+    lost = np.array([[0.1, 0.0], [np.nan, 0.0]])
+    errors = relative_errors(lost, lost, (1.0, 1.0))
+    assert Point("mg.step", "Euler", "pyramidal", "float64", 1e-3, 1e-8, 100, 2, *errors, (1.0,)).error == np.inf
+
+
+def test_an_estimate_needs_its_variance_over_what_bias_leaves_of_the_target():
+    # Target² = bias² + V/N: 0.05² − 0.03² = 0.04², so N = 0.64/0.0016 = 400 with V = 0.64 per sample.
+    assert estimate("first order", 0.03, 0.64 / 100, 1.0).samples_for(0.05) == pytest.approx(400, abs=1)
+    assert estimate("first order", 0.06, 0.64 / 100, 1.0).samples_for(0.05) == np.inf
+
+
+def test_the_cheapest_gradient_is_the_one_whose_rollouts_take_least_time_together():
+    few_dear = estimate("first order, event", 0.0, 0.01 / 100, 4.0)  # 4 samples suffice: 0.16 s
+    many_cheap = estimate("zeroth order", 0.0, 4.0 / 100, 1.0)  # 1600 samples: 16 s
+    biased = estimate("first order, discrete", 0.2, 0.0, 0.1)
+    choice = cheapest([many_cheap, few_dear, biased], 0.05)
+    assert choice is not None
+    assert choice.estimate is few_dear
+    assert choice.seconds == pytest.approx(4.0 * 4 / 100)
+
+
+def test_the_smoothed_gradient_is_exact_where_the_cost_is_linear():
+    noise = STDDEV * quasi_random(64, 2, 0)
+    value, _ = smoothed_gradient(3.0 + noise @ np.array([1.5, -2.0]), noise, STDDEV)
+    assert value == pytest.approx([1.5, -2.0], abs=1e-12)
+
+
+def test_the_smoothed_gradient_sees_a_jump():
+    """A Heaviside step at 0.1 in the first parameter: its smoothed slope is the density there, and none in the second."""
+    noise = STDDEV * quasi_random(4096, 2, 1)
+    value, error = smoothed_gradient((noise[:, 0] > 0.1).astype(float), noise, STDDEV)
+    exact = np.array([norm.pdf(0.1, scale=STDDEV), 0.0])
+    # Eight scrambles give the error bar: five of them, for Student's t with seven degrees of freedom has wide tails.
+    assert (np.abs(value - exact) < 5 * error).all()
+    assert (error < 0.02 * exact[0]).all()
+
+
+def test_estimators_take_records_for_rollouts(key):
+    """Drawn with replacement, the derivatives of a record average to their mean, and so does zeroth order to the slope."""
+    noise = jnp.asarray(STDDEV * quasi_random(512, 2, 2))
+    costs = jnp.exp(noise[:, 0]) - 0.5 * noise[:, 1]
+    gradients = jnp.stack([jnp.exp(noise[:, 0]), jnp.full(512, -0.5)], axis=1)
+    records = Recorded(costs=costs, gradients=gradients, noise=noise, stddev=jnp.full(2, STDDEV), dim=2)
+    # The mean of exp(w) is exp(σ²/2), of which it is the derivative, too.
+    exact = np.array([np.exp(STDDEV**2 / 2), -0.5])
+    for name in ("first_order", "zeroth_order", "alpha_order"):
+        found = jax.jit(lambda k, name=name: getattr(mg.estimators, name)(records, jnp.zeros(2), k, num_samples=256))(
+            key
+        )
+        # Four standard errors of the estimate, and the records' own distance from their density, below 1e-3.
+        assert (np.abs(found.value - exact) < 4 * np.asarray(found.standard_error) + 1e-3).all(), name
+        assert int(found.num_rollouts) == 256
+
+
+def test_softening_multiplies_time_constants_in_both_formats():
+    model = mg.load_scene(case("push").model).model
+    ball = mg.load_scene(case("bounce").model).model
+    assert np.asarray(softened(model, 2.0).pair_solref)[0] == pytest.approx([-1e5 / 4, 0.0])
+    assert np.asarray(softened(ball, 2.0).geom_solref)[0] == pytest.approx([0.04, 1.0])
+
+
+def test_the_threaded_rollout_ends_where_single_steps_do():
+    one = case("arm")
+    qvel = one.start[1] + np.array([[0.0], [0.2]]) @ one.directions[:1]
+    ends, seconds = native.simulate(one, qvel, Knobs(0.004, 1e-10), integrator="implicitfast", threads=2)
+    model = one.model
+    model.opt.integrator, model.opt.tolerance = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-10
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = one.start[0], qvel[1], one.controls
+    mujoco.mj_step(model, data, 100)
+    assert ends[0][1] == pytest.approx(data.qpos, abs=1e-10)
+    assert ends[1][1] == pytest.approx(data.qvel, abs=1e-9)
+    assert seconds > 0
+
+
+def test_distances_of_free_bodies_are_metres_and_radians():
+    model = case("bounce").model
+    here = np.array([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
+    turned = np.array([[0.3, 0.0, 0.1, np.cos(0.2), 0.0, 0.0, np.sin(0.2)]])
+    still = np.zeros((1, 6))
+    found = native.differences(model, (here, still), (turned, still))
+    assert found[0] == pytest.approx([0.3, 0, 0, 0, 0, 0.4], abs=1e-12)
+
+
+def test_only_what_makes_a_difference_is_compiled():
+    settings = WorkPrecisionSettings(experiment="work_precision")
+    compiled = {name: variants(case(name), settings) for name in ("pendulum", "push", "bounce", "arm")}
+    assert all(len(found) == len(set(found)) for found in compiled.values())
+    assert [v.derivative for v in compiled["pendulum"] if v.derivative] == ["discrete"]  # no contact, no event
+    assert {v.cone for v in compiled["push"]} == {"pyramidal"}  # no friction, no cone
+    assert {v.cone for v in compiled["bounce"]} == {"pyramidal", "elliptic"}
+    implicit = {name for name, found in compiled.items() if any(v.integrator == "implicitfast" for v in found)}
+    assert implicit == {"arm"}  # its servos damp; elsewhere Euler's implicit damping is all there is
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_time_step_divides_every_motion(size):
+    for name in SIZES[size].scenes:
+        one = case(name)
+        for refinement in (*SIZES[size].refinements, *SIZES[size].gradient_refinements):
+            steps = one.duration * refinement / one.model.opt.timestep
+            assert steps == pytest.approx(round(steps), abs=1e-9), (name, refinement)
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ('precision="float32"', "precision must be float64"),
+        ('scenes=["bounce", "bounce"]', "scenes must not repeat"),
+        ("scenes=[]", "scenes must name at least one scene"),
+        ('size="huge"', "size"),
+        ("targets=[2.0]", "targets"),
+    ],
+)
+def test_settings_that_cannot_be_are_a_sentence(override, sentence):
+    with pytest.raises(ConfigurationError, match=sentence):
+        load_runs("work_precision", [override])
+
+
+@pytest.mark.slow
+def test_a_run_leaves_its_diagrams_its_table_and_a_recommendation(tmp_path):
+    settings = ["size='quick'", "scenes=['bounce']"]
+    assert main(["run", "work_precision", *settings, "--output", str(tmp_path)]) == 0
+    folder = tmp_path / "work_precision"
+    assert sorted(path.stem for path in (folder / "figures").iterdir()) == ["gradient_bounce", "motion_bounce"]
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    of_motion = [row for row in rows if row["of"] == "motion"]
+    # Both MJX and mg.step find the same motion, whatever it costs.
+    by_library = {
+        library: {row["timestep"]: float(row["error"]) for row in of_motion if _is_plain(row, library)}
+        for library in ("mg.step", "mjx.step", "C MuJoCo")
+    }
+    assert by_library["mg.step"] == pytest.approx(by_library["mjx.step"], rel=1e-5)
+    assert by_library["mg.step"] == pytest.approx(by_library["C MuJoCo"], rel=1e-5)
+    verdict = json.loads((folder / "summary.json").read_text())["verdict"]
+    assert "For 5 % error of the motion mg.step takes" in verdict
+    assert "for 5 % take mg.step" in (folder / "report.html").read_text()
+
+
+def _is_plain(row, library):
+    is_euler = (row["library"], row["integrator"], row["cone"]) == (library, "Euler", "pyramidal")
+    is_tight = (row["precision"], row["tolerance"], row["iterations"]) == ("float64", "1e-08", "100")
+    return is_euler and is_tight and row["batch"] == "32"
