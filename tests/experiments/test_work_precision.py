@@ -90,21 +90,28 @@ def test_the_smoothed_gradient_sees_a_jump():
     assert (error < 0.02 * exact[0]).all()
 
 
-def test_estimators_take_records_for_rollouts(key):
-    """Drawn with replacement, the derivatives of a record average to their mean, and so does zeroth order to the slope."""
+@pytest.fixture(scope="module")
+def records():
+    """f(w) = exp(w₁) − w₂/2, whose mean has the gradient (exp(σ²/2), −1/2)."""
     noise = jnp.asarray(STDDEV * quasi_random(512, 2, 2))
     costs = jnp.exp(noise[:, 0]) - 0.5 * noise[:, 1]
     gradients = jnp.stack([jnp.exp(noise[:, 0]), jnp.full(512, -0.5)], axis=1)
-    records = Recorded(costs=costs, gradients=gradients, noise=noise, stddev=jnp.full(2, STDDEV), dim=2)
-    # The mean of exp(w) is exp(σ²/2), of which it is the derivative, too.
+    return Recorded(costs=costs, gradients=gradients, noise=noise, stddev=jnp.full(2, STDDEV), dim=2)
+
+
+@pytest.mark.parametrize("name", ["first_order", "zeroth_order"])
+def test_estimators_take_records_for_rollouts(records, key, name):
+    found = jax.jit(lambda k: getattr(mg.estimators, name)(records, jnp.zeros(2), k, num_samples=256))(key)
     exact = np.array([np.exp(STDDEV**2 / 2), -0.5])
-    for name in ("first_order", "zeroth_order", "alpha_order"):
-        found = jax.jit(lambda k, name=name: getattr(mg.estimators, name)(records, jnp.zeros(2), k, num_samples=256))(
-            key
-        )
-        # Four standard errors of the estimate, and the records' own distance from their density, below 1e-3.
-        assert (np.abs(found.value - exact) < 4 * np.asarray(found.standard_error) + 1e-3).all(), name
-        assert int(found.num_rollouts) == 256
+    # Four standard errors of the estimate, and the records' own distance from their density, below 1e-3.
+    assert (np.abs(found.value - exact) < 4 * np.asarray(found.standard_error) + 1e-3).all()
+
+
+def test_a_record_is_differentiated_as_it_was_written(records):
+    found = records.differentiate(jnp.zeros(2), jnp.int32(7))
+    assert found.gradient_by_noise == pytest.approx(np.asarray(records.gradients[7]))
+    assert found.noise_score == pytest.approx(np.asarray(records.noise[7]) / STDDEV**2)
+    assert found.cost == records.costs[7]
 
 
 def test_softening_multiplies_time_constants_in_both_formats():
