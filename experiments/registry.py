@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.ablation.settings import AblationSettings
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.billiards.settings import BilliardsSettings
 from experiments.bounce.settings import BounceSettings
@@ -43,6 +44,7 @@ class Experiment:
 
 
 EXPERIMENTS = {
+    "ablation": Experiment(AblationSettings, "experiments.ablation.run:run"),
     "artificial_discontinuity": Experiment(
         ArtificialDiscontinuitySettings, "experiments.artificial_discontinuity.run:run"
     ),

@@ -1,0 +1,1 @@
+"""What leaving out costs and gains, group by group."""

@@ -1,0 +1,24 @@
+"""What the figure shows and how to read it."""
+
+from experiments.ablation.outcome import Outcome
+
+
+def captions(outcome: Outcome) -> dict[str, str]:
+    """Write the captions.
+
+    Args:
+        outcome: the numbers, for what they were made with.
+
+    Returns:
+        By the figure's name.
+    """
+    sizes = outcome.settings.sizes
+    return {
+        "ratios": (
+            "Each as a share of the same scene with everything; left of the line is cheaper. Dots are medians of "
+            f"{sizes.repeats} turns, bars their quartiles; compilation is timed once, without a cache. Only variants that make "
+            "another program are drawn: all others are the scene with everything, letter for letter. Open dots: motion or "
+            "gradient is another one. "
+            f"{sizes.batch} rollouts of {sizes.horizon} steps, started along recorded motions."
+        )
+    }

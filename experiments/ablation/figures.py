@@ -1,0 +1,77 @@
+"""The pictures of an experiment on leaving out."""
+
+from pathlib import Path
+
+from matplotlib.lines import Line2D
+
+from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
+from experiments.ablation.variants import NEEDED, REACHED
+from experiments.report import Figure
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+
+_TITLES = ("time of a step", "time of a gradient", "operations of a step", "compilation of the gradient")
+
+
+def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
+    """Draw all figures.
+
+    Args:
+        outcome: the numbers.
+        folder: of the run.
+        captions: of the figures, by name: ratios.
+
+    Returns:
+        The figures in order of reading; none if every variant is the same program.
+    """
+    drawn = [(scene, v) for scene in outcome.scenes for v in scene.variants[1:] if not v.is_same_program]
+    if not drawn:
+        return []
+    title = "Cost without, as a share of the cost with everything"
+    return [Figure(save(ratios(drawn), folder, "ratios"), title, captions["ratios"])]
+
+
+def ratios(drawn: list[tuple[SceneOutcome, VariantOutcome]]):
+    """One line per scene and group, one panel per cost."""
+    figure, axes = subplots(1, 4, height=1.7 + 0.27 * len(drawn), sharey=True)
+    for place, (_, variant) in enumerate(drawn):
+        for axis, (middle, low, high) in zip(axes[0], _shares(variant), strict=True):
+            if middle is None:
+                continue
+            fill = _colour(variant) if variant.is_unchanged else "white"
+            axis.plot([low, high], [place, place], color=_colour(variant), lw=2, solid_capstyle="round")
+            axis.plot(middle, place, "o", color=_colour(variant), mfc=fill, ms=6)
+    for axis, title in zip(axes[0], _TITLES, strict=True):
+        axis.axvline(1.0, color=REFERENCE, lw=1)
+        axis.set_title(title)
+        axis.set_xlim(left=0)
+        axis.set_xlabel("share")
+    axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
+    axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
+    handles = [
+        Line2D([], [], color=ZEROTH, marker="o", ls="", label="all that no motion needs"),
+        Line2D([], [], color=FIRST, marker="o", ls="", label="and what recorded motions did not reach"),
+        Line2D([], [], color=MUTED, marker="o", ls="", label="one group"),
+        Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="changes motion or gradient"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
+    return figure
+
+
+def _colour(variant: VariantOutcome) -> str:
+    return {NEEDED: ZEROTH, REACHED: FIRST}.get(variant.name, MUTED)
+
+
+def _shares(variant: VariantOutcome) -> list[tuple[float | None, float | None, float | None]]:
+    operations = variant.step.flops / variant.step.base_flops
+    compilation = None
+    if variant.gradient is not None:
+        compilation = variant.gradient.compile_seconds / variant.gradient.base_compile_seconds
+    counted = (operations, operations, operations), (compilation, compilation, compilation)
+    return [_of(variant.step), _of(variant.gradient), *counted]
+
+
+def _of(cost: Cost | None) -> tuple[float | None, float | None, float | None]:
+    if cost is None:
+        return None, None, None
+    low, middle, high = cost.ratio
+    return middle, low, high

@@ -1,0 +1,180 @@
+"""The numbers of an experiment on leaving out, and what follows from them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.ablation.settings import AblationSettings
+from mjxgrad.diagnostics import OmissionCheck
+
+# Two programs round differently in every operation of every step, the moved start only once.
+_ROUNDING_FACTOR = 100.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One program of one variant, beside the same one of the scene with everything.
+
+    Attributes:
+        seconds: of each run of the batch.
+        base_seconds: of the runs with everything, in the same turns.
+        compile_seconds: to trace and compile.
+        base_compile_seconds: likewise with everything.
+        flops: of the program by XLA's count, a loop's body once.
+        base_flops: likewise with everything.
+        is_same_program: whether the two are the same, letter for letter, before XLA compiles them.
+        difference: largest, of any number that the programs give.
+        rounding: largest that moving the start by a few roundings makes, with everything.
+        scale: largest number that the program gives.
+    """
+
+    seconds: Float[np.ndarray, " repeats"]
+    base_seconds: Float[np.ndarray, " repeats"]
+    compile_seconds: float
+    base_compile_seconds: float
+    flops: float
+    base_flops: float
+    is_same_program: bool
+    difference: float
+    rounding: float
+    scale: float
+
+    @property
+    def ratio(self) -> tuple[float, float, float]:
+        """Time as a share of that with everything: lower quartile, median, upper quartile over turns."""
+        low, middle, high = np.quantile(self.seconds / self.base_seconds, [0.25, 0.5, 0.75])
+        return float(low), float(middle), float(high)
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether every number is the same, bit for bit."""
+        return self.difference == 0.0
+
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether nothing differs by more than rounding makes of it."""
+        return self.difference <= _ROUNDING_FACTOR * max(self.rounding, np.finfo(float).eps * self.scale)
+
+    @property
+    def verdict(self) -> str:
+        """Say in a word or two whether numbers are those with everything."""
+        if self.is_same_program:
+            return "same program"
+        if self.is_equal:
+            return "equal"
+        return "to rounding" if self.is_unchanged else f"differs by {self.difference / self.scale:.1e}"
+
+
+@dataclass(frozen=True)
+class VariantOutcome:
+    """One variant of a scene.
+
+    Attributes:
+        name: of the group that is left out.
+        what: was left out, in a few words.
+        num_pairs: of geoms that are tested for contact.
+        num_rows: of constraints.
+        num_bodies: world included.
+        step: cost of the motion.
+        gradient: cost of its gradient; None if not measured.
+        recorded: what the full model says of the motions from which it was told what is not reached; None where a
+            group alone is left out.
+        others: likewise of other motions of the kind.
+    """
+
+    name: str
+    what: str
+    num_pairs: int
+    num_rows: int
+    num_bodies: int
+    step: Cost
+    gradient: Cost | None
+    recorded: OmissionCheck | None
+    others: OmissionCheck | None
+
+    @property
+    def is_same_program(self) -> bool:
+        """Whether XLA is given what it is given with everything."""
+        return all(cost.is_same_program for cost in (self.step, self.gradient) if cost is not None)
+
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether motion and, where measured, gradient are those with everything."""
+        return all(cost.is_unchanged for cost in (self.step, self.gradient) if cost is not None)
+
+
+@dataclass(frozen=True)
+class SceneOutcome:
+    """All variants of a scene, the one with everything first.
+
+    Attributes:
+        name: of the scene.
+        variants: of it.
+        steps_per_run: that one run of a program takes, over its batch.
+    """
+
+    name: str
+    variants: list[VariantOutcome]
+    steps_per_run: int
+
+    def find(self, name: str) -> VariantOutcome | None:
+        """Give a variant by its name; None if the scene has none."""
+        return next((variant for variant in self.variants if variant.name == name), None)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured.
+
+    Attributes:
+        settings: of the run.
+        scenes: in the order of the settings.
+    """
+
+    settings: AblationSettings
+    scenes: list[SceneOutcome]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per scene and variant, for metrics.csv."""
+        rows = []
+        for scene in self.scenes:
+            for variant in scene.variants:
+                row = {
+                    "scene": scene.name,
+                    "left_out": variant.name,
+                    "what": variant.what,
+                    "pairs": variant.num_pairs,
+                    "rows": variant.num_rows,
+                    "bodies": variant.num_bodies,
+                    "missed_recorded": len(variant.recorded.missed) if variant.recorded else "",
+                    "missed_others": len(variant.others.missed) if variant.others else "",
+                }
+                for word, cost in (("step", variant.step), ("gradient", variant.gradient)):
+                    row |= _cost_row(word, cost, scene.steps_per_run)
+                rows.append(row)
+        return rows
+
+
+def _cost_row(word: str, cost: Cost | None, steps: int) -> dict[str, Any]:
+    if cost is None:
+        return dict.fromkeys((f"{word}_{part}" for part in _PARTS), "")
+    low, middle, high = cost.ratio
+    values = (
+        1e6 * float(np.median(cost.seconds)) / steps,
+        low,
+        middle,
+        high,
+        cost.compile_seconds,
+        cost.flops,
+        cost.difference,
+        cost.rounding,
+        cost.scale,
+    )
+    return {f"{word}_{part}": value for part, value in zip(_PARTS, values, strict=True)}
+
+
+_PARTS = (
+    "microseconds", "ratio_low", "ratio", "ratio_high", "compile_seconds", "flops", "difference", "rounding", "scale"
+)  # fmt: skip

@@ -1,0 +1,158 @@
+"""A scene with everything, without one group, and without all that it does not need."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+import mjxgrad as mg
+from mjxgrad.contacts import contact_pairs
+from mjxgrad.scene.leave_out import omit
+from mjxgrad.scene.omissions import switch_off
+
+EVERYTHING, NEEDED, REACHED = "everything", "all that is not needed", "all that, and what is not reached"
+RENDERING, SENSORS, TENDONS = "rendering elements", "sensors", "unused tendons"
+FUSED, DAMPING = "fixed bodies, fused", "implicit damping of zero"
+PROVEN, PAIRS, LIMITS = "contacts proven apart", "contacts not reached", "limits not reached"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A scene with something left out.
+
+    Attributes:
+        name: of the group that is left out.
+        scene: without it.
+        what: what was left out, in a few words.
+        changes_rows: whether constraint rows are fewer or other.
+    """
+
+    name: str
+    scene: mg.Scene
+    what: str
+    changes_rows: bool
+
+
+def variants(path: Path, recorded: mg.Trajectory, beyond_limits: float) -> list[Variant]:
+    """Build a scene with everything, without each group that it has, and without all that it does not need.
+
+    Args:
+        path: of its MJCF.
+        recorded: its motions, for what they reach.
+        beyond_limits: in a proof (rad or m).
+
+    Returns:
+        The one with everything first; last the one without all that no motion needs, and where the recorded motions
+        leave more unreached, the one without that, too.
+    """
+    with warnings.catch_warnings():
+        # On the file, so the same for every variant: deprecated words, and contacts unlike C MuJoCo's.
+        warnings.simplefilter("ignore", UserWarning)
+        everything = mg.load_scene(path, keep_everything=True)
+        unused = mg.diagnostics.unused(everything, recorded)
+        found = [Variant(EVERYTHING, everything, "", False)]
+        for name, edit in _EDITS.items():
+            edited = edit(path)
+            if edited is not None:
+                scene = mg.load_scene(edited[0], keep_everything=True)
+                found.append(Variant(name, scene, edited[1], name == FUSED))
+        found += _constraints(everything, unused, beyond_limits)
+        proven = mg.LeaveOut(beyond_limits=beyond_limits)
+        found.append(_lean(NEEDED, path, proven))
+        if unused.pairs or unused.limits:
+            found.append(_lean(REACHED, path, replace(proven, pairs=unused.pairs, limits=unused.limits)))
+    return found
+
+
+def _lean(name: str, path: Path, wanted: mg.LeaveOut) -> Variant:
+    scene = mg.load_scene(path, leave_out=wanted)
+    parts = {"pairs": len(scene.omitted_pairs), "limits": len(wanted.limits)}
+    listed = [f"{count} {word}" for word, count in parts.items() if count]
+    return Variant(name, scene, ", ".join(["as load_scene does", *listed]), bool(listed))
+
+
+def _constraints(everything: mg.Scene, unused: mg.LeaveOut, beyond_limits: float) -> Iterator[Variant]:
+    proven = mg.LeaveOut(beyond_limits=beyond_limits)
+    for name, wanted in (
+        (PROVEN, proven),
+        (PAIRS, mg.LeaveOut(never_touching=False, pairs=unused.pairs)),
+        (LIMITS, mg.LeaveOut(never_touching=False, limits=unused.limits)),
+    ):
+        model = everything.to_mujoco()
+        omitted, omissions = omit(model, wanted)
+        if omissions:
+            count = (
+                f"{len(omitted)} of {len(everything.pairs)} pairs" if name != LIMITS else f"{len(unused.limits)} limits"
+            )
+            yield Variant(name, mg.load_scene(model, keep_everything=True), count, True)
+
+
+def _without_rendering(path: Path) -> tuple[mujoco.MjModel, str] | None:
+    """Delete geoms that touch nothing, sites at which nothing acts, cameras and lights; bodies keep their inertia."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    model = spec.compile()
+    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
+    visual = [geom for geom in spec.geoms if geom.id not in touching]
+    acts = model.nsensor or model.ntendon or (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any()
+    sites = [] if acts else list(spec.sites)
+    others = [*spec.cameras, *spec.lights]
+    spec.compiler.inertiafromgeom, spec.compiler.settotalmass = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO, -1.0
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat = model.body_mass[body.id], model.body_ipos[body.id], model.body_iquat[body.id]
+        body.inertia, body.fullinertia = model.body_inertia[body.id], [np.nan, 0, 0, 0, 0, 0]
+    for element in (*visual, *sites, *others):
+        spec.delete(element)
+    what = f"{len(visual)} geoms, {len(sites)} sites, {len(others)} cameras and lights"
+    return (spec.compile(), what) if visual or sites or others else None
+
+
+def _without_sensors(path: Path) -> tuple[mujoco.MjModel, str] | None:
+    spec = mujoco.MjSpec.from_file(str(path))
+    sensors = list(spec.sensors)
+    for sensor in sensors:
+        spec.delete(sensor)
+    return (spec.compile(), f"{len(sensors)} sensors") if sensors else None
+
+
+def _without_tendons(path: Path) -> tuple[mujoco.MjModel, str] | None:
+    """Delete all tendons, if none of them pulls, is driven, limited or tied."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    model = spec.compile()
+    acts = (
+        model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_armature, model.tendon_limited,
+        model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, model.eq_type == mujoco.mjtEq.mjEQ_TENDON,
+    )  # fmt: skip
+    if not model.ntendon or model.nsensor or any(np.any(x) for x in acts):
+        return None
+    for tendon in list(spec.tendons):
+        spec.delete(tendon)
+    return spec.compile(), f"{model.ntendon} tendons"
+
+
+def _fused(path: Path) -> tuple[mujoco.MjModel, str] | None:
+    spec = mujoco.MjSpec.from_file(str(path))
+    before = spec.compile().nbody
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.compiler.fusestatic = True
+    model = spec.compile()
+    return (model, f"{before - model.nbody} bodies") if model.nbody < before else None
+
+
+def _without_damping(path: Path) -> tuple[mujoco.MjModel, str] | None:
+    model = mujoco.MjModel.from_xml_path(str(path))
+    before = model.opt.disableflags
+    switch_off(model)
+    return (model, "a second factorisation") if model.opt.disableflags != before else None
+
+
+_EDITS: dict[str, Callable[[Path], tuple[mujoco.MjModel, str] | None]] = {
+    RENDERING: _without_rendering,
+    SENSORS: _without_sensors,
+    TENDONS: _without_tendons,
+    FUSED: _fused,
+    DAMPING: _without_damping,
+}
