@@ -38,6 +38,6 @@ def captions(outcome: Outcome) -> dict[str, str]:
         "mating": (
             f"A peg tilted by {TILT:g} rad, in and above a hole that is wider by 3 mm on each side. Points on the peg meet the "
             "boxes of the hole, points on the rim the box of the peg; where only one part has points the other's corners meet "
-            "nothing. Grey lines: jumps. That the peg ends in the hole or beside it is real."
+            "nothing. Grey lines: jumps. That the peg falls through or stays on the rim is real."
         ),
     }

@@ -117,7 +117,7 @@ def refinement(outcome: Outcome):
         label = outcome.paths[name].title + ("" if np.isnan(power) else f": power {-power:.1f}".replace("-", "−"))
         left.plot(count, size, "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
-    counts = [round(np.sqrt(one.num_rows)) for one in outcome.statics if one.is_lattice and one.path == name]
+    counts = sorted({round(np.sqrt(one.num_rows)) for one in outcome.statics if one.is_lattice})
     left.set_xticks(counts, [str(one) for one in counts])
     left.minorticks_off()
     left.legend(fontsize=8)
@@ -139,6 +139,7 @@ def slopes(outcome: Outcome):
         path = outcome.paths[one.path]
         axis.plot(one.starts, 1e3 * one.outcomes, ".", color=REFERENCE, ms=2.5)
         axis.set(title=f"{one.shape}, {path.title}", xlabel=f"start, {path.unit}")
+        axis.locator_params(axis="x", nbins=4)
         for estimate, colour, label in zip(
             (*one.estimates, one.reference), (FIRST, _EVENT, ZEROTH, REFERENCE), (*WAYS, "reference"), strict=True
         ):

@@ -113,7 +113,7 @@ def _wrenches(
 ) -> tuple[Float[Array, "points 6"], Float[Array, "points contacts"], Float[Array, "points contacts 3"]]:
     """Return force and torque, and the distances and places of all contacts."""
 
-    def one(pose: Float[Array, " 7"]) -> tuple[Array, ...]:
+    def one(pose: Float[Array, " 7"]) -> tuple[Array, Array, Array]:
         data = mg.forward(scene.model, scene.data.replace(qpos=pose), smoothing=smoothing)
         return _wrench(data.qfrc_constraint), data._impl.contact.dist, data._impl.contact.pos
 

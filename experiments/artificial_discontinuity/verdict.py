@@ -143,13 +143,13 @@ def _mating(outcome: Outcome) -> list[str]:
     found = []
     for one in outcome.matings:
         edge = f"{largest(one.depth) * 1e3:.2g} mm" if len(one.depth.places) else "nothing"
+        slope = quantity(one.slopes.reference, one.slopes.reference_error)
+        says = [quantity(value, error) for value, error in zip(one.slopes.estimates, one.slopes.errors, strict=True)]
         found.append(
             f"Mating with {one.label}: {len(one.force.places)} jumps in the force on the held peg, the largest "
-            f"{worst(one.force):.0%} of it; the depth reached jumps at {len(one.depth.places)} offsets, by {edge} at most. There the slope under noise is "
-            f"{quantity(one.slopes.reference, one.slopes.reference_error)}, and first order says "
-            f"{quantity(one.slopes.estimates[0], one.slopes.errors[0])} (discrete), "
-            f"{quantity(one.slopes.estimates[1], one.slopes.errors[1])} (event), zeroth order "
-            f"{quantity(one.slopes.estimates[2], one.slopes.errors[2])}."
+            f"{worst(one.force):.0%} of its largest; the depth reached jumps at {len(one.depth.places)} offsets, "
+            f"by {edge} at most. Under noise there its slope is {slope}; first order says "
+            f"{says[0]} (discrete) and {says[1]} (event), zeroth order {says[2]}."
         )
     return found
 
@@ -181,8 +181,8 @@ def _by_body(outcome: Outcome) -> Table:
         ("body", "rows", *(path.title for path in outcome.paths.values())),
         rows,
         "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently, under "
-        "the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold beyond the "
-        "threshold.",
+        "the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold beyond "
+        "the threshold.",
         frozenset(emphasised),
     )
 
@@ -205,8 +205,8 @@ def _by_jump(outcome: Outcome) -> Table:
         ("path", "at", "contacts", "jump over force", "reference jumps by", "changes nearby by", "which is"),
         rows,
         "Every jump of the box. The reference is the gradient of the overlap volume; nearby is one penetration depth to each "
-        "side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The onset "
-        "of a contact is no jump where contact begins gently.",
+        "side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The "
+        "onset of a contact is no jump where contact begins gently.",
     )
 
 
