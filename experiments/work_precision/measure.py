@@ -6,7 +6,7 @@ from experiments.work_precision import gradient, simulation
 from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
 from experiments.work_precision.outcome import Course, Outcome
-from experiments.work_precision.programs import CONES, Library, Variant, compiled, own_cone
+from experiments.work_precision.programs import CONES, FEW_ITERATIONS, Library, Variant, compiled, own_cone
 from experiments.work_precision.settings import WorkPrecisionSettings
 from experiments.workspace import Workspace
 
@@ -23,10 +23,12 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
     """
     cases = {name: case(name) for name in settings.scene_names}
     courses = []
-    with workspace.stage("scenes", "scenes", len(cases)) as advance_to:
+    # Compiling is most of the time, so progress is counted in programs.
+    total = sum(len(variants(one, settings)) for one in cases.values())
+    with workspace.stage("scenes", "programs", total) as advance_to:
         for name, one in cases.items():
             courses.append(_course(name, one, settings))
-            advance_to(len(courses))
+            advance_to(sum(course.num_programs for course in courses))
     return Outcome(settings, tuple(courses))
 
 
@@ -56,6 +58,7 @@ def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
             found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
         if everything:
             found += [Variant(library, "RK4", own, "float32", batch)]
+            found += [Variant(library, cone=own, batch=batch, iterations=count) for count in FEW_ITERATIONS]
     return found
 
 

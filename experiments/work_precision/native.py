@@ -8,7 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.work_precision.cases import Case
-from experiments.work_precision.programs import Cone, Ends, Integrator, Knobs, c_model, steps
+from experiments.work_precision.programs import NUM_ITERATIONS, Cone, Ends, Integrator, Knobs, c_model, steps
+
+# Rollouts keep every state on the way: this many at once stay within some hundred megabytes.
+_AT_A_TIME = 128
 
 
 def simulate(
@@ -18,7 +21,7 @@ def simulate(
     *,
     integrator: Integrator = "Euler",
     cone: Cone = "pyramidal",
-    iterations: int | None = None,
+    iterations: int = NUM_ITERATIONS,
     threads: int = 1,
 ) -> tuple[Ends, float]:
     """Simulate a batch.
@@ -29,27 +32,27 @@ def simulate(
         knobs: time step and solver tolerance; softening is left aside.
         integrator: its name.
         cone: its name.
-        iterations: of the solver at most; None lets it converge.
+        iterations: of the solver, at most.
         threads: of the rollout.
 
     Returns:
         Final positions and velocities, and the wall time.
     """
-    model = c_model(case, integrator, cone)
+    model = c_model(case, integrator, cone, iterations)
     model.opt.timestep, model.opt.tolerance = knobs.timestep, knobs.tolerance
-    if iterations is not None:
-        model.opt.iterations = iterations
     num_steps, batch = steps(case, knobs.timestep), len(qvel)
     initial = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     initial[:, 1 : 1 + model.nq] = case.start[0]
     initial[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
-    control = np.broadcast_to(case.controls, (batch, num_steps, model.nu)).copy() if model.nu else None
-    workers = [mujoco.MjData(model) for _ in range(threads)]
+    workers, seconds, finals = [mujoco.MjData(model) for _ in range(threads)], 0.0, []
     with mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
-        begun = time.perf_counter()
-        states, _ = pool.rollout([model] * batch, workers, initial, control, nstep=num_steps)
-        seconds = time.perf_counter() - begun
-    final = np.asarray(states)[:, -1]
+        for part in np.array_split(initial, -(-batch // _AT_A_TIME)):
+            control = np.tile(case.controls, (len(part), num_steps, 1)) if model.nu else None
+            begun = time.perf_counter()
+            states, _ = pool.rollout([model] * len(part), workers, part, control, nstep=num_steps)
+            seconds += time.perf_counter() - begun
+            finals.append(np.asarray(states)[:, -1])
+    final = np.concatenate(finals)
     return (final[:, 1 : 1 + model.nq], final[:, 1 + model.nq : 1 + model.nq + model.nv]), seconds
 
 

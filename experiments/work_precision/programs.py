@@ -41,6 +41,8 @@ CONES: dict[Cone, mujoco.mjtCone] = {
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 # Of the solver, enough to converge.
 NUM_ITERATIONS = 100
+# And too few, to see what they cost in error.
+FEW_ITERATIONS = (1, 3)
 _AT_A_TIME = 2
 
 
@@ -55,6 +57,7 @@ class Variant:
         precision: of every array.
         batch: starts simulated together.
         derivative: along the uncertain velocities; None for the motion alone.
+        iterations: of the solver, at most.
     """
 
     library: Library
@@ -63,6 +66,7 @@ class Variant:
     precision: Precision = "float64"
     batch: int = 1
     derivative: Literal["discrete", "event"] | None = None
+    iterations: int = NUM_ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -170,20 +174,21 @@ def softened(model: mjx.Model, factor: float) -> mjx.Model:
     return model.replace(geom_solref=changed(model.geom_solref), pair_solref=changed(model.pair_solref))
 
 
-def c_model(case: Case, integrator: Integrator, cone: Cone) -> mujoco.MjModel:
-    """Give the C model of a scene with another integrator and cone, its solver run to convergence.
+def c_model(case: Case, integrator: Integrator, cone: Cone, iterations: int = NUM_ITERATIONS) -> mujoco.MjModel:
+    """Give the C model of a scene with another integrator and cone, its solver run to convergence unless told otherwise.
 
     Args:
         case: the scene.
         integrator: its name.
         cone: its name.
+        iterations: of the solver, at most.
 
     Returns:
         A copy.
     """
     model = copy.deepcopy(case.model)
     model.opt.integrator, model.opt.cone = INTEGRATORS[integrator], CONES[cone]
-    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, NUM_ITERATIONS
+    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, iterations
     return model
 
 
@@ -219,7 +224,7 @@ def _compile(lowered: jax.stages.Lowered) -> tuple[Callable[..., Any], float]:
 
 def _lowered(case: Case, variant: Variant) -> tuple[mjx.Model, jax.stages.Lowered]:
     with _in_precision(variant.precision):
-        scene = mg.load_scene(c_model(case, variant.integrator, variant.cone))
+        scene = mg.load_scene(c_model(case, variant.integrator, variant.cone, variant.iterations))
         dtype = np.dtype(variant.precision)
         template = scene.data.replace(
             qpos=jnp.asarray(case.start[0], dtype), ctrl=jnp.asarray(case.controls, dtype), time=jnp.zeros((), dtype)

@@ -13,6 +13,7 @@ from experiments.work_precision.native import differences, simulate
 from experiments.work_precision.outcome import MG, MJX, C, Point, Reference, relative_errors, rms
 from experiments.work_precision.programs import (
     CONES,
+    FEW_ITERATIONS,
     NUM_ITERATIONS,
     Cone,
     Ends,
@@ -33,7 +34,6 @@ _SAME_MOTION = 1e-6
 _REFERENCE_TOLERANCE = 1e-12
 _SINGLE_TOLERANCE = 1e-6
 _NAMES = {"mg": MG, "mjx": MJX}
-_FEW_ITERATIONS = (1, 3)
 _REPEATS_OF_C = 3
 
 
@@ -151,7 +151,8 @@ def _of_program(
     program: Program, qvel: Float[np.ndarray, "batch nv"], truth: Truth, settings: WorkPrecisionSettings
 ) -> list[Point]:
     case, variant, sizes = program.case, program.variant, settings.sizes
-    is_main = variant.integrator == "Euler" and variant.batch > 1 and variant.cone == own_cone(case)
+    is_own = variant.integrator == "Euler" and variant.cone == own_cone(case)
+    is_main = is_own and variant.batch > 1 and variant.iterations == NUM_ITERATIONS
     points = []
     for knobs in _knobs(case, settings, with_tolerances=is_main, is_single=variant.precision == "float32"):
         program.run(qvel, knobs)
@@ -165,7 +166,7 @@ def _of_program(
                 precision=variant.precision,
                 timestep=knobs.timestep,
                 tolerance=knobs.tolerance,
-                iterations=NUM_ITERATIONS,
+                iterations=variant.iterations,
                 batch=variant.batch,
                 position_error=errors[0],
                 velocity_error=errors[1],
@@ -189,7 +190,7 @@ def _of_c(
         find = functools.partial(_c_points, case, qvel, right[C, cone], settings, cone=cone)
         points += [*find(plain, integrator="implicitfast"), *find(plain, integrator="RK4"), *find(varied)]
         if cone == own_cone(case):
-            points += [point for count in _FEW_ITERATIONS for point in find(plain, iterations=count)]
+            points += [point for count in FEW_ITERATIONS for point in find(plain, iterations=count)]
             points += _c_points(case, qvel[:1], right[C, cone], settings, plain, cone=cone)
     return points
 
@@ -203,7 +204,7 @@ def _c_points(
     *,
     cone: Cone,
     integrator: Integrator = "Euler",
-    iterations: int | None = None,
+    iterations: int = NUM_ITERATIONS,
 ) -> list[Point]:
     threads, simulated = (settings.threads if len(qvel) > 1 else 1), len(qvel) * case.duration
     points = []
@@ -221,7 +222,7 @@ def _c_points(
                 precision="float64",
                 timestep=knobs.timestep,
                 tolerance=knobs.tolerance,
-                iterations=iterations or NUM_ITERATIONS,
+                iterations=iterations,
                 batch=len(qvel),
                 position_error=errors[0],
                 velocity_error=errors[1],
