@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
-from experiments.ablation.variants import EVERYTHING, NEEDED, PROVEN, REACHED
+from experiments.ablation.variants import EVERYTHING, NEEDED, REACHED
 from experiments.report import Table
 
 _WORTH = 0.95  # of the time with everything: what the upper quartile must stay below to be called faster
