@@ -51,7 +51,7 @@ class Path:
         """
         start = self.orientation(np.zeros(1))[0]
         reach = shape.radius - start.apply(shape.hull)[:, 2].min()
-        height = np.full(len(parameters), HALF + reach + depth)
+        height = np.full(len(parameters), HALF + reach - depth)
         quaternions = self.orientation(parameters).as_quat(scalar_first=True)
         return np.concatenate([self.place(parameters), height[:, None], quaternions], axis=1)
 

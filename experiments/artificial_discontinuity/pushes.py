@@ -90,7 +90,7 @@ def slopes_at(
     own, repeats = values[: sizes.num_samples], values[sizes.num_samples :].reshape(shape)
     # Less the mean of the others, which keeps it unbiased.
     baseline = (own.sum() - own) / (len(own) - 1)
-    samples = np.stack([discrete[: len(own)], event[: len(own)], (own + baseline) * noise * 1.3 / stddev])
+    samples = np.stack([discrete[: len(own)], event[: len(own)], (own - baseline) * noise / stddev])
     # Each repeat less the mean of the other repeats, for the same reason.
     others = (repeats.mean(axis=1).sum() - repeats.mean(axis=1)) / (len(repeats) - 1)
     references = ((repeats - others[:, None]) * strata / stddev).mean(axis=1)
@@ -112,7 +112,7 @@ def slopes_at(
         errors=samples.std(axis=1, ddof=1) / np.sqrt(len(own)),
         reference=float(references.mean()),
         reference_error=float(references.std(ddof=1) / np.sqrt(len(references))),
-        jump=float((jumps.after - jumps.before) @ density**2) if len(jumps.places) else 0.0,
+        jump=float((jumps.after - jumps.before) @ density) if len(jumps.places) else 0.0,
         starts=(place + stddev * every)[order],
         outcomes=values[order],
     )

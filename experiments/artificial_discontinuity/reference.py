@@ -45,4 +45,4 @@ def _force(pose: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 3"]:
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     outward, distance = hull.equations[:, :3], hull.equations[:, 3]
     is_moved = np.isclose(outward @ normals.T, 1, atol=1e-7) & np.isclose(distance[:, None], offsets[6:], atol=1e-7)
-    return (areas * is_moved.any(axis=1)) @ outward
+    return -(areas * is_moved.any(axis=1)) @ outward

@@ -14,7 +14,7 @@ _POINT = 0.001  # m, radius of what stands for a point
 # Of MuJoCo's default contact, 1 / (0.02 s)² and 2 / 0.02 s, which the points of a lattice share.
 _STIFFNESS, _DAMPING = 2500.0, 100.0
 # So little impedance over all points that each is a spring of its own, whatever the others carry; MuJoCo's least is 1e-4.
-_LATTICE_IMPEDANCE, _LEAST_IMPEDANCE = 8.0, 1e-4
+_LATTICE_IMPEDANCE, _LEAST_IMPEDANCE = 0.05, 1e-4
 
 _CORNERS = HALF * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _SCENE = """<mujoco><option gravity="0 0 0" timestep="0.002" tolerance="1e-10"/><default><geom condim="1" mass="0"/></default>
