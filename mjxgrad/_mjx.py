@@ -18,12 +18,14 @@ try:
 
         # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
         # has: second implementations of these rules could disagree with them.
+        from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as collision_functions
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
         from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
 finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 __all__ = [
+    "collision_functions",
     "counts",
     "geom_pairs",
     "has_collision_fn",
