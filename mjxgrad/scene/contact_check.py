@@ -1,5 +1,7 @@
 r"""Contacts that MuJoCo alters without a word, or that the time step cannot follow."""
 
+from collections.abc import Sequence
+
 import jax
 import mujoco
 import numpy as np
@@ -94,8 +96,8 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
     return messages
 
 
-def name_pairs(pairs: list[ContactPair]) -> str:
-    """Two pairs by name, or the first of them and how many more there are."""
+def name_pairs(pairs: Sequence[object]) -> str:
+    """Two pairs, or whatever else has a name, by name; or the first of them and how many more there are."""
     if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
         return ", ".join(str(pair) for pair in pairs)
     return f"{pairs[0]} + {len(pairs) - 1} more"

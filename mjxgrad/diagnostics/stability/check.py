@@ -7,6 +7,7 @@ import jax
 import mujoco
 import numpy as np
 
+from mjxgrad._mjx import collision_functions
 from mjxgrad.contacts import ContactPair, resolve_solref
 from mjxgrad.diagnostics.stability.report import StabilityReport
 from mjxgrad.diagnostics.stability.spring import Spring
@@ -49,10 +50,9 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
         return
     parameters = scene.contact_parameters()
     columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
-    slots = [frozenset(geoms) for geoms in np.asarray(scene.data._impl.contact.geom).tolist()]
     for pair, *row in zip(scene.pairs, *(np.asarray(column, float) for column in columns), strict=True):
-        count = slots.count(frozenset((pair.geom1, pair.geom2)))
-        yield _spring(scene, "contact", str(pair), *row, _thickness(scene, pair), max(count, 1))
+        kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
+        yield _spring(scene, "contact", str(pair), *row, _thickness(scene, pair), collision_functions[kinds].ncon)
 
 
 def _others(scene: Scene) -> Iterator[Spring]:

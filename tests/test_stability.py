@@ -1,0 +1,224 @@
+"""A scene's springs beside its time step, against closed forms, the textbook's bounce and C MuJoCo's own steps."""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.diagnostics.stability import (
+    Derivative,
+    Motion,
+    MotionRecord,
+    UnsoundGradientError,
+    check_soundness,
+    classify_derivative,
+    classify_motion,
+    soundness,
+)
+
+SCENE = """
+<mujoco>
+  <option timestep="{timestep}" gravity="0 0 0" integrator="{integrator}"><flag refsafe="{refsafe}"/></option>
+  <default><geom condim="1" solref="{solref}" solimp="{solimp}"/></default>
+  <worldbody>
+    {floor}
+    <body pos="0 0 .1"><joint name="slide" type="slide" axis="0 0 1" limited="{limited}" range="-1 1"
+      solreflimit="{solref}"/><geom name="ball" size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+FLOOR = '<geom name="floor" type="plane" size="1 1 .1"/>'
+OTHER = '<geom name="post" size=".05" pos="0 0 -.5"/>'
+
+
+def _mjcf(**changes):
+    given = {
+        "timestep": 0.002, "solref": ".02 1", "solimp": ".9 .9 .001", "refsafe": "disable", "floor": FLOOR,
+        "limited": "false", "integrator": "Euler",
+    }  # fmt: skip
+    return SCENE.format(**(given | changes))
+
+
+def _report(speed=None, joint_speed=None, **changes):
+    return mg.check_stability(mg.load_scene(_mjcf(**changes)), speed=speed, joint_speed=joint_speed)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 5.0])
+def test_the_load_is_the_step_over_the_closed_form_limit_in_the_standard_format(ratio):
+    # h/tc < 2ζ(√(1 + ζ²) − ζ)
+    limit = 2 * ratio * (np.sqrt(1 + ratio**2) - ratio) * 0.02
+    (spring,) = _report(solref=f".02 {ratio}").springs
+    assert spring.load == pytest.approx(0.002 / limit, rel=1e-9)
+
+
+def test_the_load_is_one_where_the_direct_format_reaches_its_limit():
+    # h²k + 2hb = 4 at h = 2 ms and b = 100: k = (4 − 0.4) / h²
+    (spring,) = _report(solref=f"{-3.6 / 0.002**2} -100").springs
+    assert spring.load == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("integrator", "share"), [("Euler", 0.97), ("Euler", 1.03), ("RK4", 0.97), ("RK4", 1.03)])
+def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_one(integrator, share):
+    """A ball that is pressed into its contact swings ever wider, or comes to rest."""
+    solref, solimp = "-40000 -20", ".5 .5 .001"
+    (unit,) = _report(solref=solref, solimp=solimp, integrator=integrator).springs
+    step = 0.002 * share / unit.load
+    model = mujoco.MjModel.from_xml_string(
+        _mjcf(solref=solref, solimp=solimp, timestep=step, integrator=integrator).replace("0 0 0", "0 0 -1000", 1)
+    )
+    data = mujoco.MjData(model)
+    # It rests (1 − d) a₀ / k = 0.5 · 1000 / 40000 = 12.5 mm deep; start a tenth of a millimetre deeper.
+    data.qpos[0] = -0.0126
+    mujoco.mj_step(model, data, 400)
+    swing = np.abs(data.qvel[0])
+    assert (swing > 1.0) == (share > 1)
+
+
+def test_a_bounce_lasts_and_goes_as_deep_as_the_closed_form_says():
+    scene = mg.load_scene(_mjcf(timestep=1e-5, solref=".02 .5"))
+    (spring,) = mg.check_stability(scene).springs
+    model = scene.to_mujoco()
+    data = mujoco.MjData(model)
+    data.qvel[:] = -1.0
+    depths, pushes = [], []
+    for _ in range(4000):
+        mujoco.mj_step(model, data)
+        depths.append(-data.qpos[0])
+        pushes.append(data.qfrc_constraint[0] > 0)
+    # To first order in the time step: one step of the flight, and two of the contact.
+    assert spring.depth(1.0) == pytest.approx(max(depths), abs=1e-5)
+    assert spring.num_steps == pytest.approx(sum(pushes), abs=2)
+
+
+def test_what_refsafe_replaces_is_said_with_the_time_constant_in_effect():
+    report = _report(refsafe="enable", solref=".003 1")
+    (spring,) = report.springs
+    assert spring.is_hidden
+    assert spring.time_constant == pytest.approx(0.004)
+    assert any("refsafe replaces it by 0.004 s" in text for text in report.warnings)
+    assert not _report(refsafe="enable", solref="-1e4 -200").springs[0].is_hidden
+
+
+def test_joint_limits_are_looked_at_with_their_own_format_and_remedy():
+    report = _report(refsafe="enable", solref=".003 1", limited="true")
+    limit = next(spring for spring in report.springs if spring.kind == "joint limit")
+    assert limit.name == "slide"
+    assert limit.size == 2.0
+    assert any(text.startswith("joint limit of slide") and "the direct format" in text for text in report.warnings)
+
+
+def test_a_switched_off_limit_is_not_looked_at():
+    text = _mjcf(limited="true").replace('refsafe="disable"', 'refsafe="disable" limit="disable"')
+    assert {spring.kind for spring in mg.check_stability(mg.load_scene(text)).springs} == {"contact"}
+
+
+def test_four_contacts_of_a_box_pull_as_much_more_as_their_impedances_add_up_to():
+    box = _mjcf().replace('size=".1"/></body>', 'type="box" size=".1 .1 .1"/></body>')
+    (spring,) = mg.check_stability(mg.load_scene(box)).springs
+    assert spring.num_rows == 4
+    # n d / (1 + (n − 1) d) over d, for d = 0.9 and n = 4, is k's factor and b's: h²k + 2hb at 1/s² and 1/s.
+    factor = 4 / (1 + 3 * 0.9)
+    ratio = np.sqrt(factor)  # ζ grows as the root of the factor
+    limit = 2 * ratio * (np.sqrt(1 + ratio**2) - ratio) * 0.02 / factor
+    assert spring.coupled_load == pytest.approx(0.002 / limit, rel=1e-9)
+
+
+def test_passing_through_is_said_of_a_post_and_not_of_a_plane():
+    # 0.15 m of two radii, in 2 ms: from 75 m/s on.
+    assert not any("pass through" in text for text in _report(speed=74.0, solref=".005 1", floor=OTHER).warnings)
+    assert any("pass through" in text for text in _report(speed=76.0, solref=".005 1", floor=OTHER).warnings)
+    assert not any("pass through" in text for text in _report(speed=76.0, solref=".005 1").warnings)
+
+
+def test_without_a_speed_nothing_is_said_about_onsets():
+    assert _report().warnings == ()
+    assert any("begins with a jump" in text for text in _report(speed=1.0).warnings)
+
+
+def test_the_summary_names_the_scene_its_springs_and_its_warnings():
+    report = _report(speed=1.0, solref="-1e8 -200")
+    text = str(report)
+    assert "contact floor – ball" in text
+    assert all(one[:40] in text for one in report.warnings)
+    assert max(map(len, text.splitlines())) < 160
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, np.nan])
+def test_a_speed_that_is_none_is_refused(speed):
+    with pytest.raises(ValueError, match="speed must be positive"):
+        _report(speed=speed)
+
+
+def _record(**changes):
+    fine = {
+        "is_sound": True, "residual": 1e-9, "gain": 0.9, "rest": 0.5, "has_crossed": False,
+        "restitution": np.nan, "expected": np.nan,
+    }  # fmt: skip
+    return MotionRecord(**{name: np.array([value]) for name, value in (fine | changes).items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, Motion.MOVES),
+        ({"rest": 1e-4}, Motion.SETTLES),
+        # e⁻² is the restitution at critical damping.
+        ({"restitution": 0.14, "expected": np.exp(-2)}, Motion.BOUNCES_RIGHT),
+        ({"restitution": 0.30, "expected": np.exp(-2)}, Motion.BOUNCES_OTHERWISE),
+        ({"gain": 1.2, "restitution": 1.1, "expected": 1.1}, Motion.GAINS_ENERGY),
+        ({"gain": np.nan}, Motion.GAINS_ENERGY),
+        ({"has_crossed": True, "gain": 2.0}, Motion.TUNNELS),
+        ({"residual": 0.5, "has_crossed": True}, Motion.UNSOLVED),
+        ({"residual": np.nan}, Motion.UNSOLVED),
+        ({"is_sound": False, "residual": np.nan, "gain": np.inf}, Motion.DIVERGES),
+    ],
+)
+def test_a_motion_is_called_by_the_worst_of_what_it_did(changes, expected):
+    assert classify_motion(_record(**changes))[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("derivative", "is_finite", "is_sound", "error", "expected"),
+    [
+        (-np.exp(-2), True, True, 0.0, Derivative.RIGHT),
+        (-3.0, True, True, 0.0, Derivative.WRONG),
+        (-3.0, True, True, 1.0, Derivative.UNJUDGED),
+        (1e9, True, True, 0.0, Derivative.EXPLODES),
+        (-np.exp(-2), False, True, 0.0, Derivative.NON_FINITE),
+        (np.inf, True, True, 0.0, Derivative.NON_FINITE),
+        (-np.exp(-2), True, False, 0.0, Derivative.NONE),
+    ],
+)
+def test_a_derivative_is_held_against_the_restitution(derivative, is_finite, is_sound, error, expected):
+    found = classify_derivative(
+        np.array([derivative]),
+        np.array([is_finite]),
+        np.array([is_sound]),
+        np.array([-np.exp(-2)]),
+        np.array([error]),
+        largest=1e4,
+        tolerance=1e-3,
+    )
+    assert found[0] == expected
+
+
+def test_a_gradient_is_unsound_for_each_of_its_reasons():
+    good = {"a": jnp.ones(3), "b": jnp.array(2.0)}
+    assert bool(soundness(good).is_sound)
+    assert not bool(soundness(good, diverged=True).is_sound)
+    assert not bool(soundness(good | {"b": jnp.array(jnp.nan)}).is_sound)
+    bounded = soundness(good | {"b": jnp.array(-1e5)}, bound=1e4)
+    assert bool(bounded.explodes)
+    assert not bool(bounded.is_sound)
+    assert float(bounded.largest) == 1e5
+
+
+def test_unsound_gradients_are_raised_with_their_counts():
+    import jax
+
+    batch = jnp.array([[1.0, 2.0], [jnp.nan, 1.0], [jnp.inf, jnp.nan]])
+    found = jax.vmap(soundness)(batch)
+    with pytest.raises(UnsoundGradientError, match=r"2 of 3 gradients must not be used: 2 are not finite"):
+        check_soundness(found)
+    check_soundness(soundness(batch[0]))
