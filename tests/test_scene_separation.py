@@ -7,6 +7,7 @@ import pytest
 from mjxgrad.contacts import contact_pairs
 from mjxgrad.scene.masks import TooManyMasksError, keep_pairs
 from mjxgrad.scene.separation import proven_distance
+from mjxgrad.scene.volume import rotation_matrix, volume_of
 
 _MESH = "<asset><mesh name='m' vertex='0 0 0 .1 0 0 0 .15 0 0 0 .2 .05 .05 -.1'/></asset>"
 _SHAPES = (
@@ -101,6 +102,37 @@ def test_random_trees_never_bring_together_what_is_proven_apart(seed, num_positi
         assert distance >= clearance
         # C MuJoCo's own search for the closest points of convex bodies stops at 1e-6 m.
         assert closest[pair] >= distance - 1e-6
+
+
+def _surface(kind, rng):
+    """Points on a geom of each kind, in its own frame, from the equation of its surface, and its MJCF."""
+    normal = rng.normal(size=(500, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    if kind == "box":
+        return np.sign(normal) * [0.1, 0.3, 0.2], "type='box' size='0.1 0.3 0.2'"
+    if kind == "ellipsoid":
+        return normal * [0.2, 0.3, 0.1], "type='ellipsoid' size='0.2 0.3 0.1'"
+    if kind == "cylinder":
+        rim = np.column_stack(
+            [0.1 * normal[:, :2] / np.linalg.norm(normal[:, :2], axis=1, keepdims=True), normal[:, 2]]
+        )
+        return rim * [1, 1, 0.3] / [1, 1, np.abs(normal[:, 2]).max()], "type='cylinder' size='0.1 0.3'"
+    return 0.1 * normal + np.sign(normal[:, 2:]) * [0, 0, 0.3], "type='capsule' size='0.1 0.3'"
+
+
+@pytest.mark.parametrize("kind", ["box", "ellipsoid", "cylinder", "capsule"])
+def test_a_volume_holds_its_geom_and_touches_it(kind):
+    points, shape = _surface(kind, np.random.default_rng(0))
+    source = f"<geom {shape} pos='0.1 0.2 0.3' euler='20 30 40'/>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{source}</worldbody></mujoco>")
+    volume = volume_of(model, 0)
+    placed = points @ rotation_matrix(model.geom_quat[0]).T + model.geom_pos[0]
+    start, along = volume.ends[0], volume.ends[1] - volume.ends[0]
+    share = np.clip((placed - start) @ along / (along @ along), 0, 1)
+    distance = np.linalg.norm(placed - start - share[:, None] * along, axis=1)
+    assert distance.max() <= volume.radius + 1e-12
+    # Its widest points are on the volume's surface, but for how densely 500 points lie.
+    assert distance.max() >= 0.99 * volume.radius
 
 
 def _arm(joint="type='hinge' axis='0 1 0'", target="0.7 0 0", extra=""):

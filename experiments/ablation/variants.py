@@ -15,7 +15,7 @@ from mjxgrad.scene.omissions import switch_off
 
 EVERYTHING, NEEDED, REACHED = "everything", "all that is not needed", "all that, and what is not reached"
 RENDERING, SENSORS, TENDONS = "rendering elements", "sensors", "unused tendons"
-FUSED, DAMPING = "fixed bodies, fused", "implicit damping of zero"
+FUSED, DAMPING = "fixed bodies", "implicit damping of zero"
 PROVEN, PAIRS, LIMITS = "contacts proven apart", "contacts not reached", "limits not reached"
 
 
@@ -139,7 +139,7 @@ def _fused(path: Path) -> tuple[mujoco.MjModel, str] | None:
     spec = mujoco.MjSpec.from_file(str(path))
     spec.compiler.fusestatic = True
     model = spec.compile()
-    return (model, f"{before - model.nbody} bodies") if model.nbody < before else None
+    return (model, f"{before - model.nbody} fused into parents") if model.nbody < before else None
 
 
 def _without_damping(path: Path) -> tuple[mujoco.MjModel, str] | None:
