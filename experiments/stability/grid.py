@@ -1,6 +1,6 @@
 """The points that are looked at: planes through the grid, two parameters each, and a Latin hypercube over all of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,7 +108,7 @@ def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -
     return Points(values, family, tuple((across, up) for across, up, _ in planes))
 
 
-def _block(count: int, given: dict[str, np.ndarray | float]) -> dict[str, Float[np.ndarray, " n"]]:
+def _block(count: int, given: Mapping[str, np.ndarray | float]) -> dict[str, Float[np.ndarray, " n"]]:
     return {name: np.broadcast_to(given.get(name, value), count).astype(float) for name, value in DEFAULTS.items()}
 
 

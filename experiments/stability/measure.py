@@ -25,6 +25,9 @@ _TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
 _EVENT_TOLERANCE = 0.1
 
 
+_Case = tuple[StabilityScene, Points, Reference, np.ndarray]
+
+
 def largest(num_steps: int) -> float:
     """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
 
@@ -61,8 +64,8 @@ def measure(settings: StabilitySettings, workspace: Workspace) -> Outcome:
     for precision in settings.precisions:
         with _precision(precision):
             runs = _run_all(cases, precision, size, settings, workspace)
-            if precision == "float64":
-                truths = _differences_of_all(cases, runs, settings, workspace)
+        if precision == "float64":
+            truths = [truth for _, _, truth in runs if truth is not None]
         for i, (case, (discrete, event, _)) in enumerate(zip(cases, runs, strict=True)):
             behaviours[i][precision] = _of_mjxgrad(*case, discrete, event, truths[i], precision, settings)
             apart[i][precision] = _apart(case[1], discrete.course, case[2].course, settings.num_steps)
@@ -80,16 +83,25 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(cases, precision: str, size: Size, settings: StabilitySettings, workspace: Workspace):
-    """Run the programs of all scenes, two at a time: most of it is compilation, which takes one core each."""
+def _run_all(
+    cases: list[_Case], precision: str, size: Size, settings: StabilitySettings, workspace: Workspace
+) -> list[tuple[Run, Run | None, np.ndarray | None]]:
+    """Run the programs of all scenes, two at a time: most of it is compilation, which takes one core each.
 
-    def run(case) -> tuple[Run, Run | None, Program]:
-        scene, _, reference, _ = case
+    Returns:
+        Of each scene the discrete and the event gradient's run, and the differences that judge them.
+    """
+
+    def run(case: _Case) -> tuple[Run, Run | None, np.ndarray | None]:
+        scene, grid, reference, _ = case
         arrays = (reference.fields, reference.qpos, reference.qvel)
         program = Program(scene, settings.num_steps, "discrete", settings.chunk)
         has_event = size.event is None or scene.name in size.event
         event = Program(scene, settings.num_steps, "event", settings.chunk).run(*arrays) if has_event else None
-        return program.run(*arrays), event, program
+        # In float64 alone, whose differences judge the derivatives of both.
+        is_judge = precision == "float64"
+        truth = _differences(scene, grid, reference, program, settings.num_steps) if is_judge else None
+        return program.run(*arrays), event, truth
 
     done = []
     stage = workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases))
@@ -100,17 +112,8 @@ def _run_all(cases, precision: str, size: Size, settings: StabilitySettings, wor
     return done
 
 
-def _differences_of_all(cases, runs, settings: StabilitySettings, workspace: Workspace) -> list[np.ndarray]:
-    """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
-    truths = []
-    with workspace.stage("finite differences", "scenes", len(cases)) as advance_to:
-        for (scene, grid, reference, _), (_, _, program) in zip(cases, runs, strict=True):
-            truths.append(_differences(scene, grid, reference, program, settings.num_steps))
-            advance_to(len(truths))
-    return truths
-
-
 def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):
+    """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
     flown = _flown_in_step(grid)
     shift, push = direction(scene, num_steps, grid.values["timestep"])
     changes = _changes(reference)
@@ -120,7 +123,7 @@ def _differences(scene: StabilityScene, grid: Points, reference: Reference, prog
         for side in (1, -1):
             step = (side * width * flown)[:, None]
             start = (reference.qpos + step * shift, reference.qvel + step * push)
-            ends.append(program.run(reference.fields, *start).value)
+            ends.append(program.values(reference.fields, *start))
         quotients.append((ends[0] - ends[1]) / (2 * width * flown))
     for width in _PARAMETER_WIDTHS:
         ends = []
@@ -129,7 +132,7 @@ def _differences(scene: StabilityScene, grid: Points, reference: Reference, prog
                 name: value + side * width * changes.get(name, np.zeros_like(value))
                 for name, value in reference.fields.items()
             }
-            ends.append(program.run(fields, reference.qpos, reference.qvel).value)
+            ends.append(program.values(fields, reference.qpos, reference.qvel))
         quotients.append((ends[0] - ends[1]) / (2 * width * flown * num_steps))
     return np.array(quotients).reshape(2, 2, -1)
 

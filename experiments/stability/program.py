@@ -1,6 +1,6 @@
 """mjxgrad on every point of a scene's grid: one compiled program per scene, precision and gradient."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from experiments.stability.reference import Course, unbalanced
 from experiments.stability.scenes import StabilityScene
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import Gradient
-from mjxgrad.rollout import Trajectory
+from mjxgrad.rollout import Observe, Trajectory
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,13 @@ class Run:
     is_gradient_finite: np.ndarray
 
 
+def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array]:
+    mass, forces = mjx.full_m(model, data), (data.qfrc_smooth, data.qfrc_constraint)
+    kinetic = 0.5 * data.qvel @ mass @ data.qvel
+    potential = -model.body_mass @ (data.xipos @ model.opt.gravity)
+    return kinetic, potential, unbalanced(mass, data.qacc, data.qvel, *forces, model.opt.timestep)
+
+
 class Program:
     """A scene's rollout with its gradient, vectorised over points.
 
@@ -50,13 +57,23 @@ class Program:
     def __init__(self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int):
         self._scene = mg.load_scene(scene.model())
         self._weights = jnp.array(scene.outcome)
-        self._num_steps, self._gradient, self._chunk = num_steps, gradient, chunk
+        self._gradient: Gradient = gradient
+        self._num_steps, self._chunk = num_steps, chunk
         both = jax.value_and_grad(self._outcome, argnums=(0, 1, 2), has_aux=True)
-        self._batch = jax.jit(jax.vmap(both))
+        self._both = jax.jit(jax.vmap(both))
+        # Finite differences need no gradient, which takes four times as long as its value.
+        self._value = jax.jit(jax.vmap(lambda *start: self._outcome(*start, observe=None)[0]))
 
-    def compile(self, fields: dict[str, np.ndarray], qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Compile, by running a first chunk."""
-        jax.block_until_ready(self._batch(*next(self._chunks((fields, qpos, qvel)))[1]))
+    def values(self, fields: dict[str, np.ndarray], qpos: np.ndarray, qvel: np.ndarray) -> Float[np.ndarray, " points"]:
+        """Give the outcome alone.
+
+        Args:
+            fields: of the model, for every point.
+            qpos: where each rollout starts.
+            qvel: likewise.
+        """
+        parts = [np.asarray(self._value(*arrays))[:count] for count, arrays in self._chunks((fields, qpos, qvel))]
+        return np.concatenate(parts)
 
     def run(self, fields: dict[str, np.ndarray], qpos: np.ndarray, qvel: np.ndarray) -> Run:
         """Simulate and differentiate.
@@ -71,7 +88,7 @@ class Program:
         """
         parts = []
         for count, arrays in self._chunks((fields, qpos, qvel)):
-            (value, trajectory), gradient = self._batch(*arrays)
+            (value, trajectory), gradient = self._both(*arrays)
             parts.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], (value, trajectory, gradient)))
         value, trajectory, gradient = jax.tree.map(lambda *x: np.concatenate(x), *parts)
         kinetic, potential, residual = trajectory.observations
@@ -87,12 +104,14 @@ class Program:
         )
         return Run(course, value, gradient, is_silent, _all_finite(gradient))
 
-    def _outcome(self, fields: dict[str, Array], qpos: Array, qvel: Array) -> tuple[Array, Trajectory]:
+    def _outcome(
+        self, fields: dict[str, Array], qpos: Array, qvel: Array, observe: Observe | None = _observe
+    ) -> tuple[Array, Trajectory]:
         others = {name: value for name, value in fields.items() if name != "timestep"}
         model = self._scene.model.replace(**others).tree_replace({"opt.timestep": fields["timestep"]})
         scene = eqx.tree_at(lambda scene: scene.model, self._scene, model)
         state = mg.initial_state(scene, qpos, qvel)
-        trajectory = mg.rollout(scene, state, horizon=self._num_steps, observe=_observe, gradient=self._gradient)
+        trajectory = mg.rollout(scene, state, horizon=self._num_steps, observe=observe, gradient=self._gradient)
         return trajectory.qpos[-1] @ self._weights, trajectory
 
     def _chunks(self, arrays) -> Iterator[tuple[int, Any]]:
@@ -104,7 +123,7 @@ class Program:
             yield min(self._chunk, total - start), jax.tree.map(lambda x, i=index: x[i].astype(dtype), arrays)
 
 
-def along(run: Run, changes: Callable[[str], np.ndarray] | dict[str, np.ndarray]) -> Float[np.ndarray, " points"]:
+def along(run: Run, changes: dict[str, np.ndarray]) -> Float[np.ndarray, " points"]:
     """Take a gradient along a change of fields, positions and velocities.
 
     Args:
@@ -116,13 +135,6 @@ def along(run: Run, changes: Callable[[str], np.ndarray] | dict[str, np.ndarray]
     with np.errstate(all="ignore"):
         terms = [(parts[name] * change).reshape(len(qpos), -1).sum(axis=1) for name, change in changes.items()]
     return np.sum(terms, axis=0)
-
-
-def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array]:
-    mass, forces = mjx.full_m(model, data), (data.qfrc_smooth, data.qfrc_constraint)
-    kinetic = 0.5 * data.qvel @ mass @ data.qvel
-    potential = -model.body_mass @ (data.xipos @ model.opt.gravity)
-    return kinetic, potential, unbalanced(mass, data.qacc, data.qvel, *forces, model.opt.timestep)
 
 
 def _all_finite(tree: Any) -> np.ndarray:

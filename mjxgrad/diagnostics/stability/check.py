@@ -50,9 +50,21 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
         return
     parameters = scene.contact_parameters()
     columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
-    for pair, *row in zip(scene.pairs, *(np.asarray(column, float) for column in columns), strict=True):
+    stiffness, damping, impedance, width, solref = (np.asarray(column, float) for column in columns)
+    for i, pair in enumerate(scene.pairs):
         kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
-        yield _spring(scene, "contact", str(pair), *row, _thickness(scene, pair), collision_functions[kinds].ncon)
+        yield _spring(
+            scene,
+            "contact",
+            str(pair),
+            stiffness[i],
+            damping[i],
+            impedance[i],
+            width[i],
+            solref[i],
+            _thickness(scene, pair),
+            collision_functions[kinds].ncon,
+        )
 
 
 def _others(scene: Scene) -> Iterator[Spring]:

@@ -118,8 +118,7 @@ def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:
         (knows, Motion.BOUNCES_OTHERWISE),
         (record.rest <= AT_REST, Motion.SETTLES),
     )
-    conditions, classes = zip(*answers, strict=True)
-    return np.select(conditions, [int(one) for one in classes], int(Motion.MOVES))
+    return np.select([is_so for is_so, _ in answers], [int(kind) for _, kind in answers], int(Motion.MOVES))
 
 
 def classify_derivative(
@@ -155,5 +154,4 @@ def classify_derivative(
             (~(truth_error <= scale), Derivative.UNJUDGED),
             (np.abs(derivative - truth) <= scale + truth_error, Derivative.RIGHT),
         )
-    conditions, classes = zip(*answers, strict=True)
-    return np.select(conditions, [int(one) for one in classes], int(Derivative.WRONG))
+    return np.select([is_so for is_so, _ in answers], [int(kind) for _, kind in answers], int(Derivative.WRONG))
