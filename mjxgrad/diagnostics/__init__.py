@@ -4,6 +4,7 @@ from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
 from mjxgrad.diagnostics.budget import Rollouts, Seconds
 from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
+from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jitter import JitterComparison, derivative_under_jitter
 from mjxgrad.diagnostics.judgement import AgainstSlope
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
@@ -34,7 +35,9 @@ __all__ = [
     "AgainstSlope",
     "BiasVariance",
     "Comparison",
+    "Crossover",
     "EmpiricalBias",
+    "Growth",
     "JitterComparison",
     "Jumps",
     "Landscape",
@@ -59,10 +62,12 @@ __all__ = [
     "chi_square_variance_interval",
     "compare",
     "compare_to_slope",
+    "crossover",
     "derivative_against_slope",
     "derivative_under_jitter",
     "empirical_bias",
     "first_order_samples",
+    "growth",
     "jumps_along",
     "mean_interval",
     "onset_resolution",

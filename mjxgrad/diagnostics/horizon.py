@@ -1,0 +1,148 @@
+r"""What a horizon does to gradients: how fast derivatives grow, and from where on zeroth order is as good as first.
+
+The derivative of a state by an earlier one is the product of the Jacobians of the steps between. Its largest singular
+value $s_t$ bounds every derivative of an outcome at $t$; where motions part exponentially it grows as $e^{\lambda t}$, and
+the variance of a first-order estimate with $e^{2 \lambda t}$, while that of a zeroth-order one is bounded by the cost's.
+
+References:
+    Metz, Freeman, Schoenholz, Kachman. Gradients are Not All You Need. arXiv:2111.05803.
+    Benettin, Galgani, Giorgilli, Strelcyn. Lyapunov characteristic exponents for smooth dynamical systems and for Hamiltonian
+    systems; a method for computing all of them. Meccanica 15, 1980 (by repeated orthogonalisation).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad.diagnostics.statistics import checked
+
+
+class Growth(eqx.Module):
+    """How a product of Jacobians grows with their number.
+
+    Attributes:
+        log_largest: logarithm of the product's largest singular value, after each factor.
+        log_stretches: logarithms of how much the product stretches along orthogonal directions, the largest first in the
+            limit of many factors; over the time they tend to all Lyapunov exponents. Their sum is that of the determinant.
+    """
+
+    log_largest: Float[Array, "*batch horizon"]
+    log_stretches: Float[Array, "*batch horizon n"]
+
+    def exponents(self, times: Float[Array, " horizon"]) -> Float[Array, "*batch horizon n"]:
+        """Give the finite-time Lyapunov exponents, in 1/s.
+
+        Args:
+            times: after each factor, in s.
+        """
+        return self.log_stretches / times[:, None]
+
+
+def growth(jacobians: Float[Array, "*batch horizon n n"]) -> Growth:
+    """Multiply Jacobians in order, without overflow whatever their number.
+
+    Args:
+        jacobians: of consecutive steps, the first one first.
+
+    Returns:
+        The growth after each of them.
+    """
+    if jacobians.ndim > 3:
+        return jax.vmap(growth)(jacobians)
+    identity = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype)
+
+    def multiply(carry: tuple[Array, Array, Array, Array], factor: Array):
+        product, log_size, frame, log_stretch = carry
+        product = factor @ product
+        size = jnp.linalg.norm(product)
+        # A product that vanishes has no direction; its logarithm is minus infinity, and stays so.
+        product, log_size = product / jnp.where(size > 0, size, 1.0), log_size + jnp.log(size)
+        frame, triangle = jnp.linalg.qr(factor @ frame)
+        log_stretch = log_stretch + jnp.log(jnp.abs(jnp.diagonal(triangle)))
+        largest = jnp.linalg.norm(product, ord=2)
+        return (product, log_size, frame, log_stretch), (log_size + jnp.log(largest), log_stretch)
+
+    zero = jnp.zeros((), jacobians.dtype)
+    start = (identity, zero, identity, jnp.zeros(jacobians.shape[-1], jacobians.dtype))
+    _, (log_largest, log_stretches) = jax.lax.scan(multiply, start, jacobians)
+    return Growth(log_largest, log_stretches)
+
+
+class Crossover(eqx.Module):
+    """The horizon from which on the second estimator is at least as good as the first.
+
+    Attributes:
+        horizon: interpolated; infinite if it is not reached, the first horizon if it is so from the beginning.
+        low: lower end of its interval.
+        high: upper end, infinite if resamples do not reach it.
+        log_ratio: logarithm of the first estimator's mean squared error over the second's.
+    """
+
+    horizon: float
+    low: float
+    high: float
+    log_ratio: Float[np.ndarray, " horizons"]
+
+
+def crossover(
+    horizons: Float[np.ndarray, " horizons"],
+    first: Float[np.ndarray, "repeats horizons"],
+    second: Float[np.ndarray, "repeats horizons"],
+    *,
+    confidence: float = 0.95,
+    num_resamples: int = 1000,
+    seed: int = 0,
+) -> Crossover:
+    """Find where two estimators' mean squared errors cross for good, with a bootstrap interval over repeats.
+
+    For good: the last horizon at which the first one is better is followed by the crossing, so that a passing draw near the
+    beginning is none. Between horizons the logarithm of the ratio is interpolated.
+
+    Args:
+        horizons: increasing, in any unit.
+        first: squared errors of repeated estimates by the first estimator.
+        second: by the second, as often; repeats of both are drawn alike, for they may share rollouts.
+        confidence: of the interval.
+        num_resamples: of the bootstrap.
+        seed: of its draws.
+
+    Returns:
+        The horizon and its interval.
+
+    Raises:
+        ValueError: if shapes differ, horizons do not increase, there are fewer than two repeats, or `confidence` is not
+            between 0 and 1.
+    """
+    tail = (1 - checked(confidence)) / 2
+    if first.shape != second.shape or first.shape[1:] != horizons.shape or len(first) < 2:
+        raise ValueError(
+            "first and second must hold at least two repeats of one number per horizon, got shapes "
+            f"{first.shape} and {second.shape} for {len(horizons)} horizons"
+        )
+    if not (np.diff(horizons) > 0).all():
+        raise ValueError(f"horizons must increase, got {horizons.tolist()}")
+    log_ratio = _log_ratio(first.mean(axis=0), second.mean(axis=0))
+    draws = np.random.default_rng(seed).integers(len(first), size=(num_resamples, len(first)))
+    found = [_last_crossing(horizons, _log_ratio(first[one].mean(axis=0), second[one].mean(axis=0))) for one in draws]
+    # The nearest ones, not between: infinity minus infinity is no number.
+    low, high = np.quantile(found, [tail, 1 - tail], method="nearest")
+    return Crossover(_last_crossing(horizons, log_ratio), float(low), float(high), log_ratio)
+
+
+def _log_ratio(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    # Two errors of zero are alike.
+    tiny = np.finfo(float).tiny
+    return np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
+
+
+def _last_crossing(horizons: np.ndarray, log_ratio: np.ndarray) -> float:
+    is_better = log_ratio < 0
+    if not is_better.any():
+        return float(horizons[0])
+    last = int(np.flatnonzero(is_better)[-1])
+    if last == len(horizons) - 1:
+        return np.inf
+    below, above = log_ratio[last], log_ratio[last + 1]
+    return float(horizons[last] - below / (above - below) * (horizons[last + 1] - horizons[last]))
