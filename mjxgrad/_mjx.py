@@ -19,6 +19,8 @@ try:
         # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
         # has: second implementations of these rules could disagree with them.
         from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as collision_functions
+        from mujoco.mjx._src.collision_driver import _geom_groups as geom_groups
+        from mujoco.mjx._src.collision_driver import _numeric as custom_number
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
         from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
 finally:
@@ -27,6 +29,8 @@ finally:
 __all__ = [
     "collision_functions",
     "counts",
+    "custom_number",
+    "geom_groups",
     "geom_pairs",
     "has_collision_fn",
     "make_efc_address",

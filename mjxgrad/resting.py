@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad.dynamics.block import impedance
+from mjxgrad.dynamics.impedance import impedance
 
 # Halvings of the bracket; a Newton step ends the search.
 _HALVINGS = 50

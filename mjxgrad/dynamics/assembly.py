@@ -2,8 +2,8 @@ r"""Constraint rows of a state: Jacobian, reference acceleration and weight.
 
 The same rows in the same order as `mjx.make_constraint`, so that `mjx.Data` keeps its meaning, formed differently for two
 reasons. Derivatives: MJX's impedance is NaN beyond its width, its stiffness is NaN for a direct solref without damping, and its
-norms have no derivative near zero. Speed: a contact's Jacobian is here one product of wrenches with the joint axes, for
-all contacts at once, and the impedance is evaluated once per contact, not once per pyramid edge.
+norms have no derivative near zero. Speed: the Jacobian is a map that is applied without being formed (see `jacobian`), and
+the impedance is evaluated once per contact, not once per pyramid edge.
 
 A row has residual r, rate J v, and asks for a_ref = -B J v - K d(r) r, with weight D = d / ((1 - d) Â), Â the inverse inertia
 of the row estimated at the reference pose.
@@ -12,7 +12,8 @@ References:
     MuJoCo documentation, "Modeling", "Solver parameters"; "Computation", "Constraint model".
 """
 
-import jax
+import dataclasses
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -22,6 +23,9 @@ from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import contact, equality, limits
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import ConeGroup, Noise, RowLayout, Rows
+from mjxgrad.dynamics.implicit import System
+from mjxgrad.dynamics.inertia import inertia_of
+from mjxgrad.dynamics.jacobian import JoinedRows
 
 _CONDIMS = (1, 3, 4, 6)
 
@@ -58,14 +62,13 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
         fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)  # pyright: ignore[reportArgumentType]
     else:
         block = joined(blocks)
-        residual = jnp.where(block.is_active, block.residual, 0.0)
-        jacobian, reference, weight = law(model, data.qvel, block)
+        reference, weight = law(model, data.qvel, block)
         fields = {
-            "J": jacobian,
+            "J": jnp.where(block.is_active[:, None], block.jacobian, 0.0),
             "D": weight,
             "aref": reference,
             "frictionloss": block.friction_loss,
-            "pos": residual + block.margin,
+            "pos": jnp.where(block.is_active, block.residual, 0.0) + block.margin,
             "margin": block.margin,
         }
     return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})  # pyright: ignore[reportReturnType]
@@ -73,31 +76,58 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
 
 def joined(blocks: list[Block]) -> Block:
     """Return all rows as one block; which of them begin and end together it no longer says."""
-    leaves = [jnp.concatenate(x) for x in zip(*(jax.tree.leaves(block) for block in blocks), strict=True)]
-    return Block(*leaves)
+    leaves = {
+        field.name: jnp.concatenate([getattr(block, field.name) for block in blocks])
+        for field in dataclasses.fields(Block)
+        if field.name != "map" and not field.metadata.get("static")
+    }
+    return Block(JoinedRows(tuple(block.map for block in blocks)), **leaves)
 
 
 def law(
     model: mjx.Model, qvel: Float[Array, " nv"], block: Block
-) -> tuple[Float[Array, "rows nv"], Float[Array, " rows"], Float[Array, " rows"]]:
-    """Return Jacobian, a_ref and weight D of rows; those of inactive rows are zero, zero and of no effect."""
-    jacobian = jnp.where(block.is_active[:, None], block.jacobian, 0.0)
+) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+    """Return a_ref and weight D of rows; those of inactive rows are zero and of no effect."""
     residual = jnp.where(block.is_active, block.residual, 0.0)
+    rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block)
     impedance = block.impedance[:, 0]
     weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
-    return jacobian, -damping * (jacobian @ qvel) - stiffness * impedance * residual, weight
+    return -damping * rate - stiffness * impedance * residual, weight
 
 
-def rows_of(model: mjx.Model, data: mjx.Data, layout: RowLayout, noise: Noise | None = None) -> Rows:
-    """Return the parameters of the rows' laws from assembled data."""
-    impl, scales = data._impl, []
+def system_of(
+    model: mjx.Model,
+    data: mjx.Data,
+    layout: RowLayout,
+    block: Block,
+    noise: Noise | None = None,
+    velocity: Float[Array, " nv"] | None = None,
+) -> System:
+    """Return all that determines the acceleration of a state.
+
+    Args:
+        model: with the solver's options.
+        data: with all smooth forces.
+        layout: the laws of the rows.
+        block: all rows.
+        noise: of rows that have it.
+        velocity: at which the rows ask for their acceleration, if not that of the state.
+    """
+    reference, weight = law(model, data.qvel if velocity is None else velocity, block)
+    rows = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)
+    return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, rows)
+
+
+def cone_scales(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> tuple[Float[Array, "contacts dim"], ...]:
+    """Return (μ, f₁, ...) of each elliptic contact, by group."""
+    touching, scales = data._impl.contact, []
     for group in layout.cones:
-        friction = impl.contact.friction[np.asarray(impl.contact.dim) == group.dim]
+        friction = contact.least_friction(touching.friction)[np.asarray(touching.dim) == group.dim]
         friction = friction[:, : group.dim - 1]
         mu = friction[:, :1] / jnp.sqrt(model.opt.impratio)
         scales.append(jnp.concatenate([mu, friction], axis=1))
-    return Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, tuple(scales), noise)
+    return tuple(scales)
 
 
 def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:

@@ -33,7 +33,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad.dynamics.linear import sum_of_few
+from mjxgrad.dynamics.linear import add, sum_of_few
 from mjxgrad.smoothing.kernels import Kernel
 
 
@@ -162,6 +162,38 @@ def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Floa
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
+class Bend(eqx.Module):
+    """The second derivative of the cost with respect to x.
+
+    Attributes:
+        simple: of each row that stands for itself.
+        cones: of each elliptic contact, a matrix, by group.
+    """
+
+    simple: Float[Array, "_ *batch"]
+    cones: tuple[Float[Array, "_ _ _ *batch"], ...]
+
+
+def bend(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Bend:
+    """Return the second derivative of the cost with respect to x."""
+    cones = []
+    for k, group in enumerate(layout.cones):
+        unit = jnp.eye(group.dim, dtype=x.dtype).reshape(1, group.dim, group.dim, *(1,) * (x.ndim - 1))
+        unit = jnp.broadcast_to(unit, (group.count, group.dim, group.dim, *x.shape[1:]))
+        cones.append(_cone_product(layout, k, rows, x, unit))
+    return Bend(_simple_curvature(layout, rows, x), tuple(cones))
+
+
+def bend_product(layout: RowLayout, bend: Bend, x: Float[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
+    """Return a second derivative of the cost times a vector."""
+    parts = [bend.simple * x[: layout.simple_stop]]
+    for group, matrix in zip(layout.cones, bend.cones, strict=True):
+        own = _blocks(group, x)
+        both = add(matrix[:, :, k] * own[:, None, k] for k in range(group.dim))
+        parts.append(both.reshape(-1, *x.shape[1:]))
+    return jnp.concatenate(parts)
+
+
 def curvature_product(
     layout: RowLayout,
     rows: Rows,
@@ -169,24 +201,34 @@ def curvature_product(
     matrix: Float[Array, "rows columns *batch"],
 ) -> Float[Array, "rows columns *batch"]:
     """Return the second derivative of the cost with respect to x, times a matrix."""
+    parts = [_simple_curvature(layout, rows, x)[:, None] * matrix[: layout.simple_stop]]
+    for k, group in enumerate(layout.cones):
+        both = _cone_product(layout, k, rows, x, _blocks(group, matrix))
+        parts.append(both.reshape(-1, *matrix.shape[1:]))
+    return jnp.concatenate(parts, axis=0)
+
+
+def _simple_curvature(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Float[Array, "_ *batch"]:
     hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
     stuck = jnp.abs(rows.weight[friction] * x[friction]) < rows.bound[friction]
     equality = jnp.ones_like(x[: friction.start], bool)
     is_curved = jnp.concatenate([equality, stuck, x[hard] < 0])
     curvature = jnp.where(is_curved, rows.weight[: layout.hard_stop], 0.0)
-    if layout.kernel is not None:
-        noisy = slice(layout.hard_stop, layout.simple_stop)
-        share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
-        curvature = jnp.concatenate([curvature, rows.weight[noisy] * share])
-    parts = [curvature[:, None] * matrix[: layout.simple_stop]]
-    for group, scale in zip(layout.cones, rows.scales, strict=True):
-        block = _blocks(group, matrix)
-        if layout.kernel is None:
-            both = _cone_curvature(group, rows, scale, x, block)
-        else:
-            both = _noisy_cone(layout.kernel, group, rows, scale, x).curvature_product(block)
-        parts.append(both.reshape(-1, *matrix.shape[1:]))
-    return jnp.concatenate(parts, axis=0)
+    if layout.kernel is None:
+        return curvature
+    noisy = slice(layout.hard_stop, layout.simple_stop)
+    share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
+    return jnp.concatenate([curvature, rows.weight[noisy] * share])
+
+
+def _cone_product(
+    layout: RowLayout, which: int, rows: Rows, x: Float[Array, "rows *batch"], block: Float[Array, "_ _ _ *batch"]
+) -> Float[Array, "_ _ _ *batch"]:
+    """Return the second derivative for one group of elliptic contacts, times a matrix each."""
+    group, scale = layout.cones[which], rows.scales[which]
+    if layout.kernel is None:
+        return _cone_curvature(group, rows, scale, x, block)
+    return _noisy_cone(layout.kernel, group, rows, scale, x).curvature_product(block)
 
 
 def _cone_force(

@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import tree
-from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad._mjx import collision_functions, custom_number, geom_groups, mjx
+from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.jacobian import ContactRows, DenseRows, RowMap, Side
 
 
 def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
@@ -21,30 +23,66 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     chosen = np.nonzero(np.asarray(contact.dim) == dim)[0]
     if not chosen.size:
         return None
+    bodies = slot_bodies(model)
     contact = jax.tree.map(lambda x: x[chosen[0] : chosen[-1] + 1], contact)
-    bodies = jnp.asarray(model.geom_bodyid)[contact.geom]
-    directions = contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim)
-    inverse_weight = jnp.sum(model.body_invweight0[bodies, 0], axis=1)
-    if dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        return _pyramids(model, contact, directions, inverse_weight)
-    return _cones(model, contact, directions, inverse_weight)
+    is_pyramid = dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    contact = contact.replace(friction=least_friction(contact.friction))
+    friction = contact.friction[:, : dim - 1] if is_pyramid else None
+    if bodies is None:
+        of_slots = jnp.asarray(model.geom_bodyid)[contact.geom]
+        matrix = contact_jacobian(model, data, contact.pos, contact.frame, of_slots, dim)
+        rows = DenseRows.of_contacts(matrix, friction)
+    else:
+        of_slots = bodies[chosen]
+        rows = contact_rows(model, data, contact, of_slots, dim, friction)
+    inverse_weight = jnp.sum(model.body_invweight0[of_slots, 0], axis=1)
+    if is_pyramid:
+        return _pyramids(model, contact, rows, inverse_weight, dim)
+    return _cones(model, contact, rows, inverse_weight, dim)
+
+
+def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:
+    """Return friction as C MuJoCo clamps it for every contact: a cone without width has no inside."""
+    return jnp.where(friction > mujoco.mjMINMU, friction, mujoco.mjMINMU)
+
+
+def slot_bodies(model: mjx.Model) -> np.ndarray | None:
+    """Return the two bodies of each contact slot, (contacts, 2); None where MJX chooses at run time who gets a slot."""
+    if custom_number(model, "max_geom_pairs") > -1 or custom_number(model, "max_contact_points") > -1:
+        return None
+    by_dim: dict[int, list[np.ndarray]] = {}
+    for key, members in geom_groups(model).items():
+        geoms = np.array(members)[:, :2]
+        by_dim.setdefault(int(key.condim), []).append(np.repeat(geoms, collision_functions[key.types].ncon, axis=0))
+    slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
+    return np.asarray(model.geom_bodyid)[np.concatenate(slots)] if slots else np.zeros((0, 2), int)
+
+
+def contact_rows(
+    model: mjx.Model, data: mjx.Data, contact: Any, bodies: np.ndarray, dim: int, friction: Array | None
+) -> ContactRows:
+    """Return the rows of contacts between known bodies, as the relative velocity of the two at a point."""
+    moves, sides, roots = tree.moving_dofs(model), [], []
+    for slot, pair in enumerate(bodies):
+        shares_root = model.body_rootid[pair[0]] == model.body_rootid[pair[1]]
+        for sign, body, other in ((-1.0, *pair), (1.0, *pair[::-1])):
+            own = moves[body] * (1 - moves[other]) if shares_root else moves[body]
+            if own.any():
+                sides.append(Side(slot, sign, tuple(int(dof) for dof in np.nonzero(own)[0])))
+                roots.append(model.body_rootid[body])
+    owner = np.array([side.contact for side in sides], int)
+    lever = spatial.pick(owner, contact.pos) - spatial.pick(np.array(roots, int), data.subtree_com)
+    return ContactRows(lever, contact.frame, data.cdof, friction, tuple(sides), dim)
 
 
 def _pyramids(
-    model: mjx.Model,
-    contact: Any,
-    directions: Float[Array, "contacts dim nv"],
-    inverse_weight: Float[Array, " contacts"],
+    model: mjx.Model, contact: Any, rows: RowMap, inverse_weight: Float[Array, " contacts"], dim: int
 ) -> Block:
     """Return two opposite edges for each friction direction: J_n ± μ_k J_k."""
-    count, dim = directions.shape[:2]
-    friction = contact.friction[:, : dim - 1, None]
-    tilt = friction * directions[:, 1:]
-    edges = jnp.stack([directions[:, :1] + tilt, directions[:, :1] - tilt], axis=2)
     mu2 = contact.friction[:, 0] ** 2
     inverse_weight = inverse_weight * (1 + mu2) * 2 * mu2 / model.opt.impratio
     residual = contact.dist - contact.includemargin
-    each = 2 * (dim - 1)
+    count, each = len(residual), 2 * (dim - 1)
 
     def spread(x: Array) -> Array:
         return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
@@ -52,7 +90,7 @@ def _pyramids(
     resistance = spread(impedance(contact.solimp, residual))
     residual = spread(residual)
     return Block(
-        jacobian=edges.reshape(count * each, -1),
+        map=rows,
         residual=residual,
         impedance=resistance,
         solimp=spread(contact.solimp),
@@ -67,15 +105,10 @@ def _pyramids(
     )
 
 
-def _cones(
-    model: mjx.Model,
-    contact: Any,
-    directions: Float[Array, "contacts dim nv"],
-    inverse_weight: Float[Array, " contacts"],
-) -> Block:
+def _cones(model: mjx.Model, contact: Any, rows: RowMap, inverse_weight: Float[Array, " contacts"], dim: int) -> Block:
     """Return the normal row and the rows of friction of each contact, elliptic or frictionless."""
-    count, dim = directions.shape[:2]
     distance = contact.dist - contact.includemargin
+    count = len(distance)
     residual = jnp.zeros((count, dim), distance.dtype).at[:, 0].set(distance)
     weights, solref = [inverse_weight[:, None]], [contact.solref[:, None]]
     if dim > 1:
@@ -90,7 +123,7 @@ def _cones(
         return jnp.repeat(x, dim, axis=0, total_repeat_length=dim * count)
 
     return Block(
-        jacobian=directions.reshape(count * dim, -1),
+        map=rows,
         residual=residual.reshape(-1),
         impedance=spread(impedance(contact.solimp, distance)),
         solimp=spread(contact.solimp),

@@ -7,8 +7,10 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import rotation, tree
-from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.contact import contact_jacobian
+from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.jacobian import DenseRows
 
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
@@ -41,7 +43,7 @@ def _block(
     flat = residual.reshape(-1)
     zero = jnp.zeros_like(flat)
     return Block(
-        jacobian=jacobian.reshape(count * each, -1),
+        map=DenseRows(jacobian.reshape(count * each, -1)),
         residual=flat,
         impedance=spread(impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
         solimp=spread(model.eq_solimp[ids]),

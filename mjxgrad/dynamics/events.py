@@ -64,8 +64,8 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contacts import safe_sqrt
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.constraint import RowLayout
-from mjxgrad.dynamics.newton import Problem
+from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
+from mjxgrad.dynamics.implicit import System
 
 # Nodes and weights of Gauss and Legendre on (0, 1).
 _NODES = 0.5 + 0.5 * np.polynomial.legendre.leggauss(3)[0]
@@ -93,7 +93,7 @@ class _Events(eqx.Module):
     """The events of one step, and the state in which all of them are just in contact.
 
     Attributes:
-        problem: whose minimum is the acceleration.
+        system: whose balance is the acceleration.
         damping: h B of each row that acts after the events; zero of others.
         begins: whether a contact or limit begins.
         ends: whether it ends.
@@ -105,7 +105,7 @@ class _Events(eqx.Module):
         tolerance: of a solve.
     """
 
-    problem: Problem
+    system: System
     damping: Float[Array, " rows"]
     begins: Bool[Array, " contacts"]
     ends: Bool[Array, " contacts"]
@@ -138,7 +138,8 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
     plan = _plan(model, data, blocks, is_spread=False)
     events = _events(model, data, data.qvel, plan, blocks, normal, begins, ends)
     change = _impulse(plan, events, distance) / model.opt.timestep
-    return data.replace(qacc=data.qacc + change, qfrc_constraint=data.qfrc_constraint + events.problem.mass @ change)
+    pushed = data.qfrc_constraint + events.system.inertia.apply(change)
+    return data.replace(qacc=data.qacc + change, qfrc_constraint=pushed)
 
 
 def impulse(
@@ -200,13 +201,9 @@ def _events(
 ) -> _Events:
     is_event = _per_row(plan, begins | ends)
     touching = _in_contact(assembly.joined(blocks), is_event)
-    jacobian, reference, weight = assembly.law(model, velocity, touching)
-    rows = assembly.rows_of(model, data, plan.layout)
-    rows = eqx.tree_at(lambda r: (r.reference, r.weight), rows, (reference, weight))
-    problem = Problem(mjx.full_m(model, data), data.qfrc_smooth, jacobian, rows)
     damping = model.opt.timestep * assembly.stiffness_damping(model, touching)[1]
     return _Events(
-        problem=problem,
+        system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),
         damping=jnp.where(_per_row(plan, ends), 0.0, damping),
         begins=begins,
         ends=ends,
@@ -262,17 +259,16 @@ def _impulse(plan: _Plan, events: _Events, distance: Float[Array, " contacts"]) 
 @_impulse.defjvp
 def _impulse_jvp(plan, primals, tangents):
     events, _ = primals
-    problem, is_event = events.problem, _per_row(plan, events.begins | events.ends)
-    without = _without(problem, is_event)
-    held = implicit.solve(plan.layout, plan.max_iterations, problem, events.start, events.tolerance)
+    system, is_event = events.system, _per_row(plan, events.begins | events.ends)
+    without = _without(system, is_event)
+    held = implicit.solve(plan.layout, plan.max_iterations, system, events.start, events.tolerance)
     free = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
-    point, other = problem.at(plan.layout, held), without.at(plan.layout, free)
     late = jnp.where(events.begins | events.ends, tangents[1] * _delay(events, free), 0.0)
-    lost = linear.rmatvec(problem.jacobian, point.row_force * _per_row(plan, late))
-    response = _secant_hessian(plan.layout, without, other.x, point.x)
-    change = -linear.solve_positive_definite(response, lost)
+    lost = system.pull(system.row_force(plan.layout, held) * _per_row(plan, late))
+    start, stop = (without.rates(a) - without.rows.reference for a in (free, held))
+    change = -implicit.respond(plan.layout, without, _secant_bend(plan.layout, without.rows, start, stop), lost)
     if plan.is_spread:
-        change = _damped(plan, events, point.x, change)
+        change = _damped(plan, events, held, change)
     return 0 * events.start, change
 
 
@@ -283,32 +279,41 @@ def _delay(events: _Events, free: Float[Array, " nv"]) -> Float[Array, " contact
     return events.speed / jnp.where(square > 0, square, 1.0)
 
 
-def _without(problem: Problem, which: Bool[Array, " rows"]) -> Problem:
-    return eqx.tree_at(lambda p: p.rows.weight, problem, jnp.where(which, 0.0, problem.rows.weight))
+def _without(system: System, which: Bool[Array, " rows"]) -> System:
+    return eqx.tree_at(lambda s: s.rows.weight, system, jnp.where(which, 0.0, system.rows.weight))
 
 
-def _secant_hessian(
-    layout: RowLayout, problem: Problem, start: Float[Array, " rows"], stop: Float[Array, " rows"]
-) -> Float[Array, "nv nv"]:
-    """Return the Hessian averaged between two points, by which the forces at both differ."""
-    rows, jacobian = problem.rows, problem.jacobian
+def _secant_bend(layout: RowLayout, rows: Rows, start: Float[Array, " rows"], stop: Float[Array, " rows"]) -> Bend:
+    """Return the curvature averaged between two points, by which the forces at both differ."""
     moved = stop - start
-    curved = constraint.curvature_product(layout, rows, stop, jacobian)
     is_far = jnp.abs(moved) > jnp.sqrt(jnp.finfo(moved.dtype).eps) * (jnp.abs(start) + jnp.abs(stop))
     gained = constraint.force(layout, rows, start) - constraint.force(layout, rows, stop)
-    secant = (gained / jnp.where(is_far, moved, 1.0))[:, None] * jacobian
-    if layout.cones:
-        # The rows of a cone act on each other: no quotient gives their matrix.
-        between = (constraint.curvature_product(layout, rows, start + t * moved, jacobian) for t in _NODES)
-        mean = functools.reduce(operator.add, (s * product for s, product in zip(_SHARES, between, strict=True)))
-        secant = jnp.concatenate([secant[: layout.simple_stop], mean[layout.simple_stop :]])
-    return problem.mass + linear.gram(jacobian, jnp.where(is_far[:, None], secant, curved))
+    secant = gained / jnp.where(is_far, moved, 1.0)
+    curved, simple = constraint.bend(layout, rows, stop), slice(layout.simple_stop)
+    # The rows of a cone act on each other: no quotient gives their matrix.
+    between = [constraint.bend(layout, rows, start + t * moved).cones for t in _NODES] if layout.cones else []
+    means = [
+        linear.add(s * matrix for s, matrix in zip(_SHARES, each, strict=True)) for each in zip(*between, strict=True)
+    ]
+    return Bend(jnp.where(is_far[simple], secant[simple], curved.simple), tuple(means))
 
 
-def _damped(plan: _Plan, events: _Events, x: Float[Array, " rows"], change: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def _damped(
+    plan: _Plan, events: _Events, acceleration: Float[Array, " nv"], change: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
     """Return what contacts leave of a change of velocity in half a time step, by the implicit midpoint rule."""
-    after = _without(events.problem, _per_row(plan, events.ends))
-    hessian = after.hessian(plan.layout, x)
-    slope = events.damping[:, None] * after.jacobian
-    damped = linear.gram(after.jacobian, constraint.curvature_product(plan.layout, after.rows, x, slope))
-    return linear.solve_positive_definite(hessian + 0.5 * damped, hessian @ change)
+    after = _without(events.system, _per_row(plan, events.ends))
+    bend = constraint.bend(plan.layout, after.rows, after.rates(acceleration) - after.rows.reference)
+    resisting = _damped_bend(plan.layout, bend, 0.5 * events.damping)
+    whole = jax.tree.map(operator.add, bend, resisting)
+    resistance = after.pull(constraint.bend_product(plan.layout, resisting, after.rates(change)))
+    return change - implicit.respond(plan.layout, after, whole, resistance)
+
+
+def _damped_bend(layout: RowLayout, bend: Bend, damping: Float[Array, " rows"]) -> Bend:
+    """Return the curvature times the damping of the rows, symmetric."""
+    cones = []
+    for group, matrix in zip(layout.cones, bend.cones, strict=True):
+        own = damping[group.start : group.stop].reshape(group.count, group.dim)
+        cones.append(0.5 * matrix * (own[:, :, None] + own[:, None]))
+    return Bend(bend.simple * damping[: layout.simple_stop], tuple(cones))

@@ -1,6 +1,6 @@
 r"""The derivative of the acceleration, by the implicit function theorem.
 
-At the minimum g(a, p) = M a - f_smooth - Jᵀ f(J a - a_ref) = 0 for all parameters p (mass, forces, Jacobian, rows), so
+At the minimum g(a, p) = M a - f_smooth - Jᵀ f(J a - a_ref) = 0 for all parameters p (inertias, forces, rows), so
 
     da = -H⁻¹ (∂g/∂p) dp,        H = ∂g/∂a = M + Jᵀ s'' J.
 
@@ -9,41 +9,108 @@ it. The rule is linear in dp, so the same line serves forward mode and, transpos
 again, so derivatives of any order nest; one more Newton step with H held fixed would be shorter, but its second derivative is
 wrong, finite and silent, since there H and a do not move with p.
 
+The residual g is evaluated without M and J: M a is the force that accelerates the bodies, J a the acceleration of one body
+against another. So reverse mode passes through some vectors per body and contact, where the derivative of a Jacobian would be a
+Jacobian. Only the solve and the factor of H need entries, and both are formed with the batch as trailing axis.
+
 The acceleration is named "acceleration" for `jax.checkpoint`: a rollout that recomputes its steps keeps this vector and
 spares itself the iterations.
 """
 
 import functools
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from mjxgrad.dynamics import linear, newton
-from mjxgrad.dynamics.constraint import RowLayout
+from mjxgrad.dynamics import constraint, linear, newton
+from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
+from mjxgrad.dynamics.inertia import Inertia
+from mjxgrad.dynamics.jacobian import RowMap, SparseRows
 from mjxgrad.dynamics.newton import Problem
 
 CHECKPOINT_NAME = "acceleration"
+
+
+class System(eqx.Module):
+    """What determines the acceleration of one state, as its derivative wants it.
+
+    Attributes:
+        inertia: M.
+        force: f_smooth, all forces but those of constraints (N or N m).
+        map: J, also of rows that are inactive.
+        is_active: which rows are not.
+        rows: parameters of the rows' laws.
+    """
+
+    inertia: Inertia
+    force: Float[Array, "nv *batch"]
+    map: RowMap
+    is_active: Bool[Array, "rows *batch"]
+    rows: Rows
+
+    def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
+        """Return J v, zero for inactive rows."""
+        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
+
+    def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
+        """Return Jᵀ f."""
+        return self.map.pull(jnp.where(self.is_active, force, 0.0))
+
+    def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
+        """Return the constraint forces at an acceleration."""
+        return constraint.force(layout, self.rows, self.rates(acceleration) - self.rows.reference)
+
+    def gradient(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """Return M a - f_smooth - Jᵀ f, zero at the solution."""
+        pull = self.pull(self.row_force(layout, acceleration))
+        return self.inertia.apply(acceleration) - self.force - pull
+
+    def problem(self) -> Problem:
+        """Return the same with entries; arrays may carry the batch as trailing axes here."""
+        jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
+        return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def solve(
     layout: RowLayout,
     max_iterations: int,
-    problem: Problem,
+    system: System,
     start: Float[Array, " nv"],
     tolerance: Float[Array, ""],
 ) -> Float[Array, " nv"]:
-    """Return the acceleration that minimises `problem`, differentiable with respect to it."""
-    acceleration, _ = newton.minimise(layout, problem, start, tolerance, max_iterations)
-    return acceleration
+    """Return the acceleration at which the forces of a system are in balance, differentiable with respect to it."""
+
+    def run(system, start, tolerance):
+        return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)[0]
+
+    return linear.batch_last(run)(system, start, tolerance)
 
 
 @solve.defjvp
 def _solve_jvp(layout, max_iterations, primals, tangents):
-    problem, start, tolerance = primals
-    # Named here, where reverse mode reads it: the name inside the call is not seen from outside.
-    acceleration = checkpoint_name(solve(layout, max_iterations, problem, start, tolerance), CHECKPOINT_NAME)
-    _, change = jax.jvp(lambda p: p.at(layout, acceleration).gradient, (problem,), (tangents[0],))
-    hessian = problem.hessian(layout, problem.at(layout, acceleration).x)
-    return acceleration, -linear.solve_positive_definite(hessian, change)
+    system, start, tolerance = primals
+    # Named here, where reverse mode reads it: a name inside the call is not seen from outside.
+    acceleration = checkpoint_name(solve(layout, max_iterations, system, start, tolerance), CHECKPOINT_NAME)
+    _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
+    bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
+    return acceleration, -respond(layout, system, bend, change)
+
+
+def respond(layout: RowLayout, system: System, bend: Bend, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force."""
+
+    def apply(x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
+
+    def run(system, bend, force):
+        problem = system.problem()
+        return linear.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
+
+    def invert(_, force):
+        return linear.batch_last(run)(system, bend, force)
+
+    return jax.lax.custom_linear_solve(apply, force, invert, symmetric=True)

@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import rotation
-from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.jacobian import AxisRows, DenseRows, JoinedRows, RowMap
 
 
 def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
@@ -18,15 +20,20 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     tendons = np.nonzero(model._impl.tendon_hasfrictionloss)[0]
     if not dofs.size + tendons.size:
         return None
-    jacobian = jnp.concatenate([jnp.eye(model.nv)[dofs], data._impl.ten_J[tendons]])
-    zero = jnp.zeros(len(jacobian), jacobian.dtype)
+    count, dtype = dofs.size + tendons.size, data.qvel.dtype
+    maps: list[RowMap] = []
+    if dofs.size:
+        maps.append(AxisRows(jnp.ones(dofs.size, dtype), tuple(int(dof) for dof in dofs), model.nv))
+    if tendons.size:
+        maps.append(DenseRows(data._impl.ten_J[tendons]))
+    zero = jnp.zeros(count, dtype)
 
     def join(of_dofs: Any, of_tendons: Any) -> Array:
         return jnp.concatenate([of_dofs[dofs], of_tendons[tendons]])
 
     solimp = join(model.dof_solimp, model.tendon_solimp_fri)
     return Block(
-        jacobian=jacobian,
+        map=maps[0] if len(maps) == 1 else JoinedRows(tuple(maps)),
         residual=zero,
         impedance=impedance(solimp, zero),
         solimp=solimp,
@@ -34,12 +41,12 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
         solref=join(model.dof_solref, model.tendon_solref_fri),
         margin=zero,
         friction_loss=join(model.dof_frictionloss, model.tendon_frictionloss),
-        is_active=jnp.ones(len(jacobian), bool),
+        is_active=jnp.ones(count, bool),
     )
 
 
 def _limit(
-    jacobian: Float[Array, "rows nv"],
+    map: RowMap,
     distance: Float[Array, " rows"],
     margin: Float[Array, " rows"],
     inverse_weight: Float[Array, " rows"],
@@ -49,7 +56,7 @@ def _limit(
     residual = distance - margin
     zero = jnp.zeros_like(residual)
     return Block(
-        jacobian,
+        map,
         residual,
         impedance(solimp, residual),
         solimp,
@@ -76,7 +83,7 @@ def ball_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
     select = np.zeros((len(joints), 3, model.nv))
     select[np.arange(len(joints))[:, None], np.arange(3), dofs[:, None] + np.arange(3)] = 1
     return _limit(
-        jacobian=-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1),
+        map=DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1)),
         distance=jnp.max(model.jnt_range[joints], axis=1) - angle,
         margin=model.jnt_margin[joints],
         inverse_weight=model.dof_invweight0[dofs],
@@ -95,7 +102,7 @@ def joint_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
     dofs = model.jnt_dofadr[joints]
     distance, sign = _nearer_end(position, model.jnt_range[joints])
     return _limit(
-        jacobian=sign[:, None] * jnp.eye(model.nv, dtype=position.dtype)[dofs],
+        map=AxisRows(sign, tuple(int(dof) for dof in dofs), model.nv),
         distance=distance,
         margin=model.jnt_margin[joints],
         inverse_weight=model.dof_invweight0[dofs],
@@ -111,7 +118,7 @@ def tendon_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
         return None
     distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])
     return _limit(
-        jacobian=sign[:, None] * data._impl.ten_J[tendons],
+        map=DenseRows(sign[:, None] * data._impl.ten_J[tendons]),
         distance=distance,
         margin=model.tendon_margin[tendons],
         inverse_weight=model.tendon_invweight0[tendons],

@@ -6,8 +6,10 @@ third and a fifth of the time of their batched counterparts, which work on one s
 axes are written out, since XLA does not vectorise a reduction over the batch that is left.
 """
 
+import dataclasses
 import functools
 import operator
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,7 @@ def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> F
         return matrix @ x
     if matrix.shape[1] > _LONGEST_SUM:
         return jnp.einsum("mn...,n...->m...", matrix, x, precision="highest")
-    return _add(matrix[:, i] * x[i] for i in range(matrix.shape[1]))
+    return add(matrix[:, i] * x[i] for i in range(matrix.shape[1]))
 
 
 def rmatvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
@@ -40,7 +42,7 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
         return jnp.sum(x * y)
     if len(x) > _LONGEST_SUM:
         return jnp.sum(x * y, axis=0)
-    return _add(a * b for a, b in zip(x, y, strict=True))
+    return add(a * b for a, b in zip(x, y, strict=True))
 
 
 def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "contacts 1 *rest"]:
@@ -49,13 +51,13 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
     XLA's CPU backend hands such a reduction to a library (YNNPACK)
     that neither vectorises it over the batch nor, under two `jax.vmap` (jax 0.10.2), always survives it.
     """
-    return _add(terms[:, i : i + 1] for i in range(terms.shape[1]))
+    return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
 def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
     """Return leftᵀ right for a product known to be symmetric."""
     if left.ndim > 2 and len(left) <= _LONGEST_SUM:
-        return _add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
+        return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
     product = jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
     return 0.5 * (product + jnp.swapaxes(product, 0, 1))
 
@@ -88,16 +90,25 @@ def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *
     return jnp.stack(solution[::-1])
 
 
-def solve_positive_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve_positive_definite(
+    matrix: Float[Array, "n n"],
+    vector: Float[Array, " n"],
+    apply: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None,
+) -> Float[Array, " n"]:
     """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
     Under `jax.vmap` the batch is moved to the trailing axis for the factorisation.
+
+    Args:
+        matrix: symmetric, positive definite.
+        vector: right-hand side.
+        apply: the matrix as a map, through which to differentiate in place of its entries.
     """
 
     def solve(_, b):
         return batch_last(cholesky_solve)(matrix, b)
 
-    return jax.lax.custom_linear_solve(lambda x: matrix @ x, vector, solve, symmetric=True)
+    return jax.lax.custom_linear_solve(apply or (lambda x: matrix @ x), vector, solve, symmetric=True)
 
 
 def batch_last(function, batch: int | None = None):
@@ -133,5 +144,32 @@ def batch_last(function, batch: int | None = None):
     return wrapped
 
 
-def _add(terms) -> Array:
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Neighbours among chosen entries.
+
+    Attributes:
+        target: their place among all entries.
+        source: their place among the chosen ones.
+    """
+
+    target: slice
+    source: slice
+
+
+def runs(chosen: tuple[int, ...]) -> list[Run]:
+    """Return ascending indices as few slices."""
+    cuts = [k for k in range(1, len(chosen)) if chosen[k] != chosen[k - 1] + 1]
+    ends = zip([0, *cuts], [*cuts, len(chosen)], strict=True)
+    return [Run(slice(chosen[a], chosen[a] + b - a), slice(a, b)) for a, b in ends if b > a]
+
+
+def take(x: Float[Array, "n *rest"], chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
+    """Return entries at ascending constant indices."""
+    parts = [x[run.target] for run in runs(chosen)]
+    return parts[0] if len(parts) == 1 else jnp.concatenate([x[:0], *parts])
+
+
+def add(terms: Iterable[Array]) -> Array:
+    """Return a sum, written out."""
     return functools.reduce(operator.add, terms)

@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import constraint, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
+from mjxgrad.dynamics.jacobian import SparseRows
 
 # Newton steps along the search line. Near the solution the first, of length one, is already exact; far from it an inexact
 # search costs an outer iteration and not the answer. On a box and a ball that slide on a plane, 2 to 12 steps needed the
@@ -47,21 +48,20 @@ class Problem(eqx.Module):
 
     mass: Float[Array, "nv nv *batch"]
     force: Float[Array, "nv *batch"]
-    jacobian: Float[Array, "rows nv *batch"]
+    jacobian: SparseRows
     rows: Rows
 
     def at(self, layout: RowLayout, acceleration: Float[Array, "nv *batch"]) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = linear.matvec(self.jacobian, acceleration) - self.rows.reference
+        x = self.jacobian.matvec(acceleration) - self.rows.reference
         row_force = constraint.force(layout, self.rows, x)
         inertia = linear.matvec(self.mass, acceleration)
-        pull = linear.rmatvec(self.jacobian, row_force)
-        return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
+        pull = self.jacobian.rmatvec(row_force)
+        return Point(acceleration, x, inertia, pull, inertia - self.force - pull)
 
     def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
         """Return the second derivative of the cost, M + Jᵀ s'' J."""
-        curved = constraint.curvature_product(layout, self.rows, x, self.jacobian)
-        return self.mass + linear.gram(self.jacobian, curved)
+        return self.jacobian.gram(self.mass, layout, constraint.bend(layout, self.rows, x))
 
 
 class Point(eqx.Module):
@@ -70,7 +70,6 @@ class Point(eqx.Module):
     Attributes:
         acceleration: a.
         x: J a - a_ref.
-        row_force: constraint forces f(x).
         inertia: M a.
         pull: Jᵀ f, the constraint forces in joint space.
         gradient: M a - f_smooth - Jᵀ f.
@@ -78,7 +77,6 @@ class Point(eqx.Module):
 
     acceleration: Float[Array, "nv *batch"]
     x: Float[Array, "rows *batch"]
-    row_force: Float[Array, "rows *batch"]
     inertia: Float[Array, "nv *batch"]
     pull: Float[Array, "nv *batch"]
     gradient: Float[Array, "nv *batch"]
@@ -87,30 +85,6 @@ class Point(eqx.Module):
         """Return the size that the gradient has by rounding alone."""
         terms = jnp.abs(self.inertia) + jnp.abs(self.pull)
         return 4 * jnp.finfo(terms.dtype).eps * jnp.sqrt(linear.dot(terms, terms))
-
-
-def minimise(
-    layout: RowLayout,
-    problem: Problem,
-    start: Float[Array, "nv *batch"],
-    tolerance: Float[Array, "*batch"],
-    max_iterations: int,
-) -> tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]:
-    """Return the acceleration of least cost and the number of iterations spent.
-
-    Args:
-        layout: the laws of the rows.
-        problem: the cost.
-        start: where to begin, usually the last acceleration. A non-finite start is replaced by zero.
-        tolerance: on the norm of the gradient, and on the decrease that the quadratic model still promises, both
-            divided by the trace of the mass matrix, as MJX does. The search also ends where the gradient is rounding.
-        max_iterations: upper bound.
-
-    Returns:
-        The acceleration, NaN where the problem is not finite, and the number of iterations.
-    """
-    run = functools.partial(_minimise, layout, max_iterations)
-    return linear.batch_last(run)(problem, start, tolerance)
 
 
 class _Iterate(eqx.Module):
@@ -126,14 +100,28 @@ class _Iterate(eqx.Module):
     num_iterations: Int[Array, "*batch"]
 
 
-def _minimise(
+def minimise(
     layout: RowLayout,
-    max_iterations: int,
     problem: Problem,
     start: Float[Array, "nv *batch"],
     tolerance: Float[Array, "*batch"],
+    max_iterations: int,
 ) -> tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]:
-    """Iterate until every member of the batch is done; those that are do not move any more."""
+    """Return the acceleration of least cost and the number of iterations spent.
+
+    It goes on until every member of the batch is done; those that are do not move any more.
+
+    Args:
+        layout: the laws of the rows.
+        problem: the cost.
+        start: where to begin, usually the last acceleration. A non-finite start is replaced by zero.
+        tolerance: on the norm of the gradient, and on the decrease that the quadratic model still promises, both
+            divided by the trace of the mass matrix, as MJX does. The search also ends where the gradient is rounding.
+        max_iterations: upper bound.
+
+    Returns:
+        The acceleration, NaN where the problem is not finite, and the number of iterations.
+    """
     trace = functools.reduce(operator.add, (problem.mass[i, i] for i in range(len(start))))
     scale = 1 / jnp.maximum(trace, mujoco.mjMINVAL)
 
@@ -174,7 +162,7 @@ def _line_search(
     layout: RowLayout, problem: Problem, point: Point, direction: Float[Array, "nv *batch"]
 ) -> Float[Array, "*batch"]:
     """Return the minimiser of the cost along a descent direction, or a shorter step that lowers it."""
-    along = linear.matvec(problem.jacobian, direction)
+    along = problem.jacobian.matvec(direction)
     smooth_slope = linear.dot(direction, point.inertia - problem.force)
     smooth_curvature = linear.dot(direction, linear.matvec(problem.mass, direction))
 

@@ -31,8 +31,9 @@ from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly
-from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Noise, RowLayout
+from mjxgrad.dynamics.impedance import impedance
 from mjxgrad.smoothing import Kernel, Smoothing
 
 # Far below the stiffness of any contact (1/s²). Without stiffness noise on the distance does nothing, and c divides.

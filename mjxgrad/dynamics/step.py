@@ -16,15 +16,18 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, events, forces, implicit, linear, noise, smooth
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
-from mjxgrad.dynamics.constraint import RowLayout, Rows
+from mjxgrad.dynamics.constraint import Noise, RowLayout, Rows
+from mjxgrad.dynamics.implicit import System
+from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
-from mjxgrad.dynamics.newton import Problem
+from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.smoothing import Smoothing
 
 _Disable = mujoco.mjtDisableBit
@@ -121,7 +124,10 @@ def _forward(model: mjx.Model, data: mjx.Data, smoothing: Smoothing | None) -> t
     data, blocks = _smooth(model, data)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
-    data = solve(model, data) if smoothing is None else _smoothed_solve(model, data, blocks, smoothing)
+    if smoothing is None:
+        data = _minimum(model, data, *_system(model, data, blocks), _start(model, data))
+    else:
+        data = _smoothed_solve(model, data, blocks, smoothing)
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
@@ -141,10 +147,20 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX.
     """
+    layout, impl = assembly.row_layout(model, data), data._impl
+    rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
+    entries = DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones))
+    active = jnp.ones(layout.num_rows, bool)
+    system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
+    return _minimum(model, data, layout, system, _start(model, data))
+
+
+def _system(
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], noise: Noise | None = None
+) -> tuple[RowLayout, System | None]:
+    """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
     layout = assembly.row_layout(model, data)
-    if not layout.num_rows or not model.nv:
-        return data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
-    return _minimum(model, data, layout, assembly.rows_of(model, data, layout), _start(model, data))
+    return layout, assembly.system_of(model, data, layout, assembly.joined(blocks), noise) if blocks else None
 
 
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -154,16 +170,18 @@ def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
 def _smoothed_solve(model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing) -> mjx.Data:
     """Solve with rows under noise; in backward mode without it, but for the derivative."""
+    given = jax.lax.stop_gradient(blocks)
     layout = assembly.row_layout(model, data)
     blocks, uncertain, layout = noise.smoothed(model, data, blocks, smoothing, layout)
     if uncertain is None or not model.nv:
-        return solve(model, data)
+        return _minimum(model, data, *_system(model, data, blocks), _start(model, data))
     soft = assembly.make_constraint(model, data, blocks)
-    rows = assembly.rows_of(model, soft, layout, uncertain)
+    system = assembly.system_of(model, data, layout, assembly.joined(blocks), uncertain)
     if smoothing.mode == "forward":
-        return _minimum(model, soft, layout, rows, _start(model, data))
-    hard = solve(*jax.lax.stop_gradient((model, data)))
-    soft = _minimum(model, soft, layout, rows, hard.qacc)
+        return _minimum(model, soft, layout, system, _start(model, data))
+    fixed_model, fixed_data = jax.lax.stop_gradient((model, data))
+    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data))
+    soft = _minimum(model, soft, layout, system, hard.qacc)
 
     def forces_of(data: mjx.Data) -> dict[str, Array]:
         return {"qacc": data.qacc, "qfrc_constraint": data.qfrc_constraint, "_impl.efc_force": data._impl.efc_force}
@@ -182,23 +200,25 @@ def _with_derivative_of_jvp(primals, tangents):
     return _with_derivative_of(*primals), tangents[1]
 
 
-def _minimum(model: mjx.Model, data: mjx.Data, layout: RowLayout, rows: Rows, start: Float[Array, " nv"]) -> mjx.Data:
-    mass = mjx.full_m(model, data)
-    problem = Problem(mass, data.qfrc_smooth, data._impl.efc_J, rows)
-    tolerance = jnp.asarray(model.opt.tolerance, mass.dtype)
+def _minimum(
+    model: mjx.Model, data: mjx.Data, layout: RowLayout, system: System | None, start: Float[Array, " nv"]
+) -> mjx.Data:
+    if system is None or not layout.num_rows or not model.nv:
+        return data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
+    tolerance = jnp.asarray(model.opt.tolerance, data.qvel.dtype)
     acceleration = implicit.solve(
         layout,
         int(model.opt.iterations),
-        problem,
+        system,
         jax.lax.stop_gradient(start),
         jax.lax.stop_gradient(tolerance),
     )
-    point = problem.at(layout, acceleration)
+    force = system.row_force(layout, acceleration)
     return data.tree_replace(  # pyright: ignore[reportReturnType]
         {
             "qacc": acceleration,
-            "qfrc_constraint": point.pull,
-            "_impl.efc_force": point.row_force,
+            "qfrc_constraint": system.pull(force),
+            "_impl.efc_force": force,
         }
     )
 
@@ -223,11 +243,23 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
 
 
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off."""
-    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER):
+    """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
+
+    (M + h D) a' = M a, and M a the sum of all forces, is a' = a - (M + h D)⁻¹ h D a: so the forces need not be added up, nor
+    their derivatives.
+    """
+    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or _is_zero(model.dof_damping):
         return data.qacc
-    mass = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
-    return linear.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+    damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
+    slowed = linear.solve_positive_definite(
+        inertia.matrix + jnp.diag(damping), damping * data.qacc, lambda x: inertia.apply(x) + damping * x
+    )
+    return data.qacc - slowed
+
+
+def _is_zero(values: Array) -> bool:
+    """Whether numbers are known to be zero: those of a model that is an argument are not known."""
+    return not isinstance(values, jax.core.Tracer) and not np.any(np.asarray(values))
 
 
 def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:

@@ -20,8 +20,10 @@ from jaxtyping import Array, Float
 
 from mjxgrad.contacts import contact_parameters
 from mjxgrad.dynamics import assembly, constraint, noise
-from mjxgrad.dynamics.block import Block, impedance
+from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import RowLayout, Rows
+from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.scene import Scene
 from mjxgrad.smoothing.smoothing import Smoothing
 
@@ -145,7 +147,7 @@ def contact_profile(
 
         residual, zero = distance - parameters.margin, jnp.zeros_like(distance)
         block = Block(
-            jacobian=jnp.ones((len(distance), 1), distance.dtype),
+            map=DenseRows(jnp.ones((len(distance), 1), distance.dtype)),
             residual=residual,
             impedance=impedance(repeat(parameters.solimp), residual),
             solimp=repeat(parameters.solimp),
@@ -160,9 +162,9 @@ def contact_profile(
         layout, row_noise = RowLayout(0, 0, len(distance)), None
         if smoothing is not None:
             block, row_noise, layout = noise.noisy_rows(scene.model, block, smoothing, layout)
-        jacobian, reference, weight = assembly.law(scene.model, jnp.zeros(1, distance.dtype), block)
+        reference, weight = assembly.law(scene.model, jnp.zeros(1, distance.dtype), block)
         rows = Rows(reference, weight, zero, (), row_noise)
-        return constraint.force(layout, rows, jacobian[:, 0] * acceleration - reference)
+        return constraint.force(layout, rows, jnp.where(block.is_active, acceleration, 0.0) - reference)
 
     return profile
 
