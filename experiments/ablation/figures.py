@@ -9,7 +9,7 @@ from experiments.ablation.variants import NEEDED, REACHED
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
-_TITLES = ("time of a step", "time of a gradient", "operations of a step", "compilation of the gradient")
+_TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
 
 
 def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
@@ -43,7 +43,7 @@ def ratios(drawn: list[tuple[SceneOutcome, VariantOutcome]]):
     for axis, title in zip(axes[0], _TITLES, strict=True):
         axis.axvline(1.0, color=REFERENCE, lw=1)
         axis.set_title(title)
-        axis.set_xlim(left=0)
+        axis.set_xlim(0, max(1.12, axis.get_xlim()[1]))
         axis.set_xlabel("share")
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)

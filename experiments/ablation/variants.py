@@ -13,7 +13,7 @@ from mjxgrad.contacts import contact_pairs
 from mjxgrad.scene.leave_out import omit
 from mjxgrad.scene.omissions import switch_off
 
-EVERYTHING, NEEDED, REACHED = "everything", "all that is not needed", "all that, and what is not reached"
+EVERYTHING, NEEDED, REACHED = "everything", "all that is not needed", "all not needed or not reached"
 RENDERING, SENSORS, TENDONS = "rendering elements", "sensors", "unused tendons"
 FUSED, DAMPING = "fixed bodies", "implicit damping of zero"
 PROVEN, PAIRS, LIMITS = "contacts proven apart", "contacts not reached", "limits not reached"

@@ -18,9 +18,9 @@ def verdict(outcome: Outcome) -> str:
     Returns:
         A few sentences.
     """
-    sentences = [_gain(outcome, NEEDED, "Leaving out what no motion needs"), _safety(outcome)]
+    sentences = [_gain(outcome, NEEDED, "what no motion needs"), _safety(outcome)]
     if any(scene.find(REACHED) for scene in outcome.scenes):
-        sentences.append(_gain(outcome, REACHED, "Leaving out as well what recorded motions did not reach"))
+        sentences.append(_gain(outcome, REACHED, "what recorded motions did not reach, either"))
         sentences.append(_generalisation(outcome))
     return " ".join(sentences)
 
@@ -48,16 +48,16 @@ def _gain(outcome: Outcome, name: str, subject: str) -> str:
     having = [(scene, v) for scene in outcome.scenes if (v := scene.find(name))]
     same = [scene.name for scene, v in having if v.is_same_program]
     other = [(scene, v) for scene, v in having if not v.is_same_program]
-    parts = []
+    sentences = []
     if other:
-        faster = ", ".join(
-            f"{scene.name} (step {_percent(v.step)}{f', gradient {_percent(v.gradient)}' if v.gradient else ''})"
+        times = ", ".join(
+            f"{scene.name} {_percent(v.step)} %" + (f", its gradient {_percent(v.gradient)} %" if v.gradient else "")
             for scene, v in sorted(other, key=lambda one: one[1].step.ratio[1])
         )
-        parts.append(f"changes the time of a step to, in per cent of that with everything: {faster}")
+        sentences.append(f"Without {subject} a step takes of its time with everything: {times}.")
     if same:
-        parts.append(f"gives XLA the same program, letter for letter, in {_listed(same)}")
-    return f"{subject} {'; it '.join(parts)}."
+        sentences.append(f"Without {subject} XLA is given the same program, letter for letter, in {_listed(same)}.")
+    return " ".join(sentences)
 
 
 def _safety(outcome: Outcome) -> str:
