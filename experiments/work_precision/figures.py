@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from experiments.report import Figure
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 from experiments.work_precision.front import pareto_front
-from experiments.work_precision.outcome import MG, MJX, C, Course, Estimate, Outcome, Point
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Estimate, Outcome, Point
 
 _COLOURS = {MG: ZEROTH, MJX: FIRST, C: "#009e73"}
 _MARKERS = {"Euler": "o", "implicitfast": "s", "RK4": "^"}
@@ -53,12 +53,13 @@ def motion(course: Course, outcome: Outcome):
     figure, axes = subplots(1, 2, height=4.3, sharey=True, sharex=True)
     tight = [one for one in course.in_batch() if _is_tight(one, outcome)]
     others = [one for one in course.points if one not in tight and one.batch == tight[0].batch]
+    others = [one for one in others if one.cone == course.cone or one.integrator == "Euler"]
     front = pareto_front([one.cost for one in tight], [one.error for one in tight])
     _front(axes[0, 0], tight, front)
     _ring(axes[0, 0], [one for one in tight if one.library != C])
     for axis, shown in zip(axes[0], (tight, others), strict=True):
         for line in _lines(shown):
-            _motion_line(axis, line, course)
+            _motion_line(axis, line, _look(line[0], course, is_tight=line[0] in tight))
         for library in (MG, C):
             floor = max(course.floor(library), _SMALLEST)
             axis.axhline(floor, color=_COLOURS[library], lw=0.9, ls=(0, (2, 3)), zorder=0)
@@ -116,7 +117,7 @@ def gradient(course: Course, outcome: Outcome):
 def _is_tight(point: Point, outcome: Outcome) -> bool:
     tight = outcome.settings.tight_tolerance
     tight = max(tight, _RESOLVED) if point.precision == "float32" else tight
-    return point.tolerance <= tight and point.iterations >= 100
+    return point.tolerance <= tight and point.iterations >= NUM_ITERATIONS
 
 
 def _lines(measured: Iterable[Any]) -> list[list[Any]]:
@@ -126,14 +127,14 @@ def _lines(measured: Iterable[Any]) -> list[list[Any]]:
     return list(lines.values())
 
 
-def _motion_line(axis: Axes, line: Sequence[Point], course: Course) -> None:
+def _motion_line(axis: Axes, line: Sequence[Point], look: tuple[str, str | None]) -> None:
     shown = sorted((one for one in line if one.error <= _LARGEST), key=lambda one: one.timestep)
     if not shown:
         return
     first = shown[0]
     colour = _COLOURS[first.library]
     costs, errors = np.array([one.cost for one in shown]), np.array([max(one.error, _SMALLEST) for one in shown])
-    marker, face = _look(first, course)
+    marker, face = look
     axis.plot(costs, errors, color=colour, lw=1.1, ls="--" if face == "white" else "-")
     low, high = (np.array([pick(one.seconds) for one in shown]) for pick in (min, max))
     axis.errorbar(
@@ -142,12 +143,12 @@ def _motion_line(axis: Axes, line: Sequence[Point], course: Course) -> None:
     )  # fmt: skip
 
 
-def _look(point: Point, course: Course) -> tuple[str, str | None]:
+def _look(point: Point, course: Course, *, is_tight: bool) -> tuple[str, str | None]:
     if point.cone != course.cone:
         return "D", "white"
-    if point.iterations < 100:
+    if point.iterations < NUM_ITERATIONS:
         return "x", None
-    if point.tolerance > _RESOLVED:
+    if not is_tight:
         return "v", "white"
     return _MARKERS[point.integrator], "white" if point.precision == "float32" else None
 
@@ -157,7 +158,7 @@ def _motion_legend(tight: Sequence[Point], others: Sequence[Point]) -> list[Line
     present = {one.integrator for one in tight}
     marks = [Line2D([], [], color=MUTED, marker=m, ls="", ms=5, label=n) for n, m in _MARKERS.items() if n in present]
     marks.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls=(0, (4, 2)), ms=5, label="float32"))
-    if any(one.tolerance > _RESOLVED for one in others):
+    if any(one.iterations >= NUM_ITERATIONS and one.cone == tight[0].cone for one in others):
         marks.append(Line2D([], [], color=MUTED, marker="v", mfc="white", ls="", ms=5, label="looser tolerance"))
     marks.append(Line2D([], [], color=MUTED, marker="x", ls="", ms=5, label="1 or 3 iterations"))
     if len({one.cone for one in others}) > 1:

@@ -257,8 +257,9 @@ def _estimates(
             centre, chance = _expectation(function, records, gradients, values, case.stddev)
             offset = float(np.linalg.norm(centre - right) / size)
             chance = float(np.linalg.norm(chance) / size)
-            bias = float(np.sqrt(max(0.0, offset**2 - chance**2)))
             variance = float(values.var(axis=0, ddof=1).sum() / size**2)
+            is_finite = np.isfinite([offset, chance, variance]).all()
+            bias = float(np.sqrt(max(0.0, offset**2 - chance**2))) if is_finite else np.inf
             low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
             found.append(
                 Estimate(
@@ -266,7 +267,7 @@ def _estimates(
                     num_samples=num_samples,
                     timestep=knobs.timestep,
                     softening=knobs.softening,
-                    error=float(np.hypot(bias, np.sqrt(variance))),
+                    error=float(np.hypot(bias, np.sqrt(variance))) if is_finite else np.inf,
                     spread=(low, high),
                     bias=bias,
                     bias_error=chance,

@@ -1,6 +1,8 @@
 """C MuJoCo on the same starts, on some threads."""
 
+import contextlib
 import time
+from collections.abc import Iterator
 
 import mujoco
 import mujoco.rollout
@@ -8,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.work_precision.cases import Case
-from experiments.work_precision.programs import NUM_ITERATIONS, Cone, Ends, Integrator, Knobs, c_model, steps
+from experiments.work_precision.outcome import NUM_ITERATIONS
+from experiments.work_precision.programs import Cone, Ends, Integrator, Knobs, c_model, steps
 
 # Rollouts keep every state on the way: this many at once stay within some hundred megabytes.
 _AT_A_TIME = 128
@@ -40,12 +43,14 @@ def simulate(
     """
     model = c_model(case, integrator, cone, iterations)
     model.opt.timestep, model.opt.tolerance = knobs.timestep, knobs.tolerance
+    # What diverges shall end as no number, not at a new start.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     num_steps, batch = steps(case, knobs.timestep), len(qvel)
     initial = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     initial[:, 1 : 1 + model.nq] = case.start[0]
     initial[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
     workers, seconds, finals = [mujoco.MjData(model) for _ in range(threads)], 0.0, []
-    with mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+    with _unsaid(), mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
         for part in np.array_split(initial, -(-batch // _AT_A_TIME)):
             control = np.tile(case.controls, (len(part), num_steps, 1)) if model.nu else None
             begun = time.perf_counter()
@@ -87,3 +92,13 @@ def differences(model: mujoco.MjModel, start: Ends, end: Ends) -> Float[np.ndarr
         if np.isfinite(one).all() and np.isfinite(other).all():
             mujoco.mj_differentiatePos(model, found[row], 1.0, one, other)
     return found
+
+
+@contextlib.contextmanager
+def _unsaid() -> Iterator[None]:
+    """Keep C MuJoCo from writing a warning, to the terminal and to a file, for each state that diverges: the error says it."""
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)

@@ -11,6 +11,8 @@ from experiments.work_precision.settings import WorkPrecisionSettings
 
 C = "C MuJoCo"
 MG, MJX = "mg.step", "mjx.step"
+# Of the solver, enough to converge.
+NUM_ITERATIONS = 100
 
 
 @dataclass(frozen=True)

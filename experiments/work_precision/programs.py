@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.work_precision.cases import Case
+from experiments.work_precision.outcome import NUM_ITERATIONS
 from mjxgrad._mjx import mjx
 
 Library = Literal["mg", "mjx"]
@@ -39,8 +40,6 @@ CONES: dict[Cone, mujoco.mjtCone] = {
     "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
 }
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
-# Of the solver, enough to converge.
-NUM_ITERATIONS = 100
 # And too few, to see what they cost in error.
 FEW_ITERATIONS = (1, 3)
 _AT_A_TIME = 2

@@ -10,11 +10,10 @@ from jaxtyping import Float
 
 from experiments.work_precision.cases import Case
 from experiments.work_precision.native import differences, simulate
-from experiments.work_precision.outcome import MG, MJX, C, Point, Reference, relative_errors, rms
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Point, Reference, relative_errors, rms
 from experiments.work_precision.programs import (
     CONES,
     FEW_ITERATIONS,
-    NUM_ITERATIONS,
     Cone,
     Ends,
     Integrator,

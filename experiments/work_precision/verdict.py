@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from experiments.report import Table
+from experiments.report import Table, quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
-from experiments.work_precision.outcome import MG, MJX, C, Course, Outcome, Point
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Outcome, Point
 
 
 def verdict(outcome: Outcome) -> str:
@@ -90,8 +90,8 @@ def summary(outcome: Outcome) -> Table:
     caption = (
         "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one "
         f"state in a batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
-        f"{_threads(outcome)}; of the gradient with its rollouts and the time they take. A dash: no setting that was tried gets "
-        "there; a question mark: the reference is not known so well."
+        f"{_threads(outcome)}; of the gradient with its rollouts, as many as bias and variance call for, and the time they "
+        "take. A dash: no setting that was tried gets there; a question mark: the reference is not known so well."
     )
     return Table(columns, rows, caption)
 
@@ -131,7 +131,7 @@ def _alone_and_together(course: Course, library: str) -> str:
     costs: dict[bool, float] = {}
     for one in course.points:
         is_plain = one.integrator == "Euler" and one.cone == course.cone and one.timestep == course.timestep
-        is_converged = one.iterations >= 100 and one.tolerance <= 1e-6
+        is_converged = one.iterations >= NUM_ITERATIONS and one.tolerance <= 1e-6
         if one.library == library and is_plain and is_converged and (library == C or one.precision == "float32"):
             costs[one.batch > 1] = 1e3 * one.cost
     return f"{costs[False]:.3g}; {costs[True]:.3g}"
@@ -196,10 +196,9 @@ def _choice(choice: Choice | None) -> str:
         return "–"
     one = choice.estimate
     soft = f", contact {one.softening:g} times softer" if one.softening != 1 else ""
-    return (
-        f"{one.estimator}, {1e3 * one.timestep:g} ms{soft}, {choice.num_samples:.0f} rollouts, "
-        f"{_milliseconds_of(choice.seconds)} ms"
-    )
+    count = f"{choice.num_samples:.0f}" if choice.num_samples < 1e4 else quantity(choice.num_samples)
+    seconds = f"{_milliseconds_of(choice.seconds)} ms" if choice.seconds < 10 else f"{choice.seconds:.0f} s"
+    return f"{one.estimator}, {1e3 * one.timestep:g} ms{soft}, {count} rollouts, {seconds}"
 
 
 def _milliseconds(point: Point | None) -> str:
