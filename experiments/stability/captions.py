@@ -4,7 +4,7 @@ from experiments.stability.outcome import Outcome, SceneOutcome
 from mjxgrad.diagnostics.stability.classes import BOUNCE, GAIN
 
 _LIMITS = {
-    "two balls": "Dashed, in the plane of speed and time step: one step carries a ball past the other's centre. ",
+    "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",
     "chain": "Dashed, the explicit limit of a joint limit, h²k + 2hb = 4. ",
 }
 _EXPLICIT = (

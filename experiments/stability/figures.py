@@ -110,7 +110,7 @@ def _scales(axis: Axes, across: str, up: str, count: int) -> None:
 
 def _short(value: float) -> str:
     if value == 0 or 0.01 <= value < 1000:
-        return f"{value:.2g}" if value != round(value) else f"{value:g}"
+        return f"{float(f'{value:.2g}'):g}"
     exponent = int(np.floor(np.log10(value)))
     return power(10.0**exponent * round(value / 10.0**exponent))
 
@@ -119,12 +119,14 @@ def _limit(axis: Axes, one: SceneOutcome, index: int) -> None:
     """Draw the analytic limit, in the coordinates of the squares."""
     curve = limit_curve(one.scene, one.points, index)
     if curve is not None:
-        axis.contour(curve, levels=[1.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+        axis.contour(curve, levels=[0.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
 
 
 def _legend(figure: Picture, one: SceneOutcome) -> None:
-    kinds = np.unique(np.concatenate([behaviour.motion for behaviour in one.behaviour.values()]))
-    slopes = np.unique(np.concatenate([behaviour.derivative for behaviour in one.behaviour.values()]))
+    shown = one.points.family >= 0
+    kinds = np.unique(np.concatenate([behaviour.motion[shown] for behaviour in one.behaviour.values()]))
+    ours = [behaviour for name, behaviour in one.behaviour.items() if name != C_MUJOCO]
+    slopes = np.unique(np.concatenate([behaviour.derivative[shown] for behaviour in ours]))
     handles = [Patch(color=MOTION_COLOURS[Motion(k)], label=Motion(k).label) for k in kinds]
     handles += [
         Patch(color=DERIVATIVE_COLOURS[Derivative(k)], label=f"gradient {Derivative(k).label}")

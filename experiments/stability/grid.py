@@ -127,6 +127,12 @@ def _impedance(place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.interp(place, np.linspace(0, 1, len(knots)), knots)
 
 
+def _depth(place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Up to four radii; around two, where two balls have one centre, exactly that."""
+    depth = np.maximum(4 * place, 0.1)
+    return np.where(np.abs(depth - 2) < 0.3, 2.0, depth)
+
+
 AXES: dict[str, Axis] = {
     "timestep": _powers(1e-4, 5e-2),
     "time_constant": _powers(1e-5, 1.0),
@@ -139,6 +145,5 @@ AXES: dict[str, Axis] = {
     "speed": _powers(1e-2, 100.0),
     "friction": _zero_and_powers(1e-3, 10.0),
     "margin": _zero_and_powers(1e-6, 0.02),
-    # Up to four radii; two balls whose depth is two radii have one centre.
-    "depth": lambda place: 0.25 * np.maximum(np.round(16 * place), 1),
+    "depth": _depth,
 }

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from experiments.stability.grid import Points
 from experiments.stability.scenes import RADIUS, StabilityScene, effective
 from mjxgrad.scene.contact_check import largest_stable_step
+from mjxgrad.tasks.textbook import Bounce
 
 
 def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
@@ -27,17 +28,24 @@ def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
     return found
 
 
-def crossing(points: Points) -> Float[np.ndarray, " points"]:
-    """Give what two balls fly in one step over the distance of their centres: beyond 1 they can pass unseen.
+def crossing(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give how far two balls go into each other, over the distance at which their centres meet: beyond 1 they pass.
+
+    One step carries them $v h$, unseen; a bounce goes $v \sqrt e / \omega_0$ deep.
 
     Args:
+        scene: of the catalogue.
         points: of the grid of two balls.
     """
-    return points.values["speed"] * points.values["timestep"] / (2 * RADIUS)
+    springs = np.array([effective(scene, points[i]) for i in range(len(points))])
+    frequency, damping = np.sqrt(springs[:, 0]), springs[:, 1]
+    restitution = np.asarray(Bounce(2 / damping, damping / (2 * frequency)).restitution)
+    time = np.maximum(points.values["timestep"], np.sqrt(restitution) / frequency)
+    return points.values["speed"] * time / (2 * RADIUS)
 
 
 def limit_curve(scene: StabilityScene, points: Points, plane: int) -> np.ndarray | None:
-    """Arrange the limit that belongs to a plane as an image whose contour at 1 is to be drawn.
+    """Arrange the limit that belongs to a plane as an image of logarithms whose contour at 0 is to be drawn.
 
     Args:
         scene: of the catalogue.
@@ -49,12 +57,12 @@ def limit_curve(scene: StabilityScene, points: Points, plane: int) -> np.ndarray
     """
     names = set(points.planes[plane])
     decides_spring = names & {"timestep", "time_constant", "damping_ratio", "stiffness"}
-    if scene.family == "two balls" and "speed" in names and "timestep" in names:
-        values = crossing(points)
+    if scene.family == "two balls" and "speed" in names:
+        values = crossing(scene, points)
     elif decides_spring:
         values = load(scene, points)
     else:
         return None
-    chosen = values[points.family == plane]
+    chosen = np.log(values[points.family == plane])
     image = chosen.reshape(round(np.sqrt(len(chosen))), -1)
-    return image if image.min() < 1 < image.max() else None
+    return image if image.min() < 0 < image.max() else None

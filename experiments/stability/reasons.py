@@ -24,11 +24,16 @@ def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
     values, ours, theirs = one.points.values, one.behaviour[precision], one.behaviour[C_MUJOCO]
     is_fine_in_double = ~one.worse("float64")
     takes_other_impedance = (values["width"] == 0) & (values["impedance_first"] != values["impedance_last"])
+    is_unsolved = ours.motion == Motion.UNSOLVED
+    is_single = is_fine_in_double & (precision == "float32")
     rules = (
-        (ours.motion == Motion.UNSOLVED, "the solve does not converge"),
+        (is_unsolved & (values["friction"] == 0), "friction 0 is degenerate: load_scene raises it, the step does not"),
+        (is_unsolved & is_single & (values["mass_ratio"] != 1), "float32's solver tolerance, for all masses together"),
+        (is_unsolved & is_single, "the solve stops short, in float32 alone"),
+        (is_unsolved, "the solve stops short"),
         (takes_other_impedance, "width 0: C MuJoCo takes the mean of both impedances, MJX the second"),
         (one.apart[precision] <= _SAME_MOTION, "the same motion, on either side of the bound between two classes"),
-        (is_fine_in_double & (precision == "float32"), "single precision: right in float64"),
+        (is_single, "single precision: right in float64"),
         (np.full(len(one.points), one.scene.family == "box"), "box on plane: MJX keeps other corners than C MuJoCo"),
         (theirs.motion >= Motion.GAINS_ENERGY, "C MuJoCo fails, too, in another way"),
         (load(one.scene, one.points) >= 1, "beyond the explicit limit, where rounding grows"),

@@ -31,12 +31,14 @@ def verdict(outcome: Outcome) -> str:
         f"not finite and no flag, and `soundness` missed {_count(missed)} of the gradients that are not finite or explode."
     ]
     for name in precisions:
+        stopped = sum(int((one.behaviour[name].motion == Motion.UNSOLVED).sum()) for one in outcome.scenes)
         worse = sum(int(one.worse(name).sum()) for one in outcome.scenes)
         better = sum(int(one.better(name).sum()) for one in outcome.scenes)
         open_ones = _reasons(outcome, name)[UNEXPLAINED]
         sentences.append(
             f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} points"
-            f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}."
+            f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; {_count(stopped)} "
+            "end with forces out of balance in some step, which no flag tells."
         )
     return " ".join(sentences)
 
@@ -73,12 +75,15 @@ def _limit(outcome: Outcome) -> str | None:
         return None
     ratio, fails = np.concatenate(predicted), np.concatenate(fails)
     below, beyond = ratio < 1, ratio >= 1
-    highest = ratio[~fails].max() if (~fails).any() else np.nan
-    return (
-        f"Of {below.sum()} single bounces within the explicit limit {_count(int((fails & below).sum()))} gain energy; of "
-        f"{beyond.sum()} beyond it {_count(int((~fails & beyond).sum()))} do not (the farthest at {highest:.3g} times the "
-        "largest stable time step)."
+    exceptions = (fails & below).sum()
+    sentence = (
+        f"Of {below.sum()} single bounces within the explicit limit {_count(int(exceptions))} "
+        f"gain{'s' * (exceptions == 1)} energy"
     )
+    if exceptions:
+        sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
+    spared = int((~fails & beyond).sum())
+    return f"{sentence}; of {beyond.sum()} beyond it " + (f"{spared} do not." if spared else "all do.")
 
 
 def _gradients(outcome: Outcome, precision: str) -> str:

@@ -1,0 +1,131 @@
+"""The grid reaches what it is to reach, and what is said of it follows from its numbers."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from experiments.stability.grid import PLANES, Points, points
+from experiments.stability.limits import load
+from experiments.stability.outcome import C_MUJOCO, Behaviour, SceneOutcome
+from experiments.stability.reasons import UNEXPLAINED, reasons
+from experiments.stability.reference import simulate, unbalanced
+from experiments.stability.scenes import DEFAULTS, catalogue, configure
+from experiments.stability.settings import SIZES
+from mjxgrad.diagnostics.stability import Motion
+
+SCENES = {scene.name: scene for scene in catalogue()}
+
+
+def _points(count=1, **values):
+    given = DEFAULTS | values
+    return Points(
+        {name: np.broadcast_to(np.asarray(value, float), count).copy() for name, value in given.items()},
+        np.full(count, -1),
+        (),
+    )
+
+
+def test_every_size_names_scenes_that_there_are():
+    for size in SIZES.values():
+        assert set(size.scenes or SCENES) <= set(SCENES)
+        assert set(size.event or SCENES) <= set(SCENES)
+
+
+def test_the_grid_reaches_its_corners_and_coincident_centres():
+    found = points(SCENES["two balls, pyramidal"], 12, 256, 0)
+    low_high = {"mass_ratio": (1e-6, 1e6), "speed": (1e-2, 100.0), "timestep": (1e-4, 5e-2), "margin": (0.0, 0.02)}
+    for name, (low, high) in low_high.items():
+        assert found.values[name].min() == pytest.approx(low)
+        assert found.values[name].max() == pytest.approx(high)
+    start, _ = SCENES["two balls, pyramidal"].start(found[int(np.argmax(found.values["depth"] == 2.0))])
+    np.testing.assert_array_equal(start[:3], start[7:10])
+
+
+@pytest.mark.parametrize("resolution", [8, 12, 24])
+def test_depths_of_two_radii_are_met_at_every_resolution(resolution):
+    found = points(SCENES["two balls, pyramidal"], resolution, 4, 0)
+    plane = [names[:2] for names in PLANES["two balls"]].index(("time_constant", "depth"))
+    assert (found.values["depth"][found.family == plane] == 2.0).any()
+
+
+def test_masses_come_with_all_that_mujoco_derives_from_them():
+    scene = SCENES["two balls, pyramidal"]
+    model = scene.model()
+    configure(scene, model, mujoco.MjData(model), DEFAULTS | {"mass_ratio": 1e3})
+    np.testing.assert_allclose(model.body_mass[1:], [1.0, 1e3])
+    np.testing.assert_allclose(model.body_invweight0[1:, 0], [1.0, 1e-3])
+    # 2/5 m r² of a ball of 50 mm
+    np.testing.assert_allclose(model.body_inertia[1:, 0], [1e-3, 1.0])
+
+
+def test_the_load_is_that_of_the_closed_form_and_knows_refsafe():
+    grid = _points(2, timestep=[0.01, 0.05], time_constant=0.02, damping_ratio=0.5)
+    limit = 2 * 0.5 * (np.sqrt(1.25) - 0.5)
+    np.testing.assert_allclose(load(SCENES["ball"], grid), np.array([0.5, 2.5]) / limit)
+    # refsafe keeps h/tc at one half
+    np.testing.assert_allclose(load(SCENES["ball, refsafe"], grid), 0.5 / limit)
+
+
+def test_c_mujoco_bounces_with_the_restitution_of_the_closed_form():
+    grid = _points(timestep=1e-4, time_constant=1e-3, impedance_first=0.9, impedance_last=0.9)
+    course = simulate(SCENES["ball"], grid, 100).course
+    # e⁻² at critical damping; the time step is a tenth of the time constant
+    assert course.qvel[0, 0] == pytest.approx(np.exp(-2), abs=0.02)
+    assert course.residual[0] < 1e-9
+    assert course.kinetic[0, 0] == pytest.approx(0.5)
+
+
+def test_a_start_that_is_not_finite_is_bad_from_its_first_step():
+    course = simulate(SCENES["ball"], _points(stiffness=1e300), 20).course
+    assert 0 <= course.first_bad_step[0] < 20
+    assert np.isfinite(course.qpos).all()
+
+
+def test_unbalanced_is_the_share_of_the_velocity_that_a_solve_misses():
+    # 3 N too much on 2 kg for 0.1 s, beside a speed of 1 m/s: 0.15 m/s of 1 + 0.1·(2·2 + 1 + 0)/2 m/s
+    found = unbalanced(np.array([[2.0]]), np.array([2.0]), np.array([1.0]), np.array([1.0]), np.array([0.0]), 0.1)
+    assert found == pytest.approx(0.15 / 1.25)
+
+
+def _outcome(scene, grid, ours, theirs, apart):
+    def behaviour(motion):
+        none = np.zeros(len(grid), bool)
+        return Behaviour(np.array(motion), np.zeros(len(grid), int), None, None, none, none, none, np.ones(len(grid)))
+
+    kinds = {C_MUJOCO: behaviour(theirs), "float64": behaviour(ours)}
+    return SceneOutcome(SCENES[scene], grid, kinds, {"float64": np.array(apart)})
+
+
+def test_only_what_is_worse_than_c_mujoco_needs_a_reason():
+    motions = [Motion.SETTLES, Motion.BOUNCES_RIGHT, Motion.DIVERGES]
+    one = _outcome("ball", _points(3), motions, [Motion.MOVES, Motion.MOVES, Motion.DIVERGES], [1.0, 1.0, 1.0])
+    assert reasons(one, "float64") == {}
+
+
+def test_what_no_reason_fits_stays_unexplained():
+    one = _outcome("ball", _points(2), [Motion.GAINS_ENERGY] * 2, [Motion.MOVES] * 2, [1.0, 1e-6])
+    found = reasons(one, "float64")
+    assert found[0] == UNEXPLAINED
+    assert "same motion" in found[1]
+
+
+def test_other_impedances_at_no_width_are_told_apart():
+    grid = _points(2, width=0.0, impedance_last=[0.9, 0.95])
+    one = _outcome("ball", grid, [Motion.GAINS_ENERGY] * 2, [Motion.MOVES] * 2, [1.0, 1.0])
+    assert reasons(one, "float64")[0] == UNEXPLAINED
+    assert "width 0" in reasons(one, "float64")[1]
+
+
+def test_a_workspace_notes_what_a_scene_s_time_step_does_not_follow(tmp_path):
+    import mjxgrad as mg
+    from experiments.workspace import Workspace
+
+    workspace = Workspace(tmp_path)
+    scene = SCENES["ball, refsafe"].model()
+    workspace.check(mg.load_scene(scene))
+    assert workspace.warnings == []
+    scene.opt.timestep = 0.05
+    with pytest.warns(UserWarning, match="refsafe"):
+        loaded = mg.load_scene(scene)
+    workspace.check(loaded)
+    assert any("refsafe replaces it by 0.1 s" in text for text in workspace.warnings)
