@@ -37,8 +37,8 @@ def verdict(outcome: Outcome) -> str:
         open_ones = _reasons(outcome, name)[UNEXPLAINED]
         sentences.append(
             f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} points"
-            f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; {_count(stopped)} "
-            "end with forces out of balance in some step, which no flag tells."
+            f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
+            f"{_count(stopped)} leave forces out of balance in some step, which no flag tells."
         )
     return " ".join(sentences)
 
