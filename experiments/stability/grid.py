@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from experiments.stability.scenes import DEFAULTS, StabilityScene
 
@@ -97,7 +96,9 @@ def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -
         blocks.append(_block(x.size, others | {across: x.ravel(), up: y.ravel()}))
     names = _RANDOM[scene.family]
     # A plane alone decides whether the format is direct; here every other point is.
-    sample = qmc.LatinHypercube(len(names), rng=np.random.default_rng(seed)).random(num_random)
+    rng = np.random.default_rng(seed)
+    strata = rng.permuted(np.tile(np.arange(num_random), (len(names), 1)), axis=1).T
+    sample = (strata + rng.random(strata.shape)) / num_random
     drawn = {name: AXES[name](sample[:, i]) for i, name in enumerate(names)}
     drawn["stiffness"] = np.where(np.arange(num_random) % 2, drawn["stiffness"], 0.0)
     if "depth" in drawn:
