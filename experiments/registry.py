@@ -4,8 +4,8 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.ablation.settings import AblationSettings
+from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.bias_variance.settings import BiasVarianceSettings
 from experiments.billiards.settings import BilliardsSettings
 from experiments.bounce.settings import BounceSettings
@@ -13,6 +13,7 @@ from experiments.config import RunSettings
 from experiments.cube_toss.settings import CubeTossSettings
 from experiments.kernels.settings import KernelsSettings
 from experiments.landing.settings import LandingSettings
+from experiments.long_horizon.settings import LongHorizonSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.planning.settings import PlanningSettings
 from experiments.policy_gradient.settings import PolicyGradientSettings
@@ -55,6 +56,7 @@ EXPERIMENTS = {
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
     "kernels": Experiment(KernelsSettings, "experiments.kernels.run:run"),
     "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
+    "long_horizon": Experiment(LongHorizonSettings, "experiments.long_horizon.run:run"),
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
     "policy_gradient": Experiment(PolicyGradientSettings, "experiments.policy_gradient.run:run"),
     "rolling_pin": Experiment(RollingPinSettings, "experiments.rolling_pin.run:run"),

@@ -1,0 +1,172 @@
+"""Two motions under a policy whose few parameters are noisy: smooth and chaotic, and with contact."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+import mjxgrad as mg
+from mjxgrad.rollout import State, data_of, state_of
+from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.hopper import hopper
+
+_START_ANGLES = (2.4, 0.5)  # rad from hanging: high enough that the elbow turns over
+_DAMPING_SCALE = 0.1  # of the pendulum's feedback beside its torques, N m s/rad
+
+
+class Problem(eqx.Module):
+    """A motion in segments of some steps each, with a cost at the end of every segment.
+
+    Attributes:
+        scene: what moves.
+        start: where it begins.
+        control: from parameters and a state to controls.
+        cost: from positions and velocities to a number, in m.
+        observe: likewise to what a value function is fitted on.
+        params: the policy's, without noise.
+        stddev: of the noise on each of them.
+        title: for figures and tables.
+        gradients: of the steps that differ.
+        steps_per_time: steps of a segment.
+    """
+
+    scene: mg.Scene
+    start: State
+    control: Callable[[Float[Array, " dim"], State], Float[Array, " nu"]]
+    cost: Callable[[Float[Array, " n"]], Float[Array, ""]] = eqx.field(static=True)
+    observe: Callable[[Float[Array, " n"]], Float[Array, " features"]] = eqx.field(static=True)
+    params: Float[Array, " dim"]
+    stddev: float = eqx.field(static=True)
+    title: str = eqx.field(static=True)
+    gradients: tuple[str, ...] = eqx.field(static=True)
+    steps_per_time: int = eqx.field(static=True)
+
+    @property
+    def interval(self) -> float:
+        """Time from one cost to the next (s)."""
+        return float(self.scene.model.opt.timestep) * self.steps_per_time
+
+    def segment(self, params: Float[Array, " dim"], state: State, gradient: str) -> State:
+        """Move on by one segment."""
+
+        def step(state: State, _: None) -> tuple[State, None]:
+            data = data_of(self.scene, state, self.control(params, state))
+            return state_of(mg.step(self.scene.model, data, gradient=gradient)), None  # pyright: ignore[reportArgumentType]
+
+        return jax.lax.scan(step, state, length=self.steps_per_time)[0]
+
+    def states(
+        self, params: Float[Array, " dim"], window: Int[Array, ""], num_times: int, gradient: str
+    ) -> Float[Array, "times n"]:
+        """Give the states at the end of each segment.
+
+        Args:
+            params: of the policy, noise included.
+            window: segments after which the derivative forgets where it came from; larger than the number of segments
+                for never.
+            num_times: segments.
+            gradient: of the steps.
+        """
+
+        def advance(state: State, index: Array) -> tuple[State, Array]:
+            is_cut = index % window == 0
+            state = jax.tree.map(lambda x: jnp.where(is_cut, jax.lax.stop_gradient(x), x), state)
+            state = self.segment(params, state, gradient)
+            return state, vector(state)
+
+        return jax.lax.scan(advance, self.start, jnp.arange(num_times))[1]
+
+    def jacobians(self, params: Float[Array, " dim"], num_times: int, gradient: str) -> Float[Array, "times n n"]:
+        """Give the derivative of each segment's end by its beginning, the policy's share included."""
+
+        def advance(state: State, _: None) -> tuple[State, Array]:
+            def end(x: Float[Array, " n"]) -> tuple[Array, State]:
+                qpos, qvel = jnp.split(x, [state.qpos.shape[0]])
+                moved = self.segment(params, eqx.tree_at(lambda s: (s.qpos, s.qvel), state, (qpos, qvel)), gradient)
+                return vector(moved), moved
+
+            jacobian, moved = jax.jacfwd(end, has_aux=True)(vector(state))
+            return moved, jacobian
+
+        return jax.lax.scan(advance, self.start, length=num_times)[1]
+
+
+def vector(state: State) -> Float[Array, " n"]:
+    """Give positions and velocities as one vector, of a scene whose joints are hinges and slides."""
+    return jnp.concatenate([state.qpos, state.qvel])
+
+
+def problem(name: str, num_times: int) -> Problem:
+    """Build a problem.
+
+    Args:
+        name: as in the settings.
+        num_times: segments into which its longest horizon is divided.
+
+    Returns:
+        The problem.
+    """
+    return _pendulum(num_times) if name == "double_pendulum" else _hopper(num_times)
+
+
+def _pendulum(num_times: int) -> Problem:
+    scene = mg.load_scene(scene_path("double_pendulum"))
+    return Problem(
+        scene=scene,
+        start=mg.initial_state(scene, jnp.array(_START_ANGLES)),
+        control=jax.tree_util.Partial(_torques),
+        cost=_tip,
+        observe=_angles,
+        params=jnp.zeros(4),
+        stddev=0.05,
+        title="double pendulum",
+        gradients=("discrete",),
+        steps_per_time=768 // num_times,
+    )
+
+
+def _torques(params: Float[Array, " 4"], state: State) -> Float[Array, " 2"]:
+    """Give a constant torque and a damping in each joint."""
+    return params[:2] - _DAMPING_SCALE * params[2:] * state.qvel
+
+
+def _tip(x: Float[Array, " 4"]) -> Float[Array, ""]:
+    """Give how far sideways the tip is, in m."""
+    return 0.3 * (jnp.sin(x[0]) + jnp.sin(x[0] + x[1]))
+
+
+def _angles(x: Float[Array, " 4"]) -> Float[Array, " 6"]:
+    angles = jnp.stack([x[0], x[0] + x[1]])
+    return jnp.concatenate([jnp.sin(angles), jnp.cos(angles), 0.1 * x[2:]])
+
+
+def _hopper(num_times: int) -> Problem:
+    task = hopper()
+    return Problem(
+        scene=task.scene,
+        start=task.state,
+        control=jax.tree_util.Partial(_posture, task.policy, task.start_params),
+        cost=_reach,
+        observe=_unchanged,
+        params=jnp.zeros(3),
+        stddev=0.05,
+        title="hopper",
+        gradients=("discrete", "event"),
+        steps_per_time=288 // num_times,
+    )
+
+
+def _posture(policy, posture, params: Float[Array, " 3"], state: State) -> Float[Array, " 3"]:
+    """Give the posture's actions with the parameters added to its offsets."""
+    return policy(eqx.tree_at(lambda p: p.offset, posture, posture.offset + params), state)
+
+
+def _reach(x: Float[Array, " 12"]) -> Float[Array, ""]:
+    """Give less the torso's distance forward and its height, in m."""
+    return -x[0] - x[1]
+
+
+def _unchanged(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    return x

@@ -1,0 +1,54 @@
+"""What an experiment on long horizons can be told; imports nothing heavy."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from experiments.config import RunSettings
+
+ProblemName = Literal["double_pendulum", "hopper"]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a size of the experiment stands for.
+
+    Attributes:
+        num_times: at which the horizon may end.
+        num_repeats: of every estimate.
+        num_samples: rollouts of an estimate.
+        num_reference: rollouts of the reference.
+        num_jacobians: rollouts whose Jacobians are multiplied.
+        num_adaptive: times up to which the pendulum is integrated with error control.
+    """
+
+    num_times: int
+    num_repeats: int
+    num_samples: int
+    num_reference: int
+    num_jacobians: int
+    num_adaptive: int
+
+
+SIZES = {
+    "quick": Sizes(16, 16, 16, 1024, 8, 4),
+    "default": Sizes(32, 32, 32, 8192, 16, 12),
+    "full": Sizes(48, 64, 128, 131072, 64, 24),
+}
+
+
+class LongHorizonSettings(RunSettings):
+    """Error of first- and zeroth-order estimates against the horizon, its cause, and windows."""
+
+    size: Literal["quick", "default", "full"] = "default"
+    """How many horizons, repeats and samples."""
+    problems: Annotated[tuple[ProblemName, ...], Field(min_length=1, max_length=2)] = ("double_pendulum", "hopper")
+    """To take."""
+    confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.95
+    """Of every interval."""
+
+    @property
+    def sizes(self) -> Sizes:
+        """What the size stands for."""
+        return SIZES[self.size]
