@@ -23,7 +23,8 @@ class LeaveOut:
         never_touching: pairs of geoms that `separation` proves apart at all joint positions.
         beyond_limits: how far joints may leave their ranges in such a proof (rad or m); None trusts no limit, so that only
             what no turn of any hinge brings together is left out.
-        clearance: distance that is to be proven beyond the margin (m).
+        clearance: distance that is to be proven beyond the margin (m). Smoothing acts at a distance: take several of its
+            lengths.
         pairs: pairs of geoms by name that touch in no motion of interest, on your word.
         limits: joints by name that reach their limits in no motion of interest, on your word.
     """
