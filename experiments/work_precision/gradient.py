@@ -222,7 +222,6 @@ def _record(
     derivatives = {v.derivative: p for v, p in programs.items() if v.derivative is not None}
     seconds, gradients, costs = {}, {}, np.zeros(0)
     for name, program in {None: simulate, **derivatives}.items():
-        program.run(first, knobs)
         _, taken = timed(lambda p=program: p.run(first, knobs), repeats=sizes.repeats, seconds=sizes.seconds)
         seconds[name] = tuple(one / batch for one in taken)
         if name is None:

@@ -192,17 +192,20 @@ def c_model(case: Case, integrator: Integrator, cone: Cone, iterations: int = NU
 
 
 def timed(function: Callable[[], Any], *, repeats: int, seconds: float) -> tuple[Any, tuple[float, ...]]:
-    """Call what has been called before, at least twice.
+    """Call what is compiled, at least twice.
 
     Args:
         function: blocks until it is done.
         repeats: at most.
-        seconds: after which, twice done, it is not called again.
+        seconds: after which, twice done, it is not called again. A first call shorter than this only warms up.
 
     Returns:
-        What it returned last, and the wall time of each call.
+        What it returned last, and the wall time of each call that counts.
     """
-    result, taken = None, []
+    begun = time.perf_counter()
+    result = function()
+    first = time.perf_counter() - begun
+    taken = [first] if first > seconds else []
     while len(taken) < 2 or (len(taken) < repeats and sum(taken) < seconds):
         begun = time.perf_counter()
         result = function()
