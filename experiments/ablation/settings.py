@@ -51,8 +51,8 @@ class AblationSettings(RunSettings):
 
     size: Literal["quick", "default", "full"] = "default"
     """How much is measured: quick for a look, full for a GPU."""
-    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
-    """Which scenes; those of the size, if not given."""
+    scenes: tuple[SceneName, ...] = ()
+    """Which scenes; those of the size, if none is given."""
     duration: Annotated[float, Field(gt=0)] = 1.0
     """Of each recorded rollout (s)."""
     control_share: Annotated[float, Field(ge=0, le=1)] = 0.5
