@@ -22,8 +22,8 @@ def captions(outcome: Outcome) -> dict[str, str]:
             f"{settings.tight_tolerance:g} (float32: 1e-6), the scene's own cone; the broad grey line is what no "
             "other beats, rings what no other on JAX does. "
             "Right: loose tolerances at the two coarsest steps, few iterations, and the other cone, compared with its own "
-            "reference. Dotted: how far the reference itself moved when its step was last halved; below it nothing is known. Grey: the "
-            "errors that settings are recommended for. Compilation is not in the time; it is in the table."
+            "reference. Dotted: how far the reference itself moved when its step was last halved; below it nothing is "
+            "known. Grey: the errors that settings are recommended for. Compilation is apart, in the table."
         ),
         "motion_next": "As above.",
         "gradient": (
