@@ -92,7 +92,7 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
         for i, gradient in enumerate(one.gradients):
 
             def again(length: int, gradient: str = gradient) -> np.ndarray:
-                return _run(one, noise, length, whole, gradient)[0].tangents
+                return np.asarray(_run(one, noise, length, whole, gradient)[0].tangents)
 
             windows[f"first order, {gradient}"] = cut(settings, one, again, many, first[f"first order, {gradient}"][0])
             advance_to(i + 1)

@@ -128,10 +128,10 @@ def _adaptive(outcome: Outcome) -> list[str]:
         return [
             "The pendulum's steps are off the motion by more than a tenth from the first time on: shorten the time step."
         ]
+    growth = f"{apart[:count].max():.2g} at most, of {adaptive.stepped[:count].max():.3g}"
     return [
         f"The pendulum's steps stay within a tenth of the motion by error control ({adaptive.num_steps} steps of order 8) up to "
-        f"{adaptive.times[count - 1]:.3g} s; up to there the logarithm of the largest singular value differs by {apart[:count].max():.2g} at most, of "
-        f"{adaptive.stepped[:count].max():.3g}."
+        f"{adaptive.times[count - 1]:.3g} s; up to there the logarithm of the largest singular value differs by {growth}."
     ]
 
 
