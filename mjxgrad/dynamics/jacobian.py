@@ -430,7 +430,7 @@ def _cone_product(
     return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(cone.dim))
 
 
-def _edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *rest"] | None) -> Array:
+def _edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
     """Return the edges n ± μ t of pyramids; without μ the directions themselves."""
     if tilt is None:
         return along
@@ -439,7 +439,7 @@ def _edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *r
     return edges.reshape(len(along), -1, *along.shape[2:])
 
 
-def _fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *rest"] | None) -> Array:
+def _fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
     """Return the forces along directions that forces along edges add up to; the transpose of `_edges`."""
     if tilt is None:
         return force
