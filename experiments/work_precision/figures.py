@@ -24,6 +24,8 @@ _ESTIMATORS = {
 # Errors of smooth motions in double precision fall to rounding; nobody chooses by what lies below this.
 _SMALLEST = 1e-9
 _LARGEST = 10.0
+# An empty logarithmic axis has no limits of its own.
+_ANY = (1e-3, 1.0)
 # The tolerance that single precision is given; what is beyond it is loose.
 _RESOLVED = 1e-6
 
@@ -54,8 +56,7 @@ def motion(course: Course, outcome: Outcome):
     tight = [one for one in course.in_batch() if _is_tight(one, outcome)]
     others = [one for one in course.points if one not in tight and one.batch == tight[0].batch]
     others = [one for one in others if one.cone == course.cone or one.integrator == "Euler"]
-    front = pareto_front([one.cost for one in tight], [one.error for one in tight])
-    _front(axes[0, 0], tight, front)
+    _front(axes[0, 0], [one.cost for one in tight], [max(one.error, _SMALLEST) for one in tight])
     _ring(axes[0, 0], [one for one in tight if one.library != C])
     for axis, shown in zip(axes[0], (tight, others), strict=True):
         for line in _lines(shown):
@@ -65,7 +66,9 @@ def motion(course: Course, outcome: Outcome):
             axis.axhline(floor, color=_COLOURS[library], lw=0.9, ls=(0, (2, 3)), zorder=0)
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-        axis.set(xscale="log", yscale="log", xlabel="wall-clock seconds per simulated second and state")
+        has_line = any(one.error <= _LARGEST for one in course.points)
+        limits = None if has_line else _ANY
+        axis.set(xscale="log", yscale="log", xlabel="wall-clock seconds per simulated second and state", xlim=limits)
     axes[0, 0].set_ylabel("error of the final state, relative")
     axes[0, 0].set_title("integrator, precision, time step")
     axes[0, 1].set_title("solver tolerance and iterations, the other cone")
@@ -83,22 +86,21 @@ def gradient(course: Course, outcome: Outcome):
     own = [one for one in estimates if one.timestep == course.timestep and one.softening == 1]
     costs = {"seconds": [one.cost for one in estimates], "rollouts": [one.num_samples for one in estimates]}
     for axis, (name, cost) in zip(axes[0], costs.items(), strict=True):
-        front = pareto_front(cost, [one.error for one in estimates])
-        best = sorted((c, one.error) for c, one, keep in zip(cost, estimates, front, strict=True) if keep)
-        axis.step(*zip(*best, strict=True), where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+        _front(axis, cost, [one.error for one in estimates])
         for line in _lines(estimates):
             _gradient_line(axis, line, name, is_own=line[0] in own, own_step=course.timestep)
         axis.axhline(max(course.gradient_reference.error, 1e-6), color=REFERENCE, lw=0.9, ls=(0, (2, 3)), zorder=0)
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-        axis.set(xscale="log", yscale="log")
+        axis.set(xscale="log", yscale="log", xlim=None if estimates else _ANY)
     axes[0, 0].set(xlabel="wall-clock seconds of one estimate", ylabel="error of the gradient, relative")
     axes[0, 1].set(xlabel="rollouts of one estimate")
     ticks = sorted({one.num_samples for one in estimates})
-    axes[0, 1].set_xticks(ticks, [str(tick) for tick in ticks])
-    axes[0, 1].minorticks_off()
+    if ticks:
+        axes[0, 1].set_xticks(ticks, [str(tick) for tick in ticks])
+        axes[0, 1].minorticks_off()
     errors = [one.error for one in estimates]
-    low = min([*errors, course.gradient_reference.error, *outcome.settings.targets])
+    low = np.nanmin([*errors, course.gradient_reference.error, *outcome.settings.targets])
     axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e3))
     present = {one.estimator for one in estimates}
     handles = [Line2D([], [], color=c, marker="o", ms=4, label=n) for n, c in _ESTIMATORS.items() if n in present]
@@ -169,17 +171,21 @@ def _motion_legend(tight: Sequence[Point], others: Sequence[Point]) -> list[Line
     return libraries + marks
 
 
-def _front(axis: Axes, points: Sequence[Point], front: np.ndarray) -> None:
-    best = sorted((p.cost, max(p.error, _SMALLEST)) for p, keep in zip(points, front, strict=True) if keep)
-    if best:
-        axis.step(*zip(*best, strict=True), where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+def _front(axis: Axes, costs: Sequence[float], errors: Sequence[float]) -> None:
+    best = np.array(_best(costs, errors)).reshape(-1, 2)
+    axis.step(best[:, 0], best[:, 1], where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
+
+
+def _best(costs: Sequence[float], errors: Sequence[float]) -> list[tuple[float, float]]:
+    """Give the points on the front in order of cost; none if all has diverged."""
+    on_front = pareto_front(costs, errors)
+    return sorted((cost, error) for cost, error, keep in zip(costs, errors, on_front, strict=True) if keep)
 
 
 def _ring(axis: Axes, points: Sequence[Point]) -> None:
     """Mark what no other way on JAX beats."""
-    front = pareto_front([one.cost for one in points], [one.error for one in points])
-    best = [(p.cost, max(p.error, _SMALLEST)) for p, keep in zip(points, front, strict=True) if keep]
-    axis.plot(*zip(*best, strict=True), "o", mfc="none", mec=REFERENCE, ms=9, mew=0.9, zorder=3)
+    best = np.array(_best([one.cost for one in points], [max(one.error, _SMALLEST) for one in points])).reshape(-1, 2)
+    axis.plot(best[:, 0], best[:, 1], "o", mfc="none", mec=REFERENCE, ms=9, mew=0.9, zorder=3)
 
 
 def _gradient_line(axis: Axes, line: Sequence[Estimate], against: str, *, is_own: bool, own_step: float) -> None:

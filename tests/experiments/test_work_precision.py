@@ -2,9 +2,11 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import pytest
@@ -14,13 +16,21 @@ import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.work_precision import native
+from experiments.work_precision import figures, native, verdict
 from experiments.work_precision.cases import case
 from experiments.work_precision.choice import cheapest, fastest
 from experiments.work_precision.front import pareto_front
 from experiments.work_precision.gradient import Recorded, quasi_random, smoothed_gradient
 from experiments.work_precision.measure import variants
-from experiments.work_precision.outcome import Estimate, Point, relative_errors
+from experiments.work_precision.outcome import (
+    Course,
+    Estimate,
+    GradientReference,
+    Outcome,
+    Point,
+    Reference,
+    relative_errors,
+)
 from experiments.work_precision.programs import Knobs, softened
 from experiments.work_precision.settings import SIZES, WorkPrecisionSettings
 
@@ -72,6 +82,21 @@ def test_the_cheapest_gradient_is_the_one_whose_rollouts_take_least_time_togethe
     assert choice is not None
     assert choice.estimate is few_dear
     assert choice.seconds == pytest.approx(4.0 * 4 / 100)
+
+
+def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendation():
+    lost = replace(estimate("first order, event", np.inf, np.inf, 1.0), error=np.inf)
+    references = tuple(Reference(name, "pyramidal", "RK4", 1e-5, 1e-4, 2e-4, 0.0) for name in ("mg.step", "C MuJoCo"))
+    known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01, 1e-4)
+    points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
+    course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known, 3, 1.0)
+    outcome = Outcome(WorkPrecisionSettings(experiment="work_precision"), (course,))
+    for draw in (figures.motion, figures.gradient):
+        figure = draw(course, outcome)
+        figure.canvas.draw()
+        plt.close(figure)
+    assert "for 5 % no setting that was tried is enough" in verdict.findings(outcome)[0]
+    assert "Gradient: for 5 % none is known to get there (reference known to 1 %)" in verdict.findings(outcome)[0]
 
 
 def test_the_smoothed_gradient_is_exact_where_the_cost_is_linear():
@@ -203,8 +228,8 @@ def test_a_run_leaves_its_diagrams_its_table_and_a_recommendation(tmp_path):
     }
     assert by_library["mg.step"] == pytest.approx(by_library["mjx.step"], rel=1e-5)
     assert by_library["mg.step"] == pytest.approx(by_library["C MuJoCo"], rel=1e-5)
-    verdict = json.loads((folder / "summary.json").read_text())["verdict"]
-    assert "For 5 % error of the motion mg.step takes" in verdict
+    answer = json.loads((folder / "summary.json").read_text())["verdict"]
+    assert "For 5 % error of the motion mg.step takes" in answer
     assert "for 5 % take mg.step" in (folder / "report.html").read_text()
 
 
