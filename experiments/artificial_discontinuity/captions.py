@@ -28,7 +28,7 @@ def captions(outcome: Outcome) -> dict[str, str]:
         "refinement": (
             "Bodies that touch by points, each a spring of its own with an equal share of the stiffness. Each point's force "
             "jumps where its nearest face changes; of a slide along the lattice a whole row does so at once, of one askew "
-            "one point after the other."
+            "one point after the other. Paths on which some lattice does not jump, or a single point touches, are left out."
         ),
         "slopes": (
             f"The body is let go and pushed for 30 ms; the outcome is its height. Noise on the start of "

@@ -99,7 +99,7 @@ def jumps(outcome: Outcome):
         axis.set_xticks([_LEAST, 1e-3, 1e-2, 0.1, 1], labels=["none", "0.1%", "1%", "10%", "100%"], fontsize=7)
         axis.minorticks_off()
     axes[0, 0].set_yticks(places, outcome.shapes)
-    figure.supxlabel("largest jump, over the largest force on the path", fontsize=9)
+    axes[0, len(names) // 2].set_xlabel("largest jump, over the largest force on the path")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
 
@@ -110,11 +110,13 @@ def refinement(outcome: Outcome):
     left, right = axes[0]
     colours = shades(len(outcome.paths))
     for colour, name in zip(colours, outcome.paths, strict=True):
+        power = outcome.rate(name)[0]
+        if np.isnan(power):
+            continue
         lattices = [one for one in outcome.statics if one.is_lattice and one.path == name]
         count = np.sqrt([one.num_rows for one in lattices])
         size = [max(one.worst, _LEAST) for one in lattices]
-        power = outcome.rate(name)[0]
-        label = outcome.paths[name].title + ("" if np.isnan(power) else f": power {-power:.1f}".replace("-", "−"))
+        label = f"{outcome.paths[name].title}: power {-power:.1f}".replace("-", "−")
         left.plot(count, size, "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
     counts = sorted({round(np.sqrt(one.num_rows)) for one in outcome.statics if one.is_lattice})

@@ -187,11 +187,14 @@ class Outcome:
     def rate(self, path: str) -> tuple[float, float]:
         """Give the power of the number of points along an edge by which a lattice's largest jump falls, and its error.
 
+        NaN for fewer than three lattices, and where one of them does not jump or only a single point touches.
+
         Args:
             path: key of the path.
         """
-        lattices = [one for one in self.statics if one.is_lattice and one.path == path and one.worst > 0]
-        if len(lattices) < 3:
+        lattices = [one for one in self.statics if one.is_lattice and one.path == path]
+        # Nothing is refined where a single point touches; without a jump there is no logarithm.
+        if len(lattices) < 3 or any(one.worst == 0 or one.contacts.max() < 2 for one in lattices):
             return np.nan, np.nan
         count = np.log([np.sqrt(one.num_rows) for one in lattices])
         size = np.log([one.worst for one in lattices])

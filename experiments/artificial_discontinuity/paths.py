@@ -76,7 +76,7 @@ def _at(x: float) -> Callable[[np.ndarray], np.ndarray]:
 
 PATHS = {
     "slide": Path("slide past the edge", (0.0, 0.21), "m", _still(_UPRIGHT), _along),
-    "askew": Path("slide, turned by 0.4 rad", (0.0, 0.25), "m", _still(Rotation.from_euler("z", 0.4)), _along),
+    "askew": Path("slide askew", (0.0, 0.25), "m", _still(Rotation.from_euler("z", 0.4)), _along),
     "roll": Path("roll", (-0.12, 0.12), "rad", _turned(0.0, 1.0, 0.0), _at(0.03)),
     "yaw": Path("yaw", (0.0, np.pi / 2), "rad", _turned(0.0, 0.0, 1.0), _at(0.05)),
     "corner": Path("corner past the edge", (0.0, 0.11), "m", _still(_ON_CORNER), _along),

@@ -29,15 +29,12 @@ def verdict(outcome: Outcome) -> str:
     if rough:
         sentences.append(f"By its geometry alone the force jumps by more than {threshold:.0%} with {_listed(rough)}.")
     if smooth:
-        best = min(smooth, key=lambda name: (outcome.of(name)[0].num_rows, most[name]))
-        sentences.append(
-            f"It does not with {_listed(smooth)}: to differentiate through contact build it of these; the fewest rows, "
-            f"{outcome.of(best)[0].num_rows}, has {best}."
-        )
+        rows = [f"{name} ({outcome.of(name)[0].num_rows} rows)" for name in smooth]
+        sentences.append(f"It does not with {_listed(rows)}: to differentiate through contact build it of these.")
         if worse := [f"{name} ({plain[name]:.0%})" for name in smooth if plain[name] > threshold]:
             sentences.append(
-                f"Under MuJoCo's default contact, whose force begins with a jump, {_listed(worse)} jump all the same where one "
-                "more part touches: let the impedance rise from zero (the first number of solimp)."
+                f"Under MuJoCo's default contact, whose force begins with a jump, it still does with {_listed(worse)} where one more "
+                "part touches: there let the impedance rise from zero (the first number of solimp)."
             )
     else:
         sentences.append(f"None of the bodies is without; the least has {min(bodies, key=lambda name: most[name])}.")
@@ -199,13 +196,13 @@ def _by_jump(outcome: Outcome) -> Table:
             one.kind,
         ]
         for one in outcome.judged
-        if one.relative > _SMALL
+        if one.relative > outcome.settings.threshold
     ]
     return Table(
         ("path", "at", "contacts", "jump over force", "reference jumps by", "changes nearby by", "which is"),
         rows,
-        "Every jump of the box. The reference is the gradient of the overlap volume; nearby is one penetration depth to each "
-        "side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The "
+        f"The jumps of the box beyond {outcome.settings.threshold:.0%} of the force beside them, of {len(outcome.judged)} in all. "
+        "The reference is the gradient of the overlap volume; nearby is one penetration depth to each side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The "
         "onset of a contact is no jump where contact begins gently.",
     )
 
@@ -233,7 +230,9 @@ def _by_estimate(outcome: Outcome) -> Table:
 
 
 def _percent(share: float) -> str:
-    return "none" if share < _SMALL else f"{share:.3g}" if share >= 10 else f"{100 * share:.2g}%"
+    if share < _SMALL:
+        return "none"
+    return f"{100 * share:.2g}%" if share < 0.995 else f"{100 * share:.0f}%"
 
 
 def _listed(parts: list[str]) -> str:
