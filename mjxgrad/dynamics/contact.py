@@ -62,17 +62,21 @@ def contact_rows(
     model: mjx.Model, data: mjx.Data, contact: Any, bodies: np.ndarray, dim: int, friction: Array | None
 ) -> ContactRows:
     """Return the rows of contacts between known bodies, as the relative velocity of the two at a point."""
-    moves, sides, roots = tree.moving_dofs(model), [], []
-    for slot, pair in enumerate(bodies):
-        shares_root = model.body_rootid[pair[0]] == model.body_rootid[pair[1]]
-        for sign, body, other in ((-1.0, *pair), (1.0, *pair[::-1])):
-            own = moves[body] * (1 - moves[other]) if shares_root else moves[body]
-            if own.any():
-                sides.append(Side(slot, sign, tuple(int(dof) for dof in np.nonzero(own)[0])))
-                roots.append(model.body_rootid[body])
-    owner = np.array([side.contact for side in sides], int)
-    lever = spatial.pick(owner, contact.pos) - spatial.pick(np.array(roots, int), data.subtree_com)
-    return ContactRows(lever, contact.frame, data.cdof, friction, tuple(sides), dim)
+    moves = tree.moving_dofs(model)
+    shares_root = model.body_rootid[bodies[:, 0]] == model.body_rootid[bodies[:, 1]]
+    own = moves[bodies]
+    own = own * (1 - own[:, ::-1] * shares_root[:, None, None])
+    # The side that moves first; then the second one is needed only for contacts of two moving bodies.
+    order = np.argsort(~own.any(axis=2), axis=1, kind="stable")
+    num_sides = max(1, int(own.any(axis=2).sum(axis=1).max()))
+    order = order[:, :num_sides]
+    sides = tuple(
+        tuple(Side(2.0 * k - 1, tuple(int(dof) for dof in np.nonzero(own[slot, k])[0])) for k in of_slot)
+        for slot, of_slot in enumerate(order)
+    )
+    roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
+    centre = spatial.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)
+    return ContactRows(contact.pos[:, None] - centre, contact.frame, data.cdof, friction, sides, dim)
 
 
 def _pyramids(

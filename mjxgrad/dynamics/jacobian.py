@@ -23,6 +23,8 @@ from mjxgrad.dynamics.spatial import combine, contract
 
 # Beyond so many groups the entries are kept in one matrix with its zeros: every group is some operations more to compile.
 _MOST_GROUPS = 24
+# By how much the entries of a Hessian may grow where contacts are kept together.
+_WASTE = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,15 +167,13 @@ class AxisRows(RowMap):
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """One of the two bodies of a contact, if it moves.
+    """One of the two bodies of a contact.
 
     Attributes:
-        contact: which contact.
         sign: 1 for the second body, -1 for the first.
         dofs: joint velocities that move it and not the other one too; what moves both does nothing to a contact.
     """
 
-    contact: int
     sign: float
     dofs: tuple[int, ...]
 
@@ -189,15 +189,15 @@ class ContactRows(RowMap):
         frame: normal and tangents.
         axes: motion of unit joint velocities.
         friction: μ of each tangent of a pyramid, n ± μ t its edges; None for frictionless and elliptic contacts.
-        sides: whose motion counts, by contact.
+        sides: of each contact; as many for all, those that do not move without joint velocities.
         dim: directions of each contact.
     """
 
-    lever: Float[Array, "sides 3 *batch"]
+    lever: Float[Array, "contacts sides 3 *batch"]
     frame: Float[Array, "contacts 3 3 *batch"]
     axes: Float[Array, "nv 6 *batch"]
     friction: Float[Array, "contacts tangents *batch"] | None
-    sides: tuple[Side, ...] = eqx.field(static=True)
+    sides: tuple[tuple[Side, ...], ...] = eqx.field(static=True)
     dim: int = eqx.field(static=True)
 
     @property
@@ -207,81 +207,78 @@ class ContactRows(RowMap):
         )
 
     def _runs(self) -> list[tuple[int, int, tuple[int, ...]]]:
-        """Return neighbouring contacts of the same joint velocities: first, one after the last, dofs."""
-        moved = [tuple(self.sides[side].dofs for side in own) for own in self._by_contact()]
-        starts = [k for k in range(len(moved)) if k == 0 or moved[k] != moved[k - 1]]
-        stops = [*starts[1:], len(moved)]
-        # A contact that nothing moves keeps a column of zeros.
-        return [(a, b, tuple(sorted(sum(moved[a], ()))) or (0,)) for a, b in zip(starts, stops, strict=True)]
+        """Return neighbouring contacts that are kept together: first, one after the last, dofs.
 
-    def _by_contact(self) -> list[list[int]]:
-        own: list[list[int]] = [[] for _ in range(len(self.frame))]
-        for index, side in enumerate(self.sides):
-            own[side.contact].append(index)
-        return own
+        Every run is some operations more, and every column that one contact of a run does not need is computed for
+        nothing: they are joined while that no more than doubles the entries of the Hessian.
+        """
+        runs: list[tuple[int, int, tuple[int, ...], int]] = []
+        for contact, sides in enumerate(self.sides):
+            # A contact that nothing moves keeps a column of zeros.
+            dofs = {dof for side in sides for dof in side.dofs} or {0}
+            least = len(dofs) ** 2
+            if runs:
+                start, _, others, least_others = runs[-1]
+                both = dofs | set(others)
+                if (contact + 1 - start) * len(both) ** 2 <= _WASTE * (least + least_others):
+                    runs[-1] = (start, contact + 1, tuple(sorted(both)), least + least_others)
+                    continue
+            runs.append((contact, contact + 1, tuple(sorted(dofs)), least))
+        return [run[:3] for run in runs]
 
-    def _moves(self) -> np.ndarray:
-        moves = np.zeros((len(self.sides), self.axes.shape[0]))
-        for row, side in zip(moves, self.sides, strict=True):
-            row[list(side.dofs)] = side.sign
-        return moves
+    def _moves(self, contacts: slice, dofs: tuple[int, ...]) -> np.ndarray:
+        """Return with which sign joint velocities move the sides of contacts."""
+        chosen = self.sides[contacts]
+        moves = np.zeros((len(chosen), len(chosen[0]), self.axes.shape[0]))
+        for contact, sides in enumerate(chosen):
+            for place, side in enumerate(sides):
+                moves[contact, place, list(side.dofs)] = side.sign
+        return moves[..., list(dofs)]
 
-    def _of_contacts(self) -> np.ndarray:
-        """Return which sides belong to a contact."""
-        owner = np.array([side.contact for side in self.sides], int)
-        return (np.arange(len(self.frame))[:, None] == owner).astype(float)
+    def _all_moves(self) -> np.ndarray:
+        return self._moves(slice(None), tuple(range(self.axes.shape[0]))).reshape(-1, self.axes.shape[0])
 
     def rates(self, velocity):
-        motion = combine(self._moves(), spatial.scale(velocity, self.axes))
+        motion = combine(self._all_moves(), spatial.scale(velocity, self.axes))
         turning, moving = motion[:, :3], motion[:, 3:]
-        gather = self._of_contacts()
-        relative = combine(gather, moving + spatial.cross(turning, self.lever))
+        relative = self._sum(moving + spatial.cross(turning, self.lever.reshape(-1, 3)))
         along = contract("ckx,cx->ck", self.frame[:, : min(self.dim, 3)], relative)
         if self.dim > 3:
-            spin = combine(gather, turning)
+            spin = self._sum(turning)
             along = jnp.concatenate([along, contract("ckx,cx->ck", self.frame[:, : self.dim - 3], spin)], axis=1)
         return _edges(along, self.friction).reshape(-1)
 
+    def _sum(self, of_sides: Float[Array, "sides 3"]) -> Float[Array, "contacts 3"]:
+        by_contact = of_sides.reshape(self.lever.shape)
+        return linear.add(by_contact[:, side] for side in range(by_contact.shape[1]))
+
     def pull(self, force):
         force = _fold(force.reshape(len(self.frame), -1), self.friction)
-        num_axes = min(self.dim, 3)
-        push = contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes])
-        of_sides = self._of_contacts().T
-        torque = spatial.cross(self.lever, combine(of_sides, push))
+        num_axes, num_sides = min(self.dim, 3), self.lever.shape[1]
+        push = jnp.repeat(contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0)
+        torque = spatial.cross(self.lever.reshape(-1, 3), push)
         if self.dim > 3:
             twist = contract("ckx,ck->cx", self.frame[:, : self.dim - 3], force[:, 3:])
-            torque += combine(of_sides, twist)
-        wrench = jnp.concatenate([torque, combine(of_sides, push)], axis=1)
-        return spatial.dot(self.axes, combine(self._moves().T, wrench))
+            torque += jnp.repeat(twist, num_sides, axis=0)
+        wrench = jnp.concatenate([torque, push], axis=1)
+        return spatial.dot(self.axes, combine(self._all_moves().T, wrench))
 
     def directions(self):
-        own = self._by_contact()
-        return [self._entries(range(start, stop), own, dofs) for start, stop, dofs in self._runs()]
+        return [self._entries(slice(start, stop), dofs) for start, stop, dofs in self._runs()]
 
-    def _entries(
-        self, contacts: range, own: list[list[int]], dofs: tuple[int, ...]
-    ) -> Float[Array, "num dim dofs *batch"]:
-        """Return the entries of contacts whose sides have the same joint velocities."""
-        first = own[contacts.start]
-        frame = self.frame[contacts.start : contacts.stop]
-        num_axes = min(self.dim, 3)
-        if not first:
-            return jnp.zeros((len(contacts), self.dim, 1, *frame.shape[3:]), frame.dtype)
-        columns, order = [], []
-        for place, side in enumerate(first):
-            lever = jnp.stack([self.lever[own[contact][place]] for contact in contacts])
-            axes = linear.take(self.axes, self.sides[side].dofs)
-            force = frame[:, :num_axes]
-            torque = _cross(lever[:, None], force)
-            rows = _along(torque, axes[:, :3]) + _along(force, axes[:, 3:])
+    def _entries(self, contacts: slice, dofs: tuple[int, ...]) -> Float[Array, "num dim dofs *batch"]:
+        frame, axes = self.frame[contacts], linear.take(self.axes, dofs)
+        force, num_batch = frame[:, : min(self.dim, 3)], frame.ndim - 3
+        moves = jnp.asarray(self._moves(contacts, dofs), frame.dtype)
+        moves = moves.reshape(*moves.shape, *(1,) * num_batch)
+        straight, parts = _along(force, axes[:, 3:]), []
+        for side in range(moves.shape[1]):
+            torque = _cross(self.lever[contacts, side][:, None], force)
+            rows = _along(torque, axes[:, :3]) + straight
             if self.dim > 3:
                 rows = jnp.concatenate([rows, _along(frame[:, : self.dim - 3], axes[:, :3])], axis=1)
-            columns.append(self.sides[side].sign * rows)
-            order += self.sides[side].dofs
-        entries = columns[0] if len(columns) == 1 else jnp.concatenate(columns, axis=2)
-        if tuple(order) == dofs:
-            return entries
-        return jnp.concatenate([entries[:, :, (at := order.index(dof)) : at + 1] for dof in dofs], axis=2)
+            parts.append(moves[:, side, None] * rows)
+        return linear.add(parts)
 
     def tilts(self):
         return [None if self.friction is None else self.friction[start:stop] for start, stop, _ in self._runs()]
@@ -373,8 +370,7 @@ class SparseRows(eqx.Module):
             start += group.num_rows
             push = _fold(own, tilt)
             part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else linear.rmatvec(_flat(entries), _flat(push))
-            for run in linear.runs(group.dofs):
-                total = total.at[run.target].add(part[run.source])
+            total = linear.add_at(total, group.dofs, part)
         return total
 
     def gram(self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, bend: Bend) -> Float[Array, "nv nv *batch"]:
@@ -395,14 +391,9 @@ class SparseRows(eqx.Module):
             else:
                 curved = _cone_product(layout, bend, rows, entries)
             if group.is_diagonal:
-                square = entries[:, 0, 0] * curved[:, 0, 0]
-                for place, dof in enumerate(group.dofs):
-                    total = total.at[dof, dof].add(square[place])
-                continue
-            square = linear.gram(_flat(entries), _flat(curved))
-            for across in linear.runs(group.dofs):
-                for down in linear.runs(group.dofs):
-                    total = total.at[down.target, across.target].add(square[down.source, across.source])
+                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] * curved[:, 0, 0])
+            else:
+                total = linear.add_to_block(total, group.dofs, linear.gram(_flat(entries), _flat(curved)))
         return total
 
 

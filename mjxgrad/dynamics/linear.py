@@ -170,6 +170,48 @@ def take(x: Float[Array, "n *rest"], chosen: tuple[int, ...]) -> Float[Array, "m
     return parts[0] if len(parts) == 1 else jnp.concatenate([x[:0], *parts])
 
 
+def add_at(
+    x: Float[Array, "n *rest"], chosen: tuple[int, ...], part: Float[Array, "m *rest"]
+) -> Float[Array, "n *rest"]:
+    """Return x with something added to entries at ascending constant indices."""
+    for run in runs(chosen):
+        x = _add_block(x, (run.target,), part[run.source])
+    return x
+
+
+def add_to_block(
+    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m m *batch"]
+) -> Float[Array, "n n *batch"]:
+    """Return a matrix with something added to some rows and the same columns."""
+    for down in runs(chosen):
+        for across in runs(chosen):
+            matrix = _add_block(matrix, (down.target, across.target), part[down.source, across.source])
+    return matrix
+
+
+def add_to_diagonal(
+    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m *batch"]
+) -> Float[Array, "n n *batch"]:
+    """Return a matrix with something added to some entries of the diagonal."""
+    for place, k in enumerate(chosen):
+        matrix = _add_block(matrix, (slice(k, k + 1), slice(k, k + 1)), part[place][None, None])
+    return matrix
+
+
+def _add_block(x: Array, where: tuple[slice, ...], part: Array) -> Array:
+    """Return x with something added to a block.
+
+    A CPU adds in place, and touches nothing else. A GPU spends more on starting an operation than on a
+    whole array: padded, the sum of many blocks is one operation.
+    """
+    if part.shape == x.shape:
+        return x + part
+    if jax.default_backend() == "cpu":
+        return x.at[where].add(part)
+    margins = [(axis.start, size - axis.stop, 0) for axis, size in zip(where, x.shape, strict=False)]
+    return x + jax.lax.pad(part, jnp.zeros((), x.dtype), [*margins, *[(0, 0, 0)] * (x.ndim - len(where))])
+
+
 def add(terms: Iterable[Array]) -> Array:
     """Return a sum, written out."""
     return functools.reduce(operator.add, terms)
