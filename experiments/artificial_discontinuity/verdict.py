@@ -33,8 +33,8 @@ def verdict(outcome: Outcome) -> str:
         sentences.append(f"It does not with {_listed(rows)}: to differentiate through contact build it of these.")
         if worse := [f"{name} ({plain[name]:.0%})" for name in smooth if plain[name] > threshold]:
             sentences.append(
-                f"Under MuJoCo's default contact, whose force begins with a jump, it still does with {_listed(worse)} where one more "
-                "part touches: there let the impedance rise from zero (the first number of solimp)."
+                f"Under MuJoCo's default contact, whose force begins with a jump, it still does with {_listed(worse)} where "
+                "one more part touches: there let the impedance rise from zero (the first number of solimp)."
             )
     else:
         sentences.append(f"None of the bodies is without; the least has {min(bodies, key=lambda name: most[name])}.")
@@ -201,9 +201,10 @@ def _by_jump(outcome: Outcome) -> Table:
     return Table(
         ("path", "at", "contacts", "jump over force", "reference jumps by", "changes nearby by", "which is"),
         rows,
-        f"The jumps of the box beyond {outcome.settings.threshold:.0%} of the force beside them, of {len(outcome.judged)} in all. "
-        "The reference is the gradient of the overlap volume; nearby is one penetration depth to each side. A jump of which it does at least half at once is real; at least half nearby: a real change, made sudden. The "
-        "onset of a contact is no jump where contact begins gently.",
+        f"The jumps of the box beyond {outcome.settings.threshold:.0%} of the force beside them, of {len(outcome.judged)} in "
+        "all. The reference is the gradient of the overlap volume; nearby is one penetration depth to each side. A jump of "
+        "which it does at least half at once is real; at least half nearby: a real change, made sudden. The onset of a "
+        "contact is no jump where contact begins gently.",
     )
 
 

@@ -1,5 +1,7 @@
 """From settings to numbers."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from experiments.long_horizon.adaptive import adaptive
 from experiments.long_horizon.estimates import reference_gradient, zeroth
 from experiments.long_horizon.outcome import ZEROTH, Errors, Found, Outcome
 from experiments.long_horizon.problems import Problem, problem
-from experiments.long_horizon.settings import LongHorizonSettings
+from experiments.long_horizon.settings import LongHorizonSettings, Sizes
 from experiments.long_horizon.windows import cut
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import crossover, growth, root_mean_square_interval
@@ -63,6 +65,9 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
             one, one.stddev * rng.normal(size=(max(sizes.num_reference // 8, _BATCH), dim)), whole, whole, None
         )
         many, _ = _run(one, one.stddev * rng.normal(size=(sizes.num_reference, dim)), whole, whole, None)
+        pilot, many = (
+            _chosen(each, np.flatnonzero(np.isfinite(each.states).all(axis=(1, 2)))) for each in (pilot, many)
+        )
         reference, reference_error = reference_gradient(one.stddev, _costs(one, pilot), _costs(one, many))
     first = {}
     with workspace.stage(f"{one.title}: estimates", "gradients", len(one.gradients)) as advance_to:
@@ -70,14 +75,19 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
             rollouts, slopes = _run(one, noise, whole, whole, gradient)
             first[f"first order, {gradient}"] = (rollouts, slopes)
             advance_to(i + 1)
+    # What diverged is left out of all estimates alike, and the report says how much that was.
+    is_finite = np.all([np.isfinite(slopes).all(axis=(1, 2)) for _, slopes in first.values()], axis=0)
+    sizes = dataclasses.replace(sizes, num_samples=int(is_finite.sum()) // sizes.num_repeats)
+    kept = np.flatnonzero(is_finite)[: sizes.num_repeats * sizes.num_samples]
+    noise = noise[kept]
+    first = {label: (_chosen(rollouts, kept), slopes[kept]) for label, (rollouts, slopes) in first.items()}
     costs = _costs(one, next(iter(first.values()))[0])[1]
     samples = {label: slopes for label, (_, slopes) in first.items()} | {
         ZEROTH: zeroth(one.stddev, noise, costs, sizes)
     }
-    is_finite = np.all([np.isfinite(each).all(axis=(1, 2)) for each in samples.values()], axis=0)
     estimators, squares = [], {}
     for label, each in samples.items():
-        errors, squares[label] = _errors(settings, label, each, reference, reference_error)
+        errors, squares[label] = _errors(settings, sizes, label, each, reference, reference_error)
         estimators.append(errors)
     times = one.interval * np.arange(1, whole + 1)
     crossovers = {
@@ -94,7 +104,9 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
             def again(length: int, gradient: str = gradient) -> np.ndarray:
                 return np.asarray(_run(one, noise, length, whole, gradient)[0].tangents)
 
-            windows[f"first order, {gradient}"] = cut(settings, one, again, many, first[f"first order, {gradient}"][0])
+            windows[f"first order, {gradient}"] = cut(
+                settings, sizes, one, again, many, first[f"first order, {gradient}"][0]
+            )
             advance_to(i + 1)
     return Found(
         title=one.title,
@@ -111,6 +123,10 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
         windows=windows,
         finite=float(is_finite.mean()),
     )
+
+
+def _chosen(rollouts: Rollouts, rows: np.ndarray) -> Rollouts:
+    return jax.tree.map(lambda x: x[rows], rollouts)
 
 
 def _run(
@@ -170,10 +186,14 @@ def _costs(one: Problem, rollouts: Rollouts) -> tuple[np.ndarray, Float[np.ndarr
 
 
 def _errors(
-    settings: LongHorizonSettings, label: str, samples: np.ndarray, reference: np.ndarray, reference_error: np.ndarray
+    settings: LongHorizonSettings,
+    sizes: Sizes,
+    label: str,
+    samples: np.ndarray,
+    reference: np.ndarray,
+    reference_error: np.ndarray,
 ) -> tuple[Errors, Float[np.ndarray, "repeats times"]]:
     """Return errors over the reference's largest size, and the squared errors of all repeats less the reference's own."""
-    sizes = settings.sizes
     estimates = samples.reshape(sizes.num_repeats, sizes.num_samples, *samples.shape[1:]).mean(axis=1)
     scale = np.linalg.norm(reference, axis=1).max()
     off = (estimates - reference) / scale

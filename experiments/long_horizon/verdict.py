@@ -141,7 +141,7 @@ def _by_horizon(outcome: Outcome) -> Table:
         places = np.unique(np.linspace(0, len(one.times) - 1, 6).round().astype(int))
         for each in one.estimators:
             cells = [
-                f"{_percent(each.error[i])} ({_percent(float(each.interval[0, i]))} to {_percent(float(each.interval[1, i]))})"
+                f"{_percent(float(each.error[i]))} ({_percent(float(each.interval[0, i]))} to {_percent(float(each.interval[1, i]))})"
                 for i in places
             ]
             rows.append([one.title, each.label, *cells])

@@ -10,13 +10,17 @@ from jaxtyping import Array, Float
 from experiments.long_horizon.estimates import reference_gradient, zeroth
 from experiments.long_horizon.outcome import Windows
 from experiments.long_horizon.problems import Problem
-from experiments.long_horizon.settings import LongHorizonSettings
+from experiments.long_horizon.settings import LongHorizonSettings, Sizes
 from mjxgrad.diagnostics import root_mean_square_interval
 
-_RIDGE = 1e-6  # of the features' own squares: they are many, and some hardly vary
+# Of the features' own squares. Noisy parameters are few, so the states lie close to a surface, and across it a fit knows no
+# slope; without a ridge its slopes there are arbitrary.
+_RIDGE = 1e-2
 
 
-def cut(settings: LongHorizonSettings, one: Problem, again: Callable[[int], np.ndarray], many, own) -> Windows:
+def cut(
+    settings: LongHorizonSettings, sizes: Sizes, one: Problem, again: Callable[[int], np.ndarray], many, own
+) -> Windows:
     """Estimate the gradient of the mean cost over the whole horizon from windows of every length.
 
     A window charges the costs in it, and at its end the fitted value of the costs to come; the next one starts from the same
@@ -24,6 +28,7 @@ def cut(settings: LongHorizonSettings, one: Problem, again: Callable[[int], np.n
 
     Args:
         settings: of the run.
+        sizes: how many rollouts make an estimate.
         one: the problem.
         again: from a window's length to the tangents of the same rollouts.
         many: rollouts on which the value function is fitted, and from which the reference is taken.
@@ -32,7 +37,7 @@ def cut(settings: LongHorizonSettings, one: Problem, again: Callable[[int], np.n
     Returns:
         Errors and biases by length.
     """
-    sizes, whole = settings.sizes, settings.sizes.num_times
+    whole = sizes.num_times
     costs = jax.jit(jax.vmap(jax.vmap(one.cost)))
     own_costs, many_costs = (np.asarray(costs(jnp.asarray(each.states))) for each in (own, many))
     half = len(many_costs) // 8
@@ -51,7 +56,7 @@ def cut(settings: LongHorizonSettings, one: Problem, again: Callable[[int], np.n
         later = np.einsum("stn,stnd->sd", value_slopes[:, ends], tangents[:, ends]) / whole
         samples += [charged, charged + later]
     samples.append(zeroth(one.stddev, own.noise, own_costs.mean(axis=1, keepdims=True), sizes)[:, 0])
-    errors = [_error(settings, each, reference[0], reference_error[0]) for each in samples]
+    errors = [_error(settings, sizes, each, reference[0], reference_error[0]) for each in samples]
     plain, valued, last = errors[:-1:2], errors[1:-1:2], errors[-1]
     pairs = [np.array([[each[i] for each in kind] for kind in (plain, valued)]) for i in range(5)]
     return Windows(
@@ -65,9 +70,15 @@ def cut(settings: LongHorizonSettings, one: Problem, again: Callable[[int], np.n
     )
 
 
-def _error(settings: LongHorizonSettings, samples: np.ndarray, reference: np.ndarray, reference_error: np.ndarray):
+def _error(
+    settings: LongHorizonSettings,
+    sizes: Sizes,
+    samples: np.ndarray,
+    reference: np.ndarray,
+    reference_error: np.ndarray,
+) -> tuple[float, float, float, float, float]:
     """Return error, both ends of its interval, bias and what chance makes of it, over the reference's size."""
-    sizes, scale = settings.sizes, np.linalg.norm(reference)
+    scale = np.linalg.norm(reference)
     off = (samples.reshape(sizes.num_repeats, sizes.num_samples, -1).mean(axis=1) - reference) / scale
     known = (reference_error / scale) ** 2
     mean = off.mean(axis=0)
