@@ -17,8 +17,6 @@ from experiments.long_horizon.windows import cut
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import crossover, growth, root_mean_square_interval
 
-_BATCH = 256  # rollouts of a call, so that one compilation serves all
-
 
 class Rollouts(eqx.Module):
     """Rollouts under noise on the parameters, with what follows for the costs.
@@ -57,14 +55,14 @@ def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
 
 def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generator, workspace: Workspace) -> Found:
     sizes, dim = settings.sizes, len(one.params)
-    whole, count = sizes.num_times, sizes.num_repeats * sizes.num_samples
+    whole, count, batch = sizes.num_times, sizes.num_repeats * sizes.num_samples, sizes.batch
     noise = one.stddev * rng.normal(size=(count, dim))
     with workspace.stage(f"{one.title}: reference", "rollouts", sizes.num_reference):
         # A pilot's slopes take out the linear part of the costs; fixed before the reference is drawn, they leave it unbiased.
-        pilot, _ = _run(
-            one, one.stddev * rng.normal(size=(max(sizes.num_reference // 8, _BATCH), dim)), whole, whole, None
-        )
-        many, _ = _run(one, one.stddev * rng.normal(size=(sizes.num_reference, dim)), whole, whole, None)
+        noises = [
+            one.stddev * rng.normal(size=(n, dim)) for n in (max(sizes.num_reference // 8, batch), sizes.num_reference)
+        ]
+        pilot, many = (_run(one, each, whole, whole, None, batch)[0] for each in noises)
         pilot, many = (
             _chosen(each, np.flatnonzero(np.isfinite(each.states).all(axis=(1, 2)))) for each in (pilot, many)
         )
@@ -72,7 +70,7 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
     first = {}
     with workspace.stage(f"{one.title}: estimates", "gradients", len(one.gradients)) as advance_to:
         for i, gradient in enumerate(one.gradients):
-            rollouts, slopes = _run(one, noise, whole, whole, gradient)
+            rollouts, slopes = _run(one, noise, whole, whole, gradient, batch)
             first[f"first order, {gradient}"] = (rollouts, slopes)
             advance_to(i + 1)
     # What diverged is left out of all estimates alike, and the report says how much that was.
@@ -102,7 +100,7 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
         for i, gradient in enumerate(one.gradients):
 
             def again(length: int, gradient: str = gradient) -> np.ndarray:
-                return np.asarray(_run(one, noise, length, whole, gradient)[0].tangents)
+                return np.asarray(_run(one, noise, length, whole, gradient, batch)[0].tangents)
 
             windows[f"first order, {gradient}"] = cut(
                 settings, sizes, one, again, many, first[f"first order, {gradient}"][0]
@@ -130,18 +128,17 @@ def _chosen(rollouts: Rollouts, rows: np.ndarray) -> Rollouts:
 
 
 def _run(
-    one: Problem, noise: np.ndarray, window: int, num_times: int, gradient: str | None
+    one: Problem, noise: np.ndarray, window: int, num_times: int, gradient: str | None, batch: int
 ) -> tuple[Rollouts, np.ndarray | None]:
     """Roll out in batches; with a gradient give the derivatives of the costs, too, one row per sample and time."""
     parts = []
-    for start in range(0, len(noise), _BATCH):
-        batch = np.resize(noise[start : start + _BATCH], (_BATCH, noise.shape[1]))
-        params = one.params + jnp.asarray(batch)
-        size = min(_BATCH, len(noise) - start)
+    for start in range(0, len(noise), batch):
+        params = one.params + jnp.asarray(np.resize(noise[start : start + batch], (batch, noise.shape[1])))
+        size = min(batch, len(noise) - start)
         if gradient is None:
             part = (_states(one, params, num_times),)
         else:
-            part = _tangents(one, params, jnp.full(_BATCH, window), num_times, gradient)
+            part = _tangents(one, params, jnp.full(batch, window), num_times, gradient)
         parts.append([np.asarray(each)[:size] for each in part])
     joined = [np.concatenate(each) for each in zip(*parts, strict=True)]
     if gradient is None:

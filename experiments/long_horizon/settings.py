@@ -30,9 +30,14 @@ class Sizes:
     num_jacobians: int
     num_adaptive: int
 
+    @property
+    def batch(self) -> int:
+        """Rollouts of a call, so that one compilation serves all."""
+        return min(256, self.num_repeats * self.num_samples)
+
 
 SIZES = {
-    "quick": Sizes(16, 16, 16, 1024, 8, 4),
+    "quick": Sizes(16, 16, 8, 512, 8, 4),
     "default": Sizes(32, 32, 32, 8192, 16, 12),
     "full": Sizes(48, 64, 128, 131072, 64, 24),
 }

@@ -140,10 +140,8 @@ def _by_horizon(outcome: Outcome) -> Table:
     for one in outcome.found.values():
         places = np.unique(np.linspace(0, len(one.times) - 1, 6).round().astype(int))
         for each in one.estimators:
-            cells = [
-                f"{_percent(float(each.error[i]))} ({_percent(float(each.interval[0, i]))} to {_percent(float(each.interval[1, i]))})"
-                for i in places
-            ]
+            numbers = [[float(x) for x in (each.error[i], *each.interval[:, i])] for i in places]
+            cells = [f"{_percent(error)} ({_percent(low)} to {_percent(high)})" for error, low, high in numbers]
             rows.append([one.title, each.label, *cells])
     shares = [f"{share:.0%}" for share in np.linspace(0, 1, 6)]
     heads = [f"{share} of the time" for share in shares]

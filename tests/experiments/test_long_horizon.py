@@ -79,4 +79,4 @@ def test_settings_that_cannot_be_are_a_sentence(override, sentence):
 def test_a_quick_run_says_where_the_orders_cross(tmp_path):
     assert main(["run", "long_horizon", "size=quick", "problems=['double_pendulum']", "--output", str(tmp_path)]) == 0
     verdict = json.loads((tmp_path / "long_horizon" / "summary.json").read_text())["verdict"]
-    assert verdict.startswith("Double pendulum: at 16 rollouts an estimate, zeroth order is as good from a horizon of ")
+    assert verdict.startswith("Double pendulum: at 8 rollouts an estimate, zeroth order is as good from a horizon of ")
