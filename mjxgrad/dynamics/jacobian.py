@@ -271,12 +271,14 @@ class ContactRows(RowMap):
         force, num_batch = frame[:, : min(self.dim, 3)], frame.ndim - 3
         moves = jnp.asarray(self._moves(contacts, dofs), frame.dtype)
         moves = moves.reshape(*moves.shape, *(1,) * num_batch)
-        straight, parts = _along(force, axes[:, 3:]), []
+        pushes, parts = [force[:, :, i] for i in range(3)], []
         for side in range(moves.shape[1]):
-            torque = _cross(self.lever[contacts, side][:, None], force)
-            rows = _along(torque, axes[:, :3]) + straight
+            lever = [self.lever[contacts, side, i, None] for i in range(3)]
+            torques = [lever[i] * pushes[j] - lever[j] * pushes[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+            rows = _along(torques + pushes, axes)
             if self.dim > 3:
-                rows = jnp.concatenate([rows, _along(frame[:, : self.dim - 3], axes[:, :3])], axis=1)
+                twists = [frame[:, : self.dim - 3, i] for i in range(3)]
+                rows = jnp.concatenate([rows, _along(twists, axes[:, :3])], axis=1)
             parts.append(moves[:, side, None] * rows)
         return linear.add(parts)
 
@@ -385,29 +387,31 @@ class SparseRows(eqx.Module):
         for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
             rows = slice(start, start + group.num_rows)
             start = rows.stop
-            if rows.start < layout.simple_stop:
-                of_rows = bend.simple[rows].reshape(group.num, group.rows_each, *mass.shape[2:])
-                curved = of_rows[:, :, None] * entries if tilt is None else _pyramid_product(of_rows, tilt, entries)
+            if rows.start >= layout.simple_stop:
+                square = linear.gram(_flat(entries), _flat(_cone_product(layout, bend, rows, entries)))
+            elif group.is_diagonal:
+                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * bend.simple[rows])
+                continue
+            elif tilt is None:
+                flat = _flat(entries)
+                square = linear.gram(flat, bend.simple[rows][:, None] * flat)
             else:
-                curved = _cone_product(layout, bend, rows, entries)
-            if group.is_diagonal:
-                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] * curved[:, 0, 0])
-            else:
-                total = linear.add_to_block(total, group.dofs, linear.gram(_flat(entries), _flat(curved)))
+                square = _pyramid_square(bend.simple[rows].reshape(*tilt.shape[:2], 2, *mass.shape[2:]), tilt, entries)
+            total = linear.add_to_block(total, group.dofs, square)
         return total
 
 
-def _pyramid_product(
-    bend: Float[Array, "num edges *batch"],
+def _pyramid_square(
+    bend: Float[Array, "num tangents 2 *batch"],
     tilt: Float[Array, "num tangents *batch"],
     entries: Float[Array, "num dim dofs *batch"],
-) -> Float[Array, "num dim dofs *batch"]:
-    """Return Eᵀ s'' E times the directions, E the edges n ± μ t."""
-    pairs = bend.reshape(len(bend), -1, 2, *bend.shape[2:])
-    both, difference = pairs[:, :, 0] + pairs[:, :, 1], tilt * (pairs[:, :, 0] - pairs[:, :, 1])
-    normal, tangents = entries[:, :1], entries[:, 1:]
-    along = linear.sum_of_few(both)[:, :, None] * normal + linear.sum_of_few(difference[:, :, None] * tangents)
-    return jnp.concatenate([along, difference[:, :, None] * normal + (tilt**2 * both)[:, :, None] * tangents], axis=1)
+) -> Float[Array, "dofs dofs *batch"]:
+    """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
+    both, difference = bend[:, :, 0] + bend[:, :, 1], (tilt * (bend[:, :, 0] - bend[:, :, 1]))[:, :, None]
+    normal, tangents = entries[:, 0], entries[:, 1:]
+    of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
+    of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
+    return linear.gram(normal, of_normal) + linear.gram(_flat(tangents), _flat(of_tangents))
 
 
 def _cone_product(
@@ -443,16 +447,15 @@ def _flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
     return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
 
 
-def _cross(a: Float[Array, "n #k 3 *batch"], b: Float[Array, "n #k 3 *batch"]) -> Float[Array, "n k 3 *batch"]:
-    a0, a1, a2, b0, b1, b2 = (x[:, :, i] for x in (a, b) for i in range(3))
-    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=2)
-
-
 def _along(
-    vectors: Float[Array, "n k 3 *batch"], axes: Float[Array, "dofs 3 *batch"]
+    parts: list[Float[Array, "n k *batch"]], axes: Float[Array, "dofs entries *batch"]
 ) -> Float[Array, "n k dofs *batch"]:
-    # Written out: XLA's CPU backend crashed on the derivative of the reduction under two jax.vmap (jax 0.10.2).
-    return linear.add(vectors[:, :, None, i] * axes[:, i] for i in range(3))
+    """Return products of vectors, given entry by entry, with axes.
+
+    Written out, and no vector put together of its entries: XLA's CPU backend runs along the batch only where nothing
+    is concatenated on the way. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
+    """
+    return linear.add(part[:, :, None] * axes[:, i] for i, part in enumerate(parts))
 
 
 def _spread(

@@ -33,7 +33,9 @@ def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> F
 
 def rmatvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
     """Return matrixᵀ x."""
-    return matvec(jnp.swapaxes(matrix, 0, 1), x)
+    if matrix.ndim == 2 or len(matrix) > _LONGEST_SUM:
+        return matvec(jnp.swapaxes(matrix, 0, 1), x)
+    return add(row * factor for row, factor in zip(matrix, x, strict=True))
 
 
 def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array, "*batch"]:
@@ -55,11 +57,10 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
 
 
 def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
-    """Return leftᵀ right for a product known to be symmetric."""
+    """Return leftᵀ right."""
     if left.ndim > 2 and len(left) <= _LONGEST_SUM:
         return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
-    product = jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
-    return 0.5 * (product + jnp.swapaxes(product, 0, 1))
+    return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
 
 def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
