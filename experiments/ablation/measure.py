@@ -48,18 +48,19 @@ def measure(settings: AblationSettings, workspace: Workspace) -> Outcome:
     try:
         with workspace.stage("variants", "scenes", len(settings.chosen)) as advance_to:
             for number, name in enumerate(settings.chosen):
-                scenes.append(_scene(name, settings))
+                scenes.append(_scene(name, settings, workspace))
                 advance_to(number + 1)
     finally:
         jax.config.update("jax_enable_compilation_cache", had_cache)
     return Outcome(settings, scenes)
 
 
-def _scene(name: str, settings: AblationSettings) -> SceneOutcome:
+def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> SceneOutcome:
     sizes, path = settings.sizes, scene_path(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         everything = mg.load_scene(path, keep_everything=True)
+    workspace.check(everything)
     recorded, others = (
         record(
             everything,

@@ -2,6 +2,7 @@
 
 import time
 
+import mjxgrad as mg
 from experiments.work_precision import gradient, simulation
 from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
@@ -27,6 +28,7 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
     total = sum(len(variants(one, settings)) for one in cases.values())
     with workspace.stage("scenes", "programs", total) as advance_to:
         for name, one in cases.items():
+            workspace.check(mg.load_scene(one.model))
             courses.append(_course(name, one, settings))
             advance_to(sum(course.num_programs for course in courses))
     return Outcome(settings, tuple(courses))
