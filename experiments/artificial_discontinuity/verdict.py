@@ -98,8 +98,8 @@ def _biases(outcome: Outcome) -> str:
         return sentence
     rest = [abs(one.bias[0] + one.jump) / abs(one.bias[0]) for one in jumping]
     return (
-        f"{sentence} Where the push itself jumps ({len(jumping)} of them), the jump times the density of the noise makes up the "
-        f"discrete gradient's bias to {np.median(rest):.0%} in the median."
+        f"{sentence} Where the push itself jumps ({len(jumping)} of them), the jump times the density of the noise is the "
+        f"discrete gradient's bias, up to {np.median(rest):.0%} of it in the median."
     )
 
 

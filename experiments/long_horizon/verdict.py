@@ -78,7 +78,7 @@ def _window(one: Found) -> str:
     length = one.times[0] * cut.lengths[at]
     return (
         f"For the mean cost over all of it windows of {length:.3g} s {how} are best, {_percent(best)} off "
-        f"({_percent(cut.bias[kind, at])} of it bias); {others}."
+        f"(bias {_percent(cut.bias[kind, at])}, where chance leaves up to {_percent(cut.bias_noise[kind, at])}); {others}."
     )
 
 
