@@ -107,6 +107,8 @@ def _value_slopes(
         jax.vmap(jax.grad(lambda x, centre, size, w: features(x, centre, size) @ w), in_axes=(0, None, None, None))
     )
     later = costs[:, ::-1].cumsum(axis=1)[:, ::-1] - costs
+    # Less its mean, which a ridge would pull towards zero with the rest, and which has no slope.
+    later = later - later.mean(axis=0)
     found, fits = np.zeros_like(at), []
     for time in range(states.shape[1] - 1):
         seen = np.asarray(jax.vmap(one.observe)(jnp.asarray(states[:, time])))
