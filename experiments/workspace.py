@@ -30,17 +30,18 @@ class Workspace:
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
 
-    def check(self, scene: "Scene", *, speed: float | None = None) -> None:
+    def check(self, scene: "Scene", *, speed: float | None = None, name: str | None = None) -> None:
         """Note what the time step of a scene does not follow; it becomes part of the report.
 
         Args:
             scene: that is simulated, with known values.
             speed: at which its bodies meet, in m/s.
+            name: in place of the scene's own.
         """
         # A configuration is checked before anything heavy is imported.
         from mjxgrad.diagnostics.stability import check_stability
 
-        self.warnings += [f"{scene.name}: {text}" for text in check_stability(scene, speed=speed).warnings]
+        self.warnings += [f"{name or scene.name}: {text}" for text in check_stability(scene, speed=speed).warnings]
 
     @contextlib.contextmanager
     def stage(self, name: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:

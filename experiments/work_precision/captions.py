@@ -23,7 +23,8 @@ def captions(outcome: Outcome) -> dict[str, str]:
             "other beats, rings what no other on JAX does. "
             "Right: loose tolerances at the two coarsest steps, few iterations, and the other cone, compared with its own "
             "reference. Dotted: how far the reference itself moved when its step was last halved; below it nothing is "
-            "known. Grey: the errors that settings are recommended for. Compilation is apart, in the table."
+            "known; it is left out where it is far below all errors. "
+            "Grey: the errors that settings are recommended for. Compilation is apart, in the table."
         ),
         "motion_next": "As above.",
         "gradient": (

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter
 
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
 from experiments.work_precision.front import pareto_front
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Estimate, Outcome, Point
 
@@ -72,6 +73,7 @@ def motion(course: Course, outcome: Outcome):
     axes[0, 0].set_ylabel("error of the final state, relative")
     axes[0, 0].set_title("integrator, precision, time step")
     axes[0, 1].set_title("solver tolerance and iterations, the other cone")
+    _thin_ticks(axes[0, 0])
     _limit(axes[0, 0], [one.error for one in course.points])
     handles = _motion_legend(tight, others)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
@@ -93,6 +95,7 @@ def gradient(course: Course, outcome: Outcome):
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
         axis.set(xscale="log", yscale="log", xlim=None if estimates else _ANY)
+    _thin_ticks(axes[0, 0])
     axes[0, 0].set(xlabel="wall-clock seconds of one estimate", ylabel="error of the gradient, relative")
     axes[0, 1].set(xlabel="rollouts of one estimate")
     ticks = sorted({one.num_samples for one in estimates})
@@ -101,7 +104,7 @@ def gradient(course: Course, outcome: Outcome):
         axes[0, 1].minorticks_off()
     errors = [one.error for one in estimates]
     low = np.nanmin([*errors, course.gradient_reference.error, *outcome.settings.targets])
-    axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e3))
+    axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e4))
     present = {one.estimator for one in estimates}
     handles = [Line2D([], [], color=c, marker="o", ms=4, label=n) for n, c in _ESTIMATORS.items() if n in present]
     handles += [
@@ -201,6 +204,17 @@ def _gradient_line(axis: Axes, line: Sequence[Estimate], against: str, *, is_own
     if is_own:
         low, high = np.array([one.spread for one in line]).T
         axis.vlines(places, low, high, color=colour, lw=3.5, alpha=0.25)
+
+
+def _thin_ticks(axis: Axes) -> None:
+    """Write no numbers between powers of ten but at 2 and 5, which leaves room for them."""
+    axis.xaxis.set_minor_formatter(FuncFormatter(_at_2_and_5))
+
+
+def _at_2_and_5(value: float, _: int | None) -> str:
+    exponent = int(np.floor(np.log10(value) + 1e-9))
+    digit = round(value / 10.0**exponent)
+    return power(digit * 10.0**exponent) if digit in (2, 5) else ""
 
 
 def _limit(axis: Axes, errors: Sequence[float]) -> None:

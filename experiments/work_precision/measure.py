@@ -25,16 +25,16 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
     cases = {name: case(name) for name in settings.scene_names}
     courses = []
     # Compiling is most of the time, so progress is counted in programs.
-    total = sum(len(variants(one, settings)) for one in cases.values())
+    total = sum(len(variants(one, settings, settings.has_asides(name))) for name, one in cases.items())
     with workspace.stage("scenes", "programs", total) as advance_to:
         for name, one in cases.items():
-            workspace.check(mg.load_scene(one.model))
+            workspace.check(mg.load_scene(one.model), name=one.title)
             courses.append(_course(name, one, settings))
             advance_to(sum(course.num_programs for course in courses))
     return Outcome(settings, tuple(courses))
 
 
-def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
+def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> list[Variant]:
     """Say for what a scene is compiled, the longest compilations first.
 
     A cone makes no difference without friction, and implicitfast none where Euler's implicit damping is all there is.
@@ -42,6 +42,7 @@ def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
     Args:
         one: the scene.
         settings: of the run.
+        has_asides: whether to take one state alone, MJX in double precision and the other cone, too.
 
     Returns:
         The variants, without repetition.
@@ -52,11 +53,13 @@ def variants(one: Case, settings: WorkPrecisionSettings) -> list[Variant]:
     found += [Variant("mg", cone=own, batch=batch, derivative="discrete")]
     libraries: tuple[Library, ...] = ("mjx", "mg")
     for library in libraries:
-        found += [Variant(library, cone=own, batch=batch), Variant(library, cone=own, precision="float32", batch=batch)]
-        found += [Variant(library, cone=own, precision="float32")]
+        found += [Variant(library, cone=own, batch=batch)] if library == "mg" or has_asides else []
+        found += [Variant(library, cone=own, precision="float32", batch=batch)]
+        found += [Variant(library, cone=own, precision="float32")] if has_asides else []
         if library == "mg" or everything:
             found += [Variant(library, "RK4", own, batch=batch)]
-            found += [Variant(library, cone=name, batch=batch) for name in CONES if name != own and has_friction(one)]
+            cones = [name for name in CONES if name != own and has_friction(one) and has_asides]
+            found += [Variant(library, cone=name, batch=batch) for name in cones]
             found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
         if everything:
             found += [Variant(library, "RK4", own, "float32", batch)]
@@ -78,7 +81,7 @@ def has_friction(one: Case) -> bool:
 
 def _course(name: str, one: Case, settings: WorkPrecisionSettings) -> Course:
     begun = time.perf_counter()
-    programs = compiled(one, variants(one, settings))
+    programs = compiled(one, variants(one, settings, settings.has_asides(name)))
     compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
     right = simulation.truths(one, programs, qvel, settings.threads)

@@ -22,19 +22,18 @@ def verdict(outcome: Outcome) -> str:
         ratios = _ratios(outcome, other, target)
         if ratios:
             sentences.append(
-                f"For {_percent(target)} error of the motion mg.step takes {_factor(np.median(ratios))} the time of {name} "
-                f"in the median of {len(ratios)} {'scene' if len(ratios) == 1 else 'scenes'} "
-                f"({_factor(min(ratios))} to {_factor(max(ratios))})."
+                f"For {_percent(target)} error of the motion mg.step takes {np.median(ratios):.2g} times the time of {name} "
+                f"{_over(ratios, outcome)}."
             )
     chosen = [cheapest(course.estimates, target) for course in outcome.courses]
     names = [choice.estimate.estimator for choice in chosen if choice is not None]
     if names:
         counts = {name: names.count(name) for name in dict.fromkeys(names)}
-        listed = ", ".join(f"{name} on {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
-        sentences.append(f"For {_percent(target)} error of the gradient the soonest is {listed}.")
+        listed = "; ".join(f"{name}: {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+        sentences.append(f"{_percent(target)} error of the gradient is soonest reached by (scenes) {listed}.")
     lost = len(outcome.courses) - len(names)
     if lost:
-        sentences.append(f"On {lost} of {len(outcome.courses)} no way of estimating it is known to get there.")
+        sentences.append(f"On {lost} of {len(outcome.courses)} scenes no way of estimating it is known to get there.")
     return " ".join(sentences) or "No setting reached a target on any scene."
 
 
@@ -105,7 +104,7 @@ def batches(outcome: Outcome) -> Table:
             seconds = [p.compile_seconds for p in course.points if p.library == library and p.integrator == "Euler"]
             row.append(f"{np.median(seconds):.1f}")
         others = [one for one in course.references if one.cone != course.cone and one.engine == MG]
-        row.append(_percent(others[0].distance) if others else "no friction")
+        row.append(_percent(others[0].distance) if others else "–")
         row.append(_percent(course.reference(MG, course.cone).distance_to_c))
         found = course.gradient_reference
         row.append(f"{_percent(found.standard_error)}; {_percent(found.step_error)}; {_percent(found.difference)}")
@@ -117,9 +116,9 @@ def batches(outcome: Outcome) -> Table:
     )  # fmt: skip
     caption = (
         "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
-        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). The figures "
-        "are about batches, which MJX is made for, and so are estimators. Seconds to trace and compile one program, two at a "
-        "time. Then how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference "
+        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). A "
+        "dash: not tried on this scene. The figures are about batches, which MJX is made for, and so are estimators. "
+        "Seconds to trace and compile one program, two at a time. Then how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference "
         "gradient: standard error, change with the last halving of the step, distance to the same gradient by differences of "
         "smoothed outcomes."
     )
@@ -134,7 +133,7 @@ def _alone_and_together(course: Course, library: str) -> str:
         is_converged = one.iterations >= NUM_ITERATIONS and one.tolerance <= 1e-6
         if one.library == library and is_plain and is_converged and (library == C or one.precision == "float32"):
             costs[one.batch > 1] = 1e3 * one.cost
-    return f"{costs[False]:.3g}; {costs[True]:.3g}"
+    return "; ".join(f"{costs[together]:.3g}" if together in costs else "–" for together in (False, True))
 
 
 def _recommendation(course: Course, outcome: Outcome) -> str:
@@ -209,8 +208,10 @@ def _milliseconds_of(seconds: float) -> str:
     return f"{1e3 * seconds:.2g}" if seconds < 1e-2 else f"{1e3 * seconds:.0f}"
 
 
-def _factor(ratio: float) -> str:
-    return f"{ratio:.2g} times"
+def _over(ratios: list[float], outcome: Outcome) -> str:
+    if len(ratios) == 1:
+        return "on the one scene where both reach it" if len(outcome.courses) > 1 else "on this scene"
+    return f"in the median of {len(ratios)} scenes ({min(ratios):.2g} to {max(ratios):.2g} times)"
 
 
 def _threads(outcome: Outcome) -> str:

@@ -179,13 +179,18 @@ def test_distances_of_free_bodies_are_metres_and_radians():
 
 def test_only_what_makes_a_difference_is_compiled():
     settings = WorkPrecisionSettings(experiment="work_precision")
-    compiled = {name: variants(case(name), settings) for name in ("pendulum", "push", "bounce", "arm")}
+    compiled = {name: variants(case(name), settings, True) for name in ("pendulum", "push", "bounce", "arm")}
     assert all(len(found) == len(set(found)) for found in compiled.values())
     assert [v.derivative for v in compiled["pendulum"] if v.derivative] == ["discrete"]  # no contact, no event
     assert {v.cone for v in compiled["push"]} == {"pyramidal"}  # no friction, no cone
     assert {v.cone for v in compiled["bounce"]} == {"pyramidal", "elliptic"}
     implicit = {name for name, found in compiled.items() if any(v.integrator == "implicitfast" for v in found)}
     assert implicit == {"arm"}  # its servos damp; elsewhere Euler's implicit damping is all there is
+    # Aside of the main diagram: one state alone, MJX in double precision, the other cone.
+    left_out = set(compiled["bounce"]) - set(variants(case("bounce"), settings, False))
+    aside = {("mg", 1), ("mjx", 1), ("mjx", settings.sizes.batch), ("mg", settings.sizes.batch)}
+    assert {(one.library, one.batch) for one in left_out} == aside
+    assert {one.cone for one in left_out if (one.library, one.batch) == ("mg", 32)} == {"elliptic"}
 
 
 @pytest.mark.parametrize("size", SIZES)
