@@ -118,7 +118,8 @@ def batches(outcome: Outcome) -> Table:
         "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
         f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). A "
         "dash: not tried on this scene. The figures are about batches, which MJX is made for, and so are estimators. "
-        "Seconds to trace and compile one program, two at a time. Then how far the other cone's motion ends, and MJX's from C MuJoCo's; last what is known of the reference "
+        "Seconds to trace and compile one program, two at a time. Then how far the other cone's motion ends, and MJX's from "
+        "C MuJoCo's; last what is known of the reference "
         "gradient: standard error, change with the last halving of the step, distance to the same gradient by differences of "
         "smoothed outcomes."
     )
