@@ -26,7 +26,7 @@ class Size:
 
 
 SIZES = {
-    "quick": Size(8, 64, ("ball", "sphere, condim 3, elliptic", "two balls, pyramidal", "chain"), ("ball",)),
+    "quick": Size(8, 32, ("ball", "sphere, condim 3, elliptic", "two balls, pyramidal"), ("ball",)),
     "default": Size(
         12,
         256,

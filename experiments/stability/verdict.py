@@ -75,11 +75,9 @@ def _limit(outcome: Outcome) -> str | None:
         return None
     ratio, fails = np.concatenate(predicted), np.concatenate(fails)
     below, beyond = ratio < 1, ratio >= 1
-    exceptions = (fails & below).sum()
-    sentence = (
-        f"Of {below.sum()} single bounces within the explicit limit {_count(int(exceptions))} "
-        f"gain{'s' * (exceptions == 1)} energy"
-    )
+    exceptions = int((fails & below).sum())
+    gain = "gains" if exceptions == 1 else "gain"
+    sentence = f"Of {below.sum()} single bounces within the explicit limit {_count(exceptions)} {gain} energy"
     if exceptions:
         sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
     spared = int((~fails & beyond).sum())

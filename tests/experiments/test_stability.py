@@ -6,11 +6,12 @@ import pytest
 
 from experiments.stability.grid import PLANES, Points, points
 from experiments.stability.limits import load
-from experiments.stability.outcome import C_MUJOCO, Behaviour, SceneOutcome
+from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.reasons import UNEXPLAINED, reasons
 from experiments.stability.reference import simulate, unbalanced
 from experiments.stability.scenes import DEFAULTS, catalogue, configure
-from experiments.stability.settings import SIZES
+from experiments.stability.settings import SIZES, StabilitySettings
+from experiments.stability.verdict import findings
 from mjxgrad.diagnostics.stability import Motion
 
 SCENES = {scene.name: scene for scene in catalogue()}
@@ -90,7 +91,8 @@ def test_unbalanced_is_the_share_of_the_velocity_that_a_solve_misses():
 def _outcome(scene, grid, ours, theirs, apart):
     def behaviour(motion):
         none = np.zeros(len(grid), bool)
-        return Behaviour(np.array(motion), np.zeros(len(grid), int), None, None, none, none, none, np.ones(len(grid)))
+        right = np.zeros(len(grid), int)
+        return Behaviour(np.array(motion), right, right, None, none, none, none, np.ones(len(grid)))
 
     kinds = {C_MUJOCO: behaviour(theirs), "float64": behaviour(ours)}
     return SceneOutcome(SCENES[scene], grid, kinds, {"float64": np.array(apart)})
@@ -100,6 +102,18 @@ def test_only_what_is_worse_than_c_mujoco_needs_a_reason():
     motions = [Motion.SETTLES, Motion.BOUNCES_RIGHT, Motion.DIVERGES]
     one = _outcome("ball", _points(3), motions, [Motion.MOVES, Motion.MOVES, Motion.DIVERGES], [1.0, 1.0, 1.0])
     assert reasons(one, "float64") == {}
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, "none gain energy"), (1, "1 gains energy"), (2, "2 gain energy")])
+def test_what_gains_energy_is_counted_on_either_side_of_the_explicit_limit(count, said):
+    """h/tc < 2ζ(√(1+ζ²) − ζ), 0.83 of critical damping: 0.1 and 0.5 are within, 2.5 is beyond."""
+    grid = _points(3, timestep=[0.002, 0.01, 0.05], time_constant=0.02, damping_ratio=1.0)
+    motions = [Motion.GAINS_ENERGY] * count + [Motion.BOUNCES_RIGHT] * (2 - count) + [Motion.GAINS_ENERGY]
+    one = _outcome("ball", grid, motions, motions, [0.0, 0.0, 0.0])
+    settings = StabilitySettings(experiment="stability", precisions=("float64",))
+    sentence = findings(Outcome(settings, [one]))[0]
+    assert f"Of 2 single bounces within the explicit limit {said}" in sentence
+    assert "of 1 beyond it all do" in sentence
 
 
 def test_what_no_reason_fits_stays_unexplained():
