@@ -1,7 +1,5 @@
 """A peg and a hole, whose contact is told by boxes, by points on the peg alone, or by points on both."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +10,7 @@ import mjxgrad as mg
 from experiments.artificial_discontinuity.outcome import Mating
 from experiments.artificial_discontinuity.pushes import slopes_at
 from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.workspace import Workspace
 from mjxgrad.diagnostics import jumps_along
 
 TILT = 0.1  # rad
@@ -35,21 +34,23 @@ _SCENE = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
 <geom class="peg" type="box" size="{width} .01 {length}"/>{points}</body></worldbody></mujoco>"""
 
 
-def measure(settings: ArtificialDiscontinuitySettings, advance_to: Callable[[int], None]) -> list[Mating]:
+def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> list[Mating]:
     """Hold the peg in the hole, and drop it beside it.
 
     Args:
         settings: of the run.
-        advance_to: to be told how many geometries are done.
+        workspace: for the clock, and for what the time step does not follow.
 
     Returns:
         One result per geometry.
     """
     found = []
-    for i, label in enumerate(settings.sizes.geometries):
-        scene = mg.load_scene(_mjcf(label))
-        found.append(_mate(settings, label, scene, np.random.default_rng([settings.seed, 100 + i])))
-        advance_to(i + 1)
+    with workspace.stage("mating", "geometries", len(settings.sizes.geometries)) as advance_to:
+        for i, label in enumerate(settings.sizes.geometries):
+            scene = mg.load_scene(_mjcf(label))
+            workspace.check(scene, name=f"mating, {label}")
+            found.append(_mate(settings, label, scene, np.random.default_rng([settings.seed, 100 + i])))
+            advance_to(i + 1)
     return found
 
 

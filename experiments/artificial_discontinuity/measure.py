@@ -54,10 +54,9 @@ def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> 
     slopes = []
     with workspace.stage("pushes", "bodies", len(sizes.pushed)) as advance_to:
         for i, name in enumerate(sizes.pushed):
+            workspace.check(bodies[name].scene, name=bodies[name].label)
             slopes += push_slopes(settings, bodies[name], {one.path: _where(one) for one in box}, i)
             advance_to(i + 1)
-    with workspace.stage("mating", "geometries", len(sizes.geometries)) as advance_to:
-        matings = mating.measure(settings, advance_to)
     return Outcome(
         settings=settings,
         paths={name: PATHS[name] for name in sizes.paths},
@@ -65,7 +64,7 @@ def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> 
         judged=judged,
         reference=reference,
         slopes=slopes,
-        matings=matings,
+        matings=mating.measure(settings, workspace),
         friction=_friction(sizes.num_points),
     )
 

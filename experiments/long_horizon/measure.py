@@ -45,6 +45,7 @@ def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
     found, reference = {}, None
     for index, name in enumerate(settings.problems):
         one = problem(name, settings.sizes.num_times)
+        workspace.check(one.scene)
         rng = np.random.default_rng([settings.seed, index])
         found[name] = _measure(settings, one, rng, workspace)
         if name == "double_pendulum":
