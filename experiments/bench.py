@@ -70,8 +70,11 @@ def main() -> None:
         f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}"
     )
     for name in options.scene:
-        rows = list(_measure(name, options))
-        print(f"\n{name}\n" + "\n".join(_format(row, rows, options) for row in rows), flush=True)
+        print(f"\n{name}")
+        rows: list[Row] = []
+        for row in _measure(name, options):
+            rows.append(row)
+            print(_format(row, rows, options), flush=True)
 
 
 def _measure(name: str, options: argparse.Namespace) -> Iterator[Row]:

@@ -58,7 +58,7 @@ def test_all_kinds_of_rows_move_as_in_c(cone, integrator):
     assert _largest_difference(*zoo(cone, integrator), steps=30) < 1e-6
 
 
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("cone", ["pyramidal", pytest.param("elliptic", marks=_SLOW)])
 def test_rows_are_those_of_mjx(cone):
     """Every field of every row; a few units of rounding of numbers up to 1e4."""
     model, data = zoo(cone, welded=True)
@@ -81,6 +81,7 @@ def test_solve_replaces_the_one_of_mjx():
     np.testing.assert_allclose(ours._impl.efc_force, ready._impl.efc_force, rtol=1e-5, atol=1e-5)
 
 
+@_SLOW
 def test_solution_is_a_minimum_and_cold_start_finds_the_same():
     """The gradient of the cost vanishes; without warm start the answer does not move."""
     model, data = zoo("elliptic")
@@ -157,9 +158,11 @@ def _sliding():
 @pytest.mark.parametrize(
     "field",
     [
-        "body_mass",
         "geom_solref",
-        *(pytest.param(x, marks=_SLOW) for x in ("geom_friction", "dof_damping", "opt.timestep", "opt.gravity")),
+        *(
+            pytest.param(x, marks=_SLOW)
+            for x in ("body_mass", "geom_friction", "dof_damping", "opt.timestep", "opt.gravity")
+        ),
     ],
 )
 def test_parameters_of_the_model_have_their_derivative(field):
