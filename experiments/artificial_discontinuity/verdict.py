@@ -29,7 +29,7 @@ def verdict(outcome: Outcome) -> str:
     if rough:
         sentences.append(f"By its geometry alone the force jumps by more than {threshold:.0%} with {_listed(rough)}.")
     if smooth:
-        rows = [f"{name} ({outcome.of(name)[0].num_rows} rows)" for name in smooth]
+        rows = [f"{name} ({_counted(outcome.of(name)[0].num_rows, 'row')})" for name in smooth]
         sentences.append(f"It does not with {_listed(rows)}: to differentiate through contact build it of these.")
         if worse := [f"{name} ({plain[name]:.0%})" for name in smooth if plain[name] > threshold]:
             sentences.append(
@@ -139,14 +139,28 @@ def _same_in_c(outcome: Outcome) -> str:
 def _mating(outcome: Outcome) -> list[str]:
     found = []
     for one in outcome.matings:
-        edge = f"{largest(one.depth) * 1e3:.2g} mm" if len(one.depth.places) else "nothing"
+        held, let_go = len(one.force.places), len(one.depth.places)
+        force = (
+            f"jumps {_counted(held, 'time')}, by {worst(one.force):.0%} of its largest at most"
+            if held
+            else "does not jump"
+        )
+        depth = (
+            f"jumps at {_counted(let_go, 'offset')}, by {largest(one.depth) * 1e3:.0f} mm at most"
+            if let_go
+            else "does not"
+        )
         slope = quantity(one.slopes.reference, one.slopes.reference_error)
-        says = [quantity(value, error) for value, error in zip(one.slopes.estimates, one.slopes.errors, strict=True)]
+        says = [
+            # What is left of a derivative that is zero is rounding.
+            "0" if abs(value) < 1e-9 * abs(one.slopes.reference) else quantity(value, error)
+            for value, error in zip(one.slopes.estimates, one.slopes.errors, strict=True)
+        ]
+        where = "where it jumps most" if let_go else "in the middle"
         found.append(
-            f"Mating with {one.label}: {len(one.force.places)} jumps in the force on the held peg, the largest "
-            f"{worst(one.force):.0%} of its largest; the depth reached jumps at {len(one.depth.places)} offsets, "
-            f"by {edge} at most. Under noise there its slope is {slope}; first order says "
-            f"{says[0]} (discrete) and {says[1]} (event), zeroth order {says[2]}."
+            f"Mating with {one.label}: the force on the held peg {force}; the depth that it reaches when let go {depth}. "
+            f"Under noise {where} its slope is {slope}; first order says {says[0]} (discrete) and {says[1]} (event), "
+            f"zeroth order {says[2]}."
         )
     return found
 
@@ -228,6 +242,10 @@ def _by_estimate(outcome: Outcome) -> Table:
         f"than {_FAR:g} standard errors off.",
         frozenset(emphasised),
     )
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _percent(share: float) -> str:

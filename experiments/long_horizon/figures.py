@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 from experiments.long_horizon.outcome import ZEROTH, Errors, Outcome
 from experiments.report import Figure
@@ -102,8 +103,8 @@ def windows(outcome: Outcome):
     """Error and bias against the window's length."""
     figure, axes = subplots(1, len(outcome.found), height=3.9, sharey=True)
     for axis, one in zip(axes[0], outcome.found.values(), strict=True):
+        length = one.times[0] * np.array(next(iter(one.windows.values())).lengths)
         for label, cut in one.windows.items():
-            length = one.times[0] * np.array(cut.lengths)
             for kind, (style, name) in enumerate((((0, (2, 2)), "cut"), ("-", "with a value function"))):
                 error, interval = cut.error[kind], cut.interval[kind]
                 axis.plot(length, error, color=COLOURS[label], ls=style, marker=".", label=f"{label}, {name}")
@@ -118,6 +119,8 @@ def windows(outcome: Outcome):
         axis.set(
             xscale="log", yscale="log", title=one.title[:1].upper() + one.title[1:], xlabel="length of a window, s"
         )
+        axis.set_xticks(length, [f"{seconds:.2g}" for seconds in length])
+        axis.xaxis.set_minor_locator(NullLocator())
     axes[0, 0].set_ylabel("error over the gradient")
     handles, labels = axes[0, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8.5)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from experiments.long_horizon.adaptive import adaptive
 from experiments.long_horizon.estimates import reference_gradient, zeroth
-from experiments.long_horizon.outcome import ZEROTH, Errors, Found, Outcome
+from experiments.long_horizon.outcome import BEYOND_CHANCE, ZEROTH, Errors, Found, Outcome
 from experiments.long_horizon.problems import Problem, problem
 from experiments.long_horizon.settings import LongHorizonSettings, Sizes
 from experiments.long_horizon.windows import cut
@@ -208,8 +208,7 @@ def _errors(
             error=error,
             interval=interval,
             bias=np.linalg.norm(mean, axis=-1),
-            # Of a sum of a few squares: twice its root mean square is exceeded by one in twenty or fewer.
-            bias_noise=2 * np.sqrt(noise),
+            bias_noise=BEYOND_CHANCE * np.sqrt(noise),
             variance=samples.var(axis=0, ddof=1).sum(axis=-1),
         ),
         np.maximum(squares - known, 0.0),

@@ -10,6 +10,9 @@ from experiments.long_horizon.settings import LongHorizonSettings
 from mjxgrad.diagnostics import Crossover
 
 ZEROTH = "zeroth order"
+# Standard errors of a mean. Two would do for one in twenty of normal samples; derivatives along chaotic motions have tails so
+# heavy that a few dozen repeats show too little of their spread.
+BEYOND_CHANCE = 3.0
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Errors:
             horizon alone.
         interval: of it.
         bias: distance of the mean of all estimates from the reference, likewise.
-        bias_noise: what distance chance alone makes of one in twenty.
+        bias_noise: distance up to which it can be chance.
         variance: of one sample, summed over parameters.
     """
 
@@ -43,7 +46,7 @@ class Windows:
         error: root mean squared error, plain and with a value function, over the size of the reference.
         interval: of it.
         bias: distance of the mean from the reference, likewise.
-        bias_noise: what distance chance alone makes of one in twenty.
+        bias_noise: distance up to which it can be chance.
         zeroth: error of zeroth order, with its interval.
         fit: share of the variance of the costs to come that the value function explains, in the median over times.
     """

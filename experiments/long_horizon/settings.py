@@ -38,7 +38,7 @@ class Sizes:
 
 SIZES = {
     "quick": Sizes(16, 16, 8, 512, 8, 4),
-    "default": Sizes(32, 32, 32, 8192, 16, 12),
+    "default": Sizes(32, 32, 16, 4096, 16, 12),
     "full": Sizes(48, 64, 128, 131072, 64, 24),
 }
 

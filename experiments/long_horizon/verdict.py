@@ -4,6 +4,7 @@ import numpy as np
 
 from experiments.long_horizon.outcome import Found, Outcome, Windows
 from experiments.report import Table, quantity
+from experiments.theme import power
 
 
 def verdict(outcome: Outcome) -> str:
@@ -96,7 +97,7 @@ def _biases(one: Found) -> list[str]:
     found = []
     for each in one.estimators[:-1]:
         is_seen = each.bias > each.bias_noise
-        # One in twenty is seen by chance.
+        # A few are seen by chance, and neighbouring horizons together.
         if is_seen.mean() > 0.1:
             first = one.times[np.flatnonzero(is_seen)[0]]
             found.append(
@@ -171,7 +172,9 @@ def _by_window(outcome: Outcome) -> Table:
 
 
 def _percent(share: float) -> str:
-    return f"{share:.2g} times" if share >= 10 else f"{100 * share:.2g}%" if share < 1 else f"{100 * share:.0f}%"
+    if share < 10:
+        return f"{100 * share:.2g}%" if share < 0.995 else f"{100 * share:.0f}%"
+    return f"{power(float(f'{share:.2g}'))} times"
 
 
 def _capital(text: str) -> str:

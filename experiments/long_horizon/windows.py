@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.long_horizon.estimates import reference_gradient, zeroth
-from experiments.long_horizon.outcome import Windows
+from experiments.long_horizon.outcome import BEYOND_CHANCE, Windows
 from experiments.long_horizon.problems import Problem
 from experiments.long_horizon.settings import LongHorizonSettings, Sizes
 from mjxgrad.diagnostics import root_mean_square_interval
@@ -88,7 +88,7 @@ def _error(
         reference_variance=known.sum(),
         cross_variance=(4 * mean**2 * known + 2 * known**2).sum(),
     )
-    noise = 2 * np.sqrt((off.var(axis=0, ddof=1) / sizes.num_repeats + known).sum())
+    noise = BEYOND_CHANCE * np.sqrt((off.var(axis=0, ddof=1) / sizes.num_repeats + known).sum())
     return float(error), float(interval[0]), float(interval[1]), float(np.linalg.norm(mean)), float(noise)
 
 
