@@ -50,6 +50,9 @@ class Trajectory(eqx.Module):
         final: the last state, to continue from.
         diverged: whether some step gave a non-finite or runaway state.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
+        unsolved: number of steps before it whose solve ran into the model's limit of iterations, short of its tolerance. There
+            the motion is not quite that of the model, and the derivative, which takes the solve for finished, not quite its
+            own. Zero, unless `opt.iterations` is small. Only `rollout` counts it.
     """
 
     qpos: Float[Array, "states nq"]
@@ -59,6 +62,7 @@ class Trajectory(eqx.Module):
     final: State
     diverged: Bool[Array, ""]
     first_bad_step: Int[Array, ""]
+    unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
 
 
 class DivergedError(FloatingPointError):
@@ -152,8 +156,8 @@ def rollout(
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
 
-    def advance(carry: tuple[State, Int[Array, ""]], inputs: tuple[Array, Array, Array]):
-        state, first_bad = carry
+    def advance(carry: tuple[State, Int[Array, ""], Int[Array, ""]], inputs: tuple[Array, Array, Array]):
+        state, first_bad, unsolved = carry
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
         data = data_of(scene, state, ctrl)
@@ -163,14 +167,15 @@ def rollout(
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         seen = None if observe is None else _observed(scene, observe, data, stepped, smoothing)
-        return (kept, first_bad), (state.qpos, state.qvel, ctrl, seen)
+        unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
+        return (kept, first_bad, unsolved), (state.qpos, state.qvel, ctrl, seen)
 
     if checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
-    start = (state, jnp.full((), -1, jnp.int32))
-    (final, first_bad), (qpos, qvel, ctrl, seen) = jax.lax.scan(
+    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32))
+    (final, first_bad, unsolved), (qpos, qvel, ctrl, seen) = jax.lax.scan(
         advance,
         start,
         (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
@@ -187,6 +192,7 @@ def rollout(
         final=final,
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
+        unsolved=unsolved,
     )
 
 

@@ -71,6 +71,11 @@ class RowLayout:
         return self.cones[0].start if self.cones else self.num_rows
 
     @property
+    def is_piecewise_quadratic(self) -> bool:
+        """Whether the cost along a line is."""
+        return not self.cones and self.kernel is None
+
+    @property
     def hard_stop(self) -> int:
         """End of the rows among them that have no noise; those from here on have it, cones included."""
         return self.simple_stop if self.kernel is None else self.first_noisy

@@ -261,8 +261,8 @@ def _impulse_jvp(plan, primals, tangents):
     events, _ = primals
     system, is_event = events.system, _per_row(plan, events.begins | events.ends)
     without = _without(system, is_event)
-    held = implicit.solve(plan.layout, plan.max_iterations, system, events.start, events.tolerance)
-    free = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
+    held, _ = implicit.solve(plan.layout, plan.max_iterations, system, events.start, events.tolerance)
+    free, _ = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
     late = jnp.where(events.begins | events.ends, tangents[1] * _delay(events, free), 0.0)
     lost = system.pull(system.row_force(plan.layout, held) * _per_row(plan, late))
     start, stop = (without.rates(a) - without.rows.reference for a in (free, held))

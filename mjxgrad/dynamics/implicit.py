@@ -22,8 +22,9 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import constraint, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
@@ -81,11 +82,15 @@ def solve(
     system: System,
     start: Float[Array, " nv"],
     tolerance: Float[Array, ""],
-) -> Float[Array, " nv"]:
-    """Return the acceleration at which the forces of a system are in balance, differentiable with respect to it."""
+) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
+    """Return the acceleration at which the forces of a system are in balance, differentiable with respect to it.
+
+    Returns:
+        The acceleration, and the number of iterations that it took: one more than `max_iterations` where these were too few.
+    """
 
     def run(system, start, tolerance):
-        return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)[0]
+        return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)
 
     return linear.batch_last(run)(system, start, tolerance)
 
@@ -94,10 +99,12 @@ def solve(
 def _solve_jvp(layout, max_iterations, primals, tangents):
     system, start, tolerance = primals
     # Named here, where reverse mode reads it: a name inside the call is not seen from outside.
-    acceleration = checkpoint_name(solve(layout, max_iterations, system, start, tolerance), CHECKPOINT_NAME)
+    acceleration, num_iterations = solve(layout, max_iterations, system, start, tolerance)
+    acceleration = checkpoint_name(acceleration, CHECKPOINT_NAME)
     _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
     bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
-    return acceleration, -respond(layout, system, bend, change)
+    no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)  # what JAX takes for the tangent of an integer
+    return (acceleration, num_iterations), (-respond(layout, system, bend, change), no_change)
 
 
 def respond(layout: RowLayout, system: System, bend: Bend, force: Float[Array, " nv"]) -> Float[Array, " nv"]:

@@ -77,6 +77,8 @@ def step(
     Returns:
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
         them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
+        `_impl.solver_niter` is the number of iterations that the solve took, of Runge-Kutta's four the largest: one more than
+        `opt.iterations` where these were too few.
 
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or the smoothing
@@ -186,7 +188,8 @@ def _smoothed_solve(model: mjx.Model, data: mjx.Data, blocks: list[Block], smoot
     def forces_of(data: mjx.Data) -> dict[str, Array]:
         return {"qacc": data.qacc, "qfrc_constraint": data.qfrc_constraint, "_impl.efc_force": data._impl.efc_force}
 
-    return data.tree_replace(_with_derivative_of(forces_of(hard), forces_of(soft)))  # pyright: ignore[reportReturnType]
+    changed = _with_derivative_of(forces_of(hard), forces_of(soft))
+    return data.tree_replace({**changed, "_impl.solver_niter": hard._impl.solver_niter})  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
@@ -204,9 +207,11 @@ def _minimum(
     model: mjx.Model, data: mjx.Data, layout: RowLayout, system: System | None, start: Float[Array, " nv"]
 ) -> mjx.Data:
     if system is None or not layout.num_rows or not model.nv:
-        return data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
+        idle = {"qacc": data.qacc_smooth, "qfrc_constraint": jnp.zeros_like(data.qvel)}
+        idle["_impl.solver_niter"] = jnp.zeros_like(data._impl.solver_niter)
+        return data.tree_replace(idle)  # pyright: ignore[reportReturnType]
     tolerance = jnp.asarray(model.opt.tolerance, data.qvel.dtype)
-    acceleration = implicit.solve(
+    acceleration, num_iterations = implicit.solve(
         layout,
         int(model.opt.iterations),
         system,
@@ -219,6 +224,7 @@ def _minimum(
             "qacc": acceleration,
             "qfrc_constraint": system.pull(force),
             "_impl.efc_force": force,
+            "_impl.solver_niter": num_iterations.astype(data._impl.solver_niter.dtype),
         }
     )
 
@@ -318,6 +324,7 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient, smoothin
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )
+    last = last.tree_replace({"_impl.solver_niter": jnp.max(stages._impl.solver_niter, axis=0)})
     if gradient == "event":
         first, blocks = jax.tree.map(lambda x: x[0], (stages, blocks))
         change = events.impulse(model, first, blocks, velocity)

@@ -1,0 +1,97 @@
+"""The solve ends where C's does, on hard problems too, and says so where it does not."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+import mjxgrad as mg
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import newton
+from mjxgrad.dynamics.constraint import RowLayout, Rows
+from mjxgrad.dynamics.jacobian import DenseRows, SparseRows
+from mjxgrad.dynamics.newton import Problem
+
+_BALL = """
+<mujoco>
+  <option cone="elliptic" tolerance="1e-15" timestep="{timestep}" iterations="{iterations}"/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1" friction="{friction} .005 .0001" solref="{solref}" solimp="{solimp}"/>
+    <body pos="0 0 {height}"><freejoint/>
+      <geom size=".05" mass="1" friction="{friction} .005 .0001" solref="{solref}" solimp="{solimp}"/></body>
+  </worldbody>
+</mujoco>
+"""
+_USUAL = {
+    "timestep": 0.002, "friction": 0.135, "solref": ".02 1", "solimp": ".9 .95 .001", "height": 0.05, "iterations": 100
+}  # fmt: skip
+_HARD = {"timestep": 0.03178, "solref": "7.293e-05 .1113", "solimp": ".9998 .9976 .0337", "friction": 0.0349}
+_SOFT = {"timestep": 0.04534, "solref": ".7462 .1337", "solimp": ".9545 .9921 .0002201", "friction": 0.1708}
+_ROLL = np.array([0.5, 0.2, -1, 0, 6, 2])  # m/s and rad/s: it slides, spins and falls
+
+
+def _model(**settings):
+    return mujoco.MjModel.from_xml_string(_BALL.format(**{**_USUAL, **settings}))
+
+
+def _on_its_way(settings, speed):
+    """Return C's states and accelerations while the ball goes through the contact."""
+    model = _model(**settings)
+    data = mujoco.MjData(model)
+    data.qpos[2] += 2.3 * speed * model.opt.timestep
+    data.qvel[:] = speed * _ROLL
+    seen = []
+    for _ in range(30):
+        mujoco.mj_forward(model, data)
+        seen.append((data.qpos.copy(), data.qvel.copy(), data.qacc.copy()))
+        mujoco.mj_step(model, data)
+    return model, *(np.array(x) for x in zip(*seen, strict=True))
+
+
+def test_a_sliding_ball_under_an_elliptic_cone_is_pushed_as_in_c():
+    """Three balls through contact, one of them MuJoCo's default: the acceleration in each of C's states is that of C.
+
+    C stops where the cost improves by less than 1e-15 of its scale, hence 1e-6 of the largest acceleration.
+    """
+    cases = [_on_its_way(*case) for case in ((_HARD, 60.66), (_SOFT, 6.862), ({}, 100.0))]
+    base, data = mjx.put_model(cases[0][0]), mjx.make_data(cases[0][0])
+    fields = ("geom_friction", "geom_solref", "geom_solimp")
+    leaves = {name: jnp.array([getattr(case[0], name) for case in cases]) for name in fields}
+    leaves["opt.timestep"] = jnp.array([case[0].opt.timestep for case in cases])
+
+    def push(leaves, qpos, qvel):
+        moved = mg.forward(base.tree_replace(leaves), data.replace(qpos=qpos, qvel=qvel))
+        return moved.qacc, moved._impl.solver_niter
+
+    states = [jnp.array([case[k] for case in cases]) for k in (1, 2)]
+    found, iterations = jax.jit(jax.vmap(jax.vmap(push, (None, 0, 0))))(leaves, *states)
+    for accelerations, case in zip(found, cases, strict=True):
+        np.testing.assert_allclose(accelerations, case[3], rtol=1e-6, atol=1e-6 * np.abs(case[3]).max())
+    assert 3 < iterations.max() <= 20
+
+
+def test_a_rollout_counts_the_steps_whose_solve_was_cut_short():
+    """One iteration is none too few in the air, and too few where a ball begins to slide."""
+    scene = mg.load_scene(_model(iterations=1, height=0.0499))
+
+    def roll(qvel):
+        return mg.rollout(scene, mg.initial_state(scene, qvel=qvel), horizon=4).unsolved
+
+    rising, falling = jax.jit(jax.vmap(roll))(jnp.array([[0, 0, 10.0, 0, 0, 0], [0.5, 0.2, -1, 0, 6, 2]]))
+    assert rising <= 1 < falling
+
+
+def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
+    """In single precision, 10⁸ : 1. Each row acts on one body: a = (f + D a_ref) / (M + D) where that is below a_ref."""
+    mass, force = np.array([1e4, 1e-4]), np.array([-1e5, -1e-3])
+    weight, reference = np.array([2e4, 3e-4]), np.array([5.0, -4.0])
+    expected = (force + weight * reference) / (mass + weight)
+    assert (expected < reference).all()
+    single = [jnp.asarray(x, jnp.float32) for x in (np.diag(mass), force, np.eye(2), reference, weight)]
+    inertia, force, entries, reference, weight = single
+    rows = Rows(reference, weight, jnp.zeros_like(weight), ())
+    jacobian = SparseRows.of(DenseRows(entries), jnp.ones(2, bool), 2)
+    start = jnp.array([expected[0], 0.0], jnp.float32)
+    tolerance = jnp.asarray(1e-6, jnp.float32)
+    found, _ = newton.minimise(RowLayout(0, 0, 2), Problem(inertia, force, jacobian, rows), start, tolerance, 100)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
