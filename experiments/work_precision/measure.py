@@ -7,7 +7,7 @@ from experiments.work_precision import gradient, simulation
 from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
 from experiments.work_precision.outcome import Course, Outcome
-from experiments.work_precision.programs import CONES, FEW_ITERATIONS, Library, Variant, compiled, own_cone
+from experiments.work_precision.programs import CONES, FEW_ITERATIONS, Cone, Library, Variant, compiled, own_cone
 from experiments.work_precision.settings import WorkPrecisionSettings
 from experiments.workspace import Workspace
 
@@ -58,7 +58,7 @@ def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> li
         found += [Variant(library, cone=own, precision="float32")] if has_asides else []
         if library == "mg" or everything:
             found += [Variant(library, "RK4", own, batch=batch)]
-            cones = [name for name in CONES if name != own and has_friction(one) and has_asides]
+            cones: list[Cone] = [name for name in CONES if name != own and has_friction(one) and has_asides]
             found += [Variant(library, cone=name, batch=batch) for name in cones]
             found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
         if everything:

@@ -90,7 +90,7 @@ class WorkPrecisionSettings(RunSettings):
         """Give the scenes to run."""
         return self.sizes.scenes if self.scenes is None else self.scenes
 
-    def has_asides(self, name: SceneName) -> bool:
+    def has_asides(self, name: str) -> bool:
         """Say whether a scene is looked at in every way that the size has."""
         return self.sizes.with_asides is None or name in self.sizes.with_asides
 
