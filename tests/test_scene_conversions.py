@@ -85,6 +85,14 @@ EXACT = {
 }  # fmt: skip
 
 
+NO_WIDTH = 'solimp="0.1 0.95 0" '
+EXACT |= {
+    "contact without width": (_ball().replace("<geom ", f"<geom {NO_WIDTH}"), "width in geom_solimp of 2 rows"),
+    "limit without width": (
+        _pendulum(joint='limited="true" range="-5 -1" solimplimit="0.2 0.9 0"'), "width in jnt_solimp of row 0"),
+}  # fmt: skip
+
+
 def _velocities(model, steps=8):
     data = mujoco.MjData(model)
     data.qvel[:] = np.linspace(0.5, -0.7, model.nv)
@@ -110,7 +118,7 @@ def test_a_conversion_is_reported_and_moves_the_same(case):
     np.testing.assert_allclose(_velocities(scene.mj_model), given, atol=tolerance)
 
 
-@pytest.mark.parametrize("case", ["no springs", "no dampers", "neither", "actuator inertia"])
+@pytest.mark.parametrize("case", ["no springs", "no dampers", "neither", "actuator inertia", "limit without width"])
 def test_mjx_moves_the_converted_scene_as_c_mujoco_does_and_only_that(case):
     source, _ = EXACT[case]
     model = mujoco.MjModel.from_xml_string(source)

@@ -207,9 +207,9 @@ def _minimum(
     model: mjx.Model, data: mjx.Data, layout: RowLayout, system: System | None, start: Float[Array, " nv"]
 ) -> mjx.Data:
     if system is None or not layout.num_rows or not model.nv:
-        idle = {"qacc": data.qacc_smooth, "qfrc_constraint": jnp.zeros_like(data.qvel)}
-        idle["_impl.solver_niter"] = jnp.zeros_like(data._impl.solver_niter)
-        return data.tree_replace(idle)  # pyright: ignore[reportReturnType]
+        data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
+        none = jnp.zeros_like(data._impl.solver_niter)
+        return data.tree_replace({"_impl.solver_niter": none})  # pyright: ignore[reportReturnType]
     tolerance = jnp.asarray(model.opt.tolerance, data.qvel.dtype)
     acceleration, num_iterations = implicit.solve(
         layout,

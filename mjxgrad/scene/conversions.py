@@ -19,6 +19,16 @@ _ENABLE = mujoco.mjtEnableBit
 _GEOM = mujoco.mjtGeom
 _SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
+_IMPEDANCES = (
+    "geom_solimp",
+    "pair_solimp",
+    "jnt_solimp",
+    "dof_solimp",
+    "tendon_solimp_lim",
+    "tendon_solimp_fri",
+    "eq_solimp",
+)
+_ENDLESS = 1e12  # metres or radians
 
 
 @dataclass(frozen=True)
@@ -171,6 +181,43 @@ def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion(what, "0", f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it")
 
 
+def _no_width(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """Without a width C takes the mean impedance at every depth, MJX the largest.
+
+    The largest also scales stiffness and damping, so it stays: from the mean it is then approached over a width that nothing
+    reaches.
+    """
+    fields = {name: getattr(model, name) for name in _IMPEDANCES}
+    flat = {name: _is_flat_but_uneven(values) for name, values in fields.items()}
+    if flat["geom_solimp"].any():
+        flat["geom_solimp"] &= ~_mixed_with_a_width(model)
+    for name, rows in flat.items():
+        if not rows.any():
+            continue
+        solimp = fields[name]
+        given = f"{solimp[rows][0, 2]:g}"
+        bounds = np.clip(solimp[rows, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        solimp[rows, 0], solimp[rows, 2] = bounds.mean(axis=1), _ENDLESS
+        which = f" of {int(rows.sum())} rows" if rows.sum() > 1 else f" of row {int(np.flatnonzero(rows)[0])}"
+        reason = "without a width C MuJoCo takes the mean impedance at every depth, MJX the largest"
+        yield Conversion(f"width in {name}{which}", given, f"{_ENDLESS:g}, from the mean", reason)
+
+
+def _is_flat_but_uneven(solimp: np.ndarray) -> np.ndarray:
+    bounds = np.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    return (solimp[:, 2] <= mujoco.mjMINVAL) & (bounds[:, 0] != bounds[:, 1])
+
+
+def _mixed_with_a_width(model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms have contacts where their solimp is averaged with one that keeps its width."""
+    keeps = model.geom_solimp[:, 2] > mujoco.mjMINVAL
+    averaged = [list(deciding_geoms(model, pair)) for pair in contact_pairs(model)]
+    for _ in averaged:  # what is averaged with a geom that keeps its width keeps it, too
+        for geoms in averaged:
+            keeps[geoms] = keeps[geoms].any()
+    return keeps
+
+
 def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return
@@ -263,6 +310,7 @@ AFTER_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
     _exact_diagonal,
     _actuator_inertia,
     _least_friction,
+    _no_width,
     _implicitfast,
     _distance_field_pairs,
 )
