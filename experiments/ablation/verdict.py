@@ -80,7 +80,7 @@ def _group(outcome: Outcome, name: str) -> str:
     having = [(scene, v) for scene in outcome.scenes if (v := scene.find(name))]
     if all(v.is_same_program for _, v in having):
         where = _listed([scene.name for scene, _ in having])
-        return f"{name.capitalize()} cost nothing: without them the program is the same in {where}."
+        return f"{name.capitalize()}: nothing to gain, for the program is the same without in {where}."
     real = [(scene, v) for scene, v in having if not v.is_same_program]
     changed = [(scene, v) for scene, v in real if not v.is_unchanged]
     faster = [scene.name for scene, v in real if v.step.ratio[2] < _WORTH]
