@@ -107,10 +107,17 @@ def gradient(course: Course, outcome: Outcome):
     axes[0, 0].set_ylim(max(low / 2, 1e-6), min(max([*errors, 1.0]) * 1.6, 1e4))
     present = {one.estimator for one in estimates}
     handles = [Line2D([], [], color=c, marker="o", ms=4, label=n) for n, c in _ESTIMATORS.items() if n in present]
+    others = (
+        ("<", "coarser step", any(one.timestep > course.timestep for one in estimates)),
+        (">", "finer step", any(one.timestep < course.timestep for one in estimates)),
+        ("D", "softer contact", any(one.softening != 1 for one in estimates)),
+    )
     handles += [
-        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="<", ms=4, label="coarser step"),
-        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker=">", ms=4, label="finer step"),
-        Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker="D", ms=4, label="softer contact"),
+        *(
+            Line2D([], [], color=MUTED, lw=0.8, alpha=0.8, marker=marker, ms=4, label=label)
+            for marker, label, is_drawn in others
+            if is_drawn
+        ),
         Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="none is better"),
         Line2D([], [], color=REFERENCE, lw=0.9, ls=(0, (2, 3)), label="known of the reference"),
     ]

@@ -113,7 +113,8 @@ def measured(
     noise = quasi_random(sizes.num_rollouts, len(case.moved), settings.seed) * case.stddev
     reference = _reference(case, simulate, noise, settings)
     ways = [(own / refinement, 1.0) for refinement in sizes.gradient_refinements]
-    ways += [(own, softening) for softening in sizes.softenings]
+    if any(variant.derivative == "event" for variant in programs):  # there is a contact to soften
+        ways += [(own, softening) for softening in sizes.softenings]
     estimates = []
     for timestep, softening in ways:
         knobs = Knobs(timestep, settings.tight_tolerance, softening)

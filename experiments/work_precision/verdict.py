@@ -29,8 +29,9 @@ def verdict(outcome: Outcome) -> str:
     names = [choice.estimate.estimator for choice in chosen if choice is not None]
     if names:
         counts = {name: names.count(name) for name in dict.fromkeys(names)}
-        listed = "; ".join(f"{name}: {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
-        sentences.append(f"{_percent(target)} error of the gradient is soonest reached by (scenes) {listed}.")
+        ranked = sorted(counts.items(), key=lambda item: -item[1])
+        listed = "; ".join(f"{name} (on {count} {'scene' if count == 1 else 'scenes'})" for name, count in ranked)
+        sentences.append(f"{_percent(target)} error of the gradient is soonest reached by {listed}.")
     lost = len(outcome.courses) - len(names)
     if lost:
         sentences.append(f"On {lost} of {len(outcome.courses)} scenes no way of estimating it is known to get there.")
