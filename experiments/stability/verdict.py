@@ -36,7 +36,7 @@ def verdict(outcome: Outcome) -> str:
         better = sum(int(one.better(name).sum()) for one in outcome.scenes)
         open_ones = _reasons(outcome, name)[UNEXPLAINED]
         sentences.append(
-            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} points"
+            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} of the points"
             f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
             f"{_count(stopped)} leave forces out of balance in some step, which no flag tells."
         )
@@ -81,7 +81,7 @@ def _limit(outcome: Outcome) -> str | None:
     if exceptions:
         sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
     spared = int((~fails & beyond).sum())
-    return f"{sentence}; of {beyond.sum()} beyond it " + (f"{spared} do not." if spared else "all do.")
+    return f"{sentence}; of {beyond.sum()} beyond it " + (f"all but {spared} do." if spared else "all do.")
 
 
 def _gradients(outcome: Outcome, precision: str) -> str:
