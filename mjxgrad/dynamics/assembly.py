@@ -81,7 +81,7 @@ def joined(blocks: list[Block]) -> Block:
         for field in dataclasses.fields(Block)
         if field.name != "map" and not field.metadata.get("static")
     }
-    return Block(JoinedRows(tuple(block.map for block in blocks)), **leaves)
+    return Block(JoinedRows(tuple(block.map for block in blocks)), **leaves)  # pyright: ignore[reportArgumentType]
 
 
 def law(

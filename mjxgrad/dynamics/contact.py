@@ -53,7 +53,8 @@ def slot_bodies(model: mjx.Model) -> np.ndarray | None:
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
         geoms = np.array(members)[:, :2]
-        by_dim.setdefault(int(key.condim), []).append(np.repeat(geoms, collision_functions[key.types].ncon, axis=0))
+        count = collision_functions[key.types].ncon  # pyright: ignore[reportArgumentType]
+        by_dim.setdefault(int(key.condim), []).append(np.repeat(geoms, count, axis=0))
     slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
     return np.asarray(model.geom_bodyid)[np.concatenate(slots)] if slots else np.zeros((0, 2), int)
 

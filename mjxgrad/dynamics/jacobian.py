@@ -11,6 +11,7 @@ Arrays of `SparseRows`, and of the maps while they are made into such, may carry
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -71,11 +72,11 @@ class RowMap(eqx.Module):
         """Return Jᵀ f."""
 
     @abc.abstractmethod
-    def directions(self) -> list[Float[Array, "num dim dofs *batch"]]:
+    def directions(self) -> Sequence[Float[Array, "num dim dofs *batch"]]:
         """Return the entries, one array per group; pyramids by their directions."""
 
     @abc.abstractmethod
-    def tilts(self) -> list[Float[Array, "num tangents *batch"] | None]:
+    def tilts(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
         """Return μ of each tangent of a pyramid, one array per group; None where there is none."""
 
     @abc.abstractmethod

@@ -65,16 +65,16 @@ class Problem(eqx.Module):
         row_force = constraint.force(layout, self.rows, x)
         inertia = linear.matvec(self.mass, acceleration)
         pull = self.jacobian.rmatvec(row_force)
-        return Point(acceleration, x, inertia, pull, inertia - self.force - pull)
+        return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
 
-    def rounding(self, layout: RowLayout, point: "Point") -> Float[Array, "*batch"]:
+    def rounding(self, point: "Point") -> Float[Array, "*batch"]:
         """Return the size that the decrement at a point has by rounding alone.
 
         In its norm rows may be as stiff as they like: an error of their x by e adds Jᵀ D e to the gradient, which is large,
         and at most e D e to the decrement.
         """
         size = jnp.abs(point.x) + jnp.abs(self.rows.reference)
-        weight = jnp.where(constraint.force(layout, self.rows, point.x) != 0, self.rows.weight, 0.0)
+        weight = jnp.where(point.row_force != 0, self.rows.weight, 0.0)
         terms = linear.dot(point.acceleration, point.inertia) + linear.dot(weight * size, size)
         return (_ROUNDING * jnp.finfo(size.dtype).eps) ** 2 * terms
 
@@ -89,6 +89,7 @@ class Point(eqx.Module):
     Attributes:
         acceleration: a.
         x: J a - a_ref.
+        row_force: f(x), the constraint forces.
         inertia: M a.
         pull: Jᵀ f, the constraint forces in joint space.
         gradient: M a - f_smooth - Jᵀ f.
@@ -96,6 +97,7 @@ class Point(eqx.Module):
 
     acceleration: Float[Array, "nv *batch"]
     x: Float[Array, "rows *batch"]
+    row_force: Float[Array, "rows *batch"]
     inertia: Float[Array, "nv *batch"]
     pull: Float[Array, "nv *batch"]
     gradient: Float[Array, "nv *batch"]
@@ -109,13 +111,12 @@ class Point(eqx.Module):
 class _Iterate(eqx.Module):
     """The loop's carry.
 
-    It holds the Hessian of the next iteration, not for that iteration's sake: a carried array is computed once and stored,
-    while XLA would write the sums that form an entry out again in each of the many places where the factorisation uses it.
-    For the same reason the question whether it is done is asked of the carry.
+    The question whether it is done is asked of the carry: a carried array is computed once and stored, while XLA would write
+    the sums that form it out again wherever they are used. (The Hessian needs no such help since its blocks are added in
+    place; carried along, it was one more than the iterations use.)
     """
 
     point: Point
-    hessian: Float[Array, "nv nv *batch"]
     is_near: Bool[Array, "*batch"]
     num_iterations: Int[Array, "*batch"]
 
@@ -157,13 +158,12 @@ def minimise(
         return is_solved(state) | is_broken | (state.num_iterations >= max_iterations)
 
     def measure(acceleration, is_near, num_iterations):
-        point = problem.at(layout, acceleration)
-        return _Iterate(point, problem.hessian(layout, point.x), is_near, num_iterations)
+        return _Iterate(problem.at(layout, acceleration), is_near, num_iterations)
 
     def iterate(state: _Iterate) -> _Iterate:
         point, stays = state.point, is_done(state)
-        direction = _descent(state.hessian, point.gradient)
-        decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(layout, point)
+        direction = _descent(problem.hessian(layout, point.x), point.gradient)
+        decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
         noise = jnp.sqrt(jnp.maximum(decrement, 0.0) * floor)
         length = _line_search(layout, problem, point, direction, noise, stays)
         moved = jnp.where(stays, point.acceleration, point.acceleration + length * direction)
