@@ -8,6 +8,7 @@ axes are written out, since XLA does not vectorise a reduction over the batch th
 
 import dataclasses
 import functools
+import math
 import operator
 from collections.abc import Callable, Iterable
 
@@ -128,21 +129,41 @@ def batch_last(function, batch: int | None = None):
 
         @batched.def_vmap
         def rule(size, is_batched, *args):
-            def move(x: Array, has_batch: bool) -> Array:
-                moved = jnp.moveaxis(x, 0, -1) if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))
-                return moved if batch is None else moved.reshape(*moved.shape[:-2], batch * size)
-
             def back(x: Array) -> Array:
                 split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
                 return jnp.moveaxis(split, -1, 0)
 
-            merged = jax.tree.map(move, args, tuple(is_batched))
+            leaves, structure = jax.tree.flatten(args)
+            moved = _moved_last(leaves, jax.tree.leaves(tuple(is_batched)), size)
+            if batch is not None:
+                moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
+            merged = jax.tree.unflatten(structure, moved)
             result = batch_last(function, size if batch is None else batch * size)(*merged)
             return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
         return batched(*args)
 
     return wrapped
+
+
+def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:
+    """Return arrays with the leading batch, if they have it, as trailing axis; those of one type are moved together."""
+    moved = [
+        None if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))
+        for x, has_batch in zip(leaves, is_batched, strict=True)
+    ]
+    by_type: dict[object, list[int]] = {}
+    for place, has_batch in enumerate(is_batched):
+        if has_batch:
+            by_type.setdefault(leaves[place].dtype, []).append(place)
+    for places in by_type.values():
+        rows = jnp.concatenate([leaves[place].reshape(size, -1) for place in places], axis=1).T
+        start = 0
+        for place in places:
+            shape = leaves[place].shape[1:]
+            stop = start + math.prod(shape)
+            moved[place], start = rows[start:stop].reshape(*shape, size), stop
+    return moved  # pyright: ignore[reportReturnType]
 
 
 @dataclasses.dataclass(frozen=True)
