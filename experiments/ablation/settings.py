@@ -13,7 +13,8 @@ SceneName = Literal[
     "hopper", "half_cheetah", "walker2d", "swimmer", "reacher", "inverted_pendulum", "inverted_double_pendulum", "ant",
     "humanoid",
 ]  # fmt: skip
-_SOME: tuple[SceneName, ...] = ("two_bodies", "motion_planning", "hopper", "reacher", "ant", "humanoid")
+# The humanoid takes as long as all others together: in the full size.
+_SOME: tuple[SceneName, ...] = ("two_bodies", "motion_planning", "hopper", "reacher", "ant")
 
 
 @dataclass(frozen=True)
