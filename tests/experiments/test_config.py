@@ -72,7 +72,7 @@ def test_a_misspelt_key_in_a_table_is_answered_from_that_table(write):
     ("override", "sentence"),
     [
         ("experiment=bias_varianc", 'experiment: there is no experiment "bias_varianc"; did you mean "bias_variance"?'),
-        ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of bias_variance'),
+        ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of ablation, '),
         ("task=ball_wal", 'task: there is no "ball_wal"; did you mean "ball_wall"?'),
         ("task=juggling", 'task: there is no "juggling"; choose one of ball_wall, ramp'),
         ("seed=1.5", "seed: must be integer, got 1.5"),
