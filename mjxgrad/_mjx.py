@@ -18,7 +18,7 @@ try:
 
         # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
         # has: second implementations of these rules could disagree with them.
-        from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as collision_functions
+        from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as COLLISION_FUNCTIONS
         from mujoco.mjx._src.collision_driver import _geom_groups as geom_groups
         from mujoco.mjx._src.collision_driver import _numeric as custom_number
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
@@ -27,7 +27,7 @@ finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 __all__ = [
-    "collision_functions",
+    "COLLISION_FUNCTIONS",
     "counts",
     "custom_number",
     "geom_groups",

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._mjx import collision_functions, custom_number, geom_groups, mjx
+from mjxgrad._mjx import COLLISION_FUNCTIONS, custom_number, geom_groups, mjx
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.impedance import impedance
@@ -53,7 +53,7 @@ def slot_bodies(model: mjx.Model) -> np.ndarray | None:
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
         geoms = np.array(members)[:, :2]
-        count = collision_functions[key.types].ncon  # pyright: ignore[reportArgumentType]
+        count = COLLISION_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
         by_dim.setdefault(int(key.condim), []).append(np.repeat(geoms, count, axis=0))
     slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
     return np.asarray(model.geom_bodyid)[np.concatenate(slots)] if slots else np.zeros((0, 2), int)

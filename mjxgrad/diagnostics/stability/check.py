@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad._mjx import collision_functions
+from mjxgrad._mjx import COLLISION_FUNCTIONS
 from mjxgrad.contacts import ContactPair, resolve_solref
 from mjxgrad.diagnostics.stability.report import StabilityReport
 from mjxgrad.diagnostics.stability.spring import Spring
@@ -63,7 +63,7 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
             width[i],
             solref[i],
             _thickness(scene, pair),
-            collision_functions[kinds].ncon,
+            COLLISION_FUNCTIONS[kinds].ncon,
         )
 
 
