@@ -29,8 +29,9 @@ from jaxtyping import Array, Bool, Float, Int
 from mjxgrad.dynamics import constraint, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
 from mjxgrad.dynamics.inertia import Inertia
-from mjxgrad.dynamics.jacobian import RowMap, SparseRows
+from mjxgrad.dynamics.jacobian import RowMap
 from mjxgrad.dynamics.newton import Problem
+from mjxgrad.dynamics.sparse import SparseRows
 
 CHECKPOINT_NAME = "acceleration"
 

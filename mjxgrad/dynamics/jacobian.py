@@ -1,12 +1,11 @@
-r"""The constraint Jacobian as a linear map: applied without being formed, and formed without its zeros.
+r"""The constraint Jacobian as a linear map, applied without being formed.
 
-The two uses of J want two shapes of it. A derivative of the solve needs J only times a vector, and the reverse mode of
-a product that was never spelled out is as cheap as the product: a contact's rows are the relative velocity of two
-bodies at a point, six numbers per body, whatever the number of joints. The solve needs the entries, many times over,
-but a contact moves few joints of the model, and which ones is known before anything is compiled: those between its two
-bodies. Rows are kept as `SparseRows`, which hold no other columns, and a pyramid's edges n ± μ t as its directions n, t.
+A derivative of the solve needs J only times a vector, and the reverse mode of a product that was never spelled out is as
+cheap as the product: a contact's rows are the relative velocity of two bodies at a point, six numbers per body, whatever the
+number of joints. The solve needs the entries, see `sparse`; a map gives them group by group, a pyramid's edges n ± μ t
+as its directions n, t.
 
-Arrays of `SparseRows`, and of the maps while they are made into such, may carry the batch as trailing axes, see `linear`.
+The entries are formed with or without the batch as trailing axes, see `linear`; a map is applied to one state.
 """
 
 import abc
@@ -16,14 +15,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjxgrad.dynamics import linear, spatial
-from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.spatial import combine, contract
 
-# Beyond so many groups the entries are kept in one matrix with its zeros: every group is some operations more to compile.
-_MOST_GROUPS = 24
 # By how much the entries of a Hessian may grow where contacts are kept together.
 _WASTE = 2.0
 
@@ -102,8 +98,8 @@ class DenseRows(RowMap):
         """Return the rows of contacts: the edges of pyramids if there is friction for them, or the directions."""
         count, dim, num_dofs = directions.shape
         if friction is None:
-            return cls(_flat(directions), ((count, dim),) if dim > 1 else ())
-        return cls(_edges(directions, friction[:, :, None]).reshape(-1, num_dofs))
+            return cls(flat(directions), ((count, dim),) if dim > 1 else ())
+        return cls(edges(directions, friction[:, :, None]).reshape(-1, num_dofs))
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -247,14 +243,14 @@ class ContactRows(RowMap):
         if self.dim > 3:
             spin = self._sum(turning)
             along = jnp.concatenate([along, contract("ckx,cx->ck", self.frame[:, : self.dim - 3], spin)], axis=1)
-        return _edges(along, self.friction).reshape(-1)
+        return edges(along, self.friction).reshape(-1)
 
     def _sum(self, of_sides: Float[Array, "sides 3"]) -> Float[Array, "contacts 3"]:
         by_contact = of_sides.reshape(self.lever.shape)
         return linear.add(by_contact[:, side] for side in range(by_contact.shape[1]))
 
     def pull(self, force):
-        force = _fold(force.reshape(len(self.frame), -1), self.friction)
+        force = fold(force.reshape(len(self.frame), -1), self.friction)
         num_axes, num_sides = min(self.dim, 3), self.lever.shape[1]
         push = jnp.repeat(contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0)
         torque = spatial.cross(self.lever.reshape(-1, 3), push)
@@ -289,8 +285,8 @@ class ContactRows(RowMap):
     def matrix(self):
         rows = []
         for entries, group, tilt in zip(self.directions(), self.groups, self.tilts(), strict=True):
-            edges = _edges(_spread(entries, group.dofs, len(self.axes)), None if tilt is None else tilt[:, :, None])
-            rows.append(edges.reshape(group.num_rows, *edges.shape[2:]))
+            own = edges(_spread(entries, group.dofs, len(self.axes)), None if tilt is None else tilt[:, :, None])
+            rows.append(own.reshape(group.num_rows, *own.shape[2:]))
         return jnp.concatenate(rows)
 
 
@@ -323,120 +319,17 @@ class JoinedRows(RowMap):
         return jnp.concatenate([part.matrix() for part in self.parts])
 
 
-class SparseRows(eqx.Module):
-    """The entries of a Jacobian, group by group, without those that are always zero.
-
-    Attributes:
-        pieces: entries of each group, by item, direction and joint velocity.
-        tilts: μ of each tangent of a pyramid; None for other groups.
-        groups: which joint velocities, and what the directions mean.
-        num_dofs: nv.
-    """
-
-    pieces: tuple[Float[Array, "_ _ _ *batch"], ...]
-    tilts: tuple[Float[Array, "_ _ *batch"] | None, ...]
-    groups: tuple[Group, ...] = eqx.field(static=True)
-    num_dofs: int = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
-        """Return the entries of a map; rows that are not active are zero."""
-        if len(rows.groups) > _MOST_GROUPS:
-            rows = DenseRows(
-                rows.matrix(), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
-            )
-        pieces, start = [], 0
-        for group, entries in zip(rows.groups, rows.directions(), strict=True):
-            active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
-            active = active[:, :1] if group.is_pyramid else active
-            pieces.append(jnp.where(active[:, :, None], entries, 0.0))
-            start += group.num_rows
-        return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)
-
-    def matvec(self, x: Float[Array, "nv *batch"]) -> Float[Array, "rows *batch"]:
-        """Return J x."""
-        rows = []
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
-            moving = linear.take(x, group.dofs)
-            if group.is_diagonal:
-                along = entries[:, :, 0] * moving[:, None]
-            else:
-                along = linear.matvec(_flat(entries), moving).reshape(group.num, group.dim, *x.shape[1:])
-            rows.append(_edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
-        return jnp.concatenate(rows)
-
-    def rmatvec(self, force: Float[Array, "rows *batch"]) -> Float[Array, "nv *batch"]:
-        """Return Jᵀ force."""
-        total, start = jnp.zeros((self.num_dofs, *force.shape[1:]), force.dtype), 0
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
-            own = force[start : start + group.num_rows].reshape(group.num, group.rows_each, *force.shape[1:])
-            start += group.num_rows
-            push = _fold(own, tilt)
-            part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else linear.rmatvec(_flat(entries), _flat(push))
-            total = linear.add_at(total, group.dofs, part)
-        return total
-
-    def gram(self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, bend: Bend) -> Float[Array, "nv nv *batch"]:
-        """Return mass + Jᵀ s'' J, of which each group adds to what it moves and to nothing else.
-
-        Args:
-            mass: to be added to.
-            layout: the laws of the rows.
-            bend: s'', see `constraint.bend`.
-        """
-        total, start = mass, 0
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
-            rows = slice(start, start + group.num_rows)
-            start = rows.stop
-            if rows.start >= layout.simple_stop:
-                square = linear.gram(_flat(entries), _flat(_cone_product(layout, bend, rows, entries)))
-            elif group.is_diagonal:
-                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * bend.simple[rows])
-                continue
-            elif tilt is None:
-                flat = _flat(entries)
-                square = linear.gram(flat, bend.simple[rows][:, None] * flat)
-            else:
-                square = _pyramid_square(bend.simple[rows].reshape(*tilt.shape[:2], 2, *mass.shape[2:]), tilt, entries)
-            total = linear.add_to_block(total, group.dofs, square)
-        return total
-
-
-def _pyramid_square(
-    bend: Float[Array, "num tangents 2 *batch"],
-    tilt: Float[Array, "num tangents *batch"],
-    entries: Float[Array, "num dim dofs *batch"],
-) -> Float[Array, "dofs dofs *batch"]:
-    """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
-    both, difference = bend[:, :, 0] + bend[:, :, 1], (tilt * (bend[:, :, 0] - bend[:, :, 1]))[:, :, None]
-    normal, tangents = entries[:, 0], entries[:, 1:]
-    of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
-    of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
-    return linear.gram(normal, of_normal) + linear.gram(_flat(tangents), _flat(of_tangents))
-
-
-def _cone_product(
-    layout: RowLayout, bend: Bend, rows: slice, entries: Float[Array, "num dim dofs *batch"]
-) -> Float[Array, "num dim dofs *batch"]:
-    """Return s'' of neighbouring elliptic contacts times their rows."""
-    which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
-    cone = layout.cones[which]
-    first = (rows.start - cone.start) // cone.dim
-    matrix = bend.cones[which][first : first + len(entries)]
-    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(cone.dim))
-
-
-def _edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
+def edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
     """Return the edges n ± μ t of pyramids; without μ the directions themselves."""
     if tilt is None:
         return along
     normal, tangent = along[:, :1], tilt * along[:, 1:]
-    edges = jnp.stack([normal + tangent, normal - tangent], axis=2)
-    return edges.reshape(len(along), -1, *along.shape[2:])
+    both = jnp.stack([normal + tangent, normal - tangent], axis=2)
+    return both.reshape(len(along), -1, *along.shape[2:])
 
 
-def _fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
-    """Return the forces along directions that forces along edges add up to; the transpose of `_edges`."""
+def fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
+    """Return the forces along directions that forces along edges add up to; the transpose of `edges`."""
     if tilt is None:
         return force
     pairs = force.reshape(len(force), -1, 2, *force.shape[2:])
@@ -444,7 +337,8 @@ def _fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#
     return jnp.concatenate([linear.sum_of_few(plus + minus), tilt * (plus - minus)], axis=1)
 
 
-def _flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
+def flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
+    """Return items and directions as rows."""
     return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
 
 

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import constraint, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.jacobian import SparseRows
+from mjxgrad.dynamics.sparse import SparseRows
 
 # Newton steps along the search line. Near the solution the first, of length one, is already exact; far from it an inexact
 # search costs an outer iteration and not the answer. On a box and a ball that slide on a plane, 2 to 12 steps needed the

@@ -16,7 +16,8 @@ from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import Bend
 from mjxgrad.dynamics.contact import slot_bodies
 from mjxgrad.dynamics.inertia import inertia_of
-from mjxgrad.dynamics.jacobian import AxisRows, SparseRows
+from mjxgrad.dynamics.jacobian import AxisRows
+from mjxgrad.dynamics.sparse import SparseRows
 
 # Two free balls on a plane and on each other, one of them heavy and rolling; an arm that bends back on itself, touches
 # the floor and a ball, and has a limit and friction loss. Contacts within one tree, between two, and with the world; all condims.
@@ -104,7 +105,7 @@ def test_the_pull_is_the_transpose(rows, random):
 @pytest.mark.parametrize("batch", [(), (3,)], ids=["one", "batch"])
 def test_sparse_rows_are_the_matrix_without_its_zeros(rows, random, batch, most_groups, monkeypatch):
     """J x, Jᵀ f and M + Jᵀ S J of the rows that act, for one state and with a trailing batch."""
-    monkeypatch.setattr("mjxgrad.dynamics.jacobian._MOST_GROUPS", most_groups)
+    monkeypatch.setattr("mjxgrad.dynamics.sparse._MOST_GROUPS", most_groups)
     model, data, block, matrix = rows
     layout, count = assembly.row_layout(model, data), len(matrix)
     matrix = np.where(block.is_active[:, None], matrix, 0)

@@ -9,8 +9,9 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import newton
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.jacobian import DenseRows, SparseRows
+from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.newton import Problem
+from mjxgrad.dynamics.sparse import SparseRows
 
 _BALL = """
 <mujoco>

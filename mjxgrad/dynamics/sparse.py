@@ -1,0 +1,119 @@
+r"""The entries of the constraint Jacobian, without those that are always zero.
+
+The solve needs them many times over, but a contact moves few joints of the model, and which ones is known before anything
+is compiled: those between its two bodies. Arrays may carry the batch as trailing axes, see `linear`.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mjxgrad.dynamics import linear
+from mjxgrad.dynamics.constraint import Bend, RowLayout
+from mjxgrad.dynamics.jacobian import DenseRows, Group, RowMap, edges, flat, fold
+
+# Beyond so many groups the entries are kept in one matrix with its zeros: every group is some operations more to compile.
+_MOST_GROUPS = 24
+
+
+class SparseRows(eqx.Module):
+    """The entries of a Jacobian, group by group, without those that are always zero.
+
+    Attributes:
+        pieces: entries of each group, by item, direction and joint velocity.
+        tilts: μ of each tangent of a pyramid; None for other groups.
+        groups: which joint velocities, and what the directions mean.
+        num_dofs: nv.
+    """
+
+    pieces: tuple[Float[Array, "_ _ _ *batch"], ...]
+    tilts: tuple[Float[Array, "_ _ *batch"] | None, ...]
+    groups: tuple[Group, ...] = eqx.field(static=True)
+    num_dofs: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
+        """Return the entries of a map; rows that are not active are zero."""
+        if len(rows.groups) > _MOST_GROUPS:
+            rows = DenseRows(
+                rows.matrix(), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
+            )
+        pieces, start = [], 0
+        for group, entries in zip(rows.groups, rows.directions(), strict=True):
+            active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
+            active = active[:, :1] if group.is_pyramid else active
+            pieces.append(jnp.where(active[:, :, None], entries, 0.0))
+            start += group.num_rows
+        return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)
+
+    def matvec(self, x: Float[Array, "nv *batch"]) -> Float[Array, "rows *batch"]:
+        """Return J x."""
+        rows = []
+        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+            moving = linear.take(x, group.dofs)
+            if group.is_diagonal:
+                along = entries[:, :, 0] * moving[:, None]
+            else:
+                along = linear.matvec(flat(entries), moving).reshape(group.num, group.dim, *x.shape[1:])
+            rows.append(edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
+        return jnp.concatenate(rows)
+
+    def rmatvec(self, force: Float[Array, "rows *batch"]) -> Float[Array, "nv *batch"]:
+        """Return Jᵀ force."""
+        total, start = jnp.zeros((self.num_dofs, *force.shape[1:]), force.dtype), 0
+        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+            own = force[start : start + group.num_rows].reshape(group.num, group.rows_each, *force.shape[1:])
+            start += group.num_rows
+            push = fold(own, tilt)
+            part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else linear.rmatvec(flat(entries), flat(push))
+            total = linear.add_at(total, group.dofs, part)
+        return total
+
+    def gram(self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, bend: Bend) -> Float[Array, "nv nv *batch"]:
+        """Return mass + Jᵀ s'' J, of which each group adds to what it moves and to nothing else.
+
+        Args:
+            mass: to be added to.
+            layout: the laws of the rows.
+            bend: s'', see `constraint.bend`.
+        """
+        total, start = mass, 0
+        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+            rows = slice(start, start + group.num_rows)
+            start = rows.stop
+            if rows.start >= layout.simple_stop:
+                square = linear.gram(flat(entries), flat(_cone_product(layout, bend, rows, entries)))
+            elif group.is_diagonal:
+                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * bend.simple[rows])
+                continue
+            elif tilt is None:
+                own = flat(entries)
+                square = linear.gram(own, bend.simple[rows][:, None] * own)
+            else:
+                square = _pyramid_square(bend.simple[rows].reshape(*tilt.shape[:2], 2, *mass.shape[2:]), tilt, entries)
+            total = linear.add_to_block(total, group.dofs, square)
+        return total
+
+
+def _pyramid_square(
+    bend: Float[Array, "num tangents 2 *batch"],
+    tilt: Float[Array, "num tangents *batch"],
+    entries: Float[Array, "num dim dofs *batch"],
+) -> Float[Array, "dofs dofs *batch"]:
+    """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
+    both, difference = bend[:, :, 0] + bend[:, :, 1], (tilt * (bend[:, :, 0] - bend[:, :, 1]))[:, :, None]
+    normal, tangents = entries[:, 0], entries[:, 1:]
+    of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
+    of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
+    return linear.gram(normal, of_normal) + linear.gram(flat(tangents), flat(of_tangents))
+
+
+def _cone_product(
+    layout: RowLayout, bend: Bend, rows: slice, entries: Float[Array, "num dim dofs *batch"]
+) -> Float[Array, "num dim dofs *batch"]:
+    """Return s'' of neighbouring elliptic contacts times their rows."""
+    which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
+    cone = layout.cones[which]
+    first = (rows.start - cone.start) // cone.dim
+    matrix = bend.cones[which][first : first + len(entries)]
+    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(cone.dim))
