@@ -23,7 +23,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, events, forces, implicit, linear, noise, smooth
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
-from mjxgrad.dynamics.constraint import Noise, RowLayout, Rows
+from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.implicit import System
 from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
@@ -157,12 +157,10 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return _minimum(model, data, layout, system, _start(model, data))
 
 
-def _system(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], noise: Noise | None = None
-) -> tuple[RowLayout, System | None]:
+def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowLayout, System | None]:
     """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
     layout = assembly.row_layout(model, data)
-    return layout, assembly.system_of(model, data, layout, assembly.joined(blocks), noise) if blocks else None
+    return layout, assembly.system_of(model, data, layout, assembly.joined(blocks)) if blocks else None
 
 
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:

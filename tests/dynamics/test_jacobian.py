@@ -16,7 +16,7 @@ from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import Bend
 from mjxgrad.dynamics.contact import slot_bodies
 from mjxgrad.dynamics.inertia import inertia_of
-from mjxgrad.dynamics.jacobian import AxisRows
+from mjxgrad.dynamics.jacobian import AxisRows, ContactRows
 from mjxgrad.dynamics.sparse import SparseRows
 
 # Two free balls on a plane and on each other, one of them heavy and rolling; an arm that bends back on itself, touches
@@ -147,6 +147,16 @@ def test_no_column_is_kept_that_no_contact_of_a_group_needs(rows):
         assert not np.any(np.delete(own, group.dofs, axis=1))
         assert np.any(own[:, list(group.dofs)], axis=0).all()
     assert any(len(group.dofs) < model.nv / 2 for group in block.map.groups)
+
+
+def test_what_moves_both_bodies_of_a_contact_is_of_neither(rows):
+    """The hip carries the whole arm: it has no part where the arm's last link touches its first."""
+    model, data, block, _ = rows
+    contacts = [side for part in block.map.parts if isinstance(part, ContactRows) for side in part.sides]
+    own, hip = np.asarray(model.geom_bodyid)[np.asarray(data._impl.contact.geom)], 12
+    within = [sides for sides, pair in zip(contacts, own, strict=True) if set(pair) == {3, 5}]
+    assert within
+    assert all(hip not in side.dofs for sides in within for side in sides)
 
 
 def test_inertia_as_a_map_is_the_mass_matrix(rows, random):
