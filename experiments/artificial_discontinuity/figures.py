@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.artificial_discontinuity.outcome import WAYS, Outcome, worst
+from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, shades, subplots
 
 _EVENT = "#009e73"
 _LEAST = 1e-4
@@ -30,10 +31,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         "slopes": ("What gradients say across the jump", slopes),
         "mating": ("A peg and a hole", mating),
     }
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def forces(outcome: Outcome):

@@ -8,8 +8,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import FuncFormatter
 
 from experiments.bounce.outcome import DISCRETE, EVENT, Outcome
+from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, subplots
 
 _WIDE = "#009e73"
 
@@ -30,10 +31,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         "steps": ("Error against steps in contact", steps),
         "error": ("Error over all contacts", error),
     }
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def derivative(outcome: Outcome):

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.kernels.outcome import TITLES, Outcome
+from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, subplots
 
 COLOURS = {
     "gaussian": FIRST,
@@ -33,10 +34,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         "profiles": ("Force at a distance, and the noise that it is", profiles),
         "motion": ("A ball that meets a plane, smoothed and sampled", motion),
     }
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def profiles(outcome: Outcome):

@@ -6,8 +6,9 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 from experiments.long_horizon.outcome import ZEROTH, Errors, Outcome
+from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, subplots
 from experiments.theme import ZEROTH as BLUE
 
 _EVENT = "#009e73"
@@ -30,10 +31,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         "growth": ("Why: the product of the Jacobians", growth),
         "windows": ("Windows, plain and with a value function", windows),
     }
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def errors(outcome: Outcome):

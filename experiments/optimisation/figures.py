@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
+from experiments.pictures import drawn
 from experiments.report import Figure, quantity
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, subplots
 
 # One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
 _COLOURS = {
@@ -62,10 +63,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
     }
     if any(run.reasons for run in outcome.runs):
         pictures["alpha"] = ("The weight of the first-order part", alpha)
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def final(outcome: Outcome):

@@ -8,9 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 
+from experiments.pictures import drawn
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, shades, subplots
 
 _COLOURS = {"analytic": ZEROTH, "mean_jacobian": FIRST, "least_squares": "#009e73", "none": DEFAULT}
 _HALF_LENGTH, _RADIUS = 0.1, 0.02  # m, of the rod's axis; of rod and finger
@@ -34,10 +35,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         pictures = {"cost": ("Cost against iterations", cost)} | pictures
     else:
         pictures = {"tree": ("The tree", tree)} | pictures
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def cost(outcome: Outcome):

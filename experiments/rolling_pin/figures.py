@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.rolling_pin.outcome import Outcome
-from experiments.theme import FIRST, MUTED, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, ZEROTH, subplots
 
 # Palette as in the theme; those that share a kind of remedy differ by their dashes.
 _COLOURS = {"first order": FIRST, "zeroth order": ZEROTH, "α-order": "#e69f00"}
@@ -26,10 +27,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         The figures in order of reading.
     """
     pictures = {"descent": ("True cost of each descent", descent), "bed": ("The bed in the end", bed)}
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def descent(outcome: Outcome):

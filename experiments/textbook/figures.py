@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.textbook.outcome import Outcome
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, shades, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, shades, subplots
 from mjxgrad.diagnostics import Comparison
 
 # For further estimators, in the order of the settings; told apart by their markers, too.
@@ -32,10 +33,7 @@ def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figur
         pictures["stiffness"] = ("Error against stiffness", stiffness)
     if outcome.missing is not None:
         pictures["missing"] = ("How often samples miss the slope", missing)
-    return [
-        Figure(save(drawing(outcome), folder, name), title, captions[name])
-        for name, (title, drawing) in pictures.items()
-    ]
+    return drawn(pictures, outcome, folder, captions)
 
 
 def stiffness_name(outcome: Outcome) -> str:
