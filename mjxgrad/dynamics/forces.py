@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import linear, rotation, smooth, spatial, springs, tree
+from mjxgrad.dynamics import factor, rotation, smooth, spatial, springs, tree
 from mjxgrad.dynamics.spatial import contract, pick
 
 _Disable = mujoco.mjtDisableBit
@@ -169,5 +169,5 @@ def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     wrench = jnp.concatenate([torque + spatial.cross(lever, push), push], axis=1)
     applied = data.qfrc_applied + smooth.generalised_force(model, data, wrench)
     total = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
-    unconstrained = linear.solve_positive_definite(mjx.full_m(model, data), total)
+    unconstrained = factor.solve_positive_definite(mjx.full_m(model, data), total)
     return data.replace(qfrc_smooth=total, qacc_smooth=unconstrained)

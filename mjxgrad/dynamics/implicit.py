@@ -26,7 +26,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, linear, newton
+from mjxgrad.dynamics import constraint, factor, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
 from mjxgrad.dynamics.inertia import Inertia
 from mjxgrad.dynamics.jacobian import RowMap
@@ -116,7 +116,7 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: Float[Array, "
 
     def run(system, bend, force):
         problem = system.problem()
-        return linear.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
+        return factor.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
 
     def invert(_, force):
         return linear.batch_last(run)(system, bend, force)

@@ -10,17 +10,14 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-# Longer sums are left to a matrix product, and larger factorisations to LAPACK or cuSOLVER: written out they would take
-# longer to compile than they save.
+# Longer sums are left to a matrix product: written out they would take longer to compile than they save.
 _LONGEST_SUM = 64
-_LARGEST_FACTOR = 16
 
 
 def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
@@ -62,55 +59,6 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
     if left.ndim > 2 and len(left) <= _LONGEST_SUM:
         return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
-
-
-def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
-    """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite."""
-    size = len(vector)
-    if matrix.ndim == 2:
-        return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), vector)
-    if size > _LARGEST_FACTOR:
-        leading = jnp.moveaxis(matrix, (0, 1), (-2, -1)), jnp.moveaxis(vector, 0, -1)[..., None]
-        factor = jnp.linalg.cholesky(leading[0])
-        return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
-    columns: list[Array] = []  # of the factor, from the diagonal down
-    for k in range(size):
-        column = matrix[k:, k]
-        for j, earlier in enumerate(columns):
-            column = column - earlier[k - j :] * earlier[k - j]
-        columns.append(column * jax.lax.rsqrt(column[0]))
-    forward, rest = [], vector
-    for column in columns:
-        forward.append(rest[0] / column[0])
-        rest = rest[1:] - column[1:] * forward[-1]
-    solution: list[Array] = []  # from the last entry up
-    for k in reversed(range(size)):
-        value = forward[k]
-        for above, known in zip(columns[k][1:], reversed(solution), strict=True):
-            value = value - above * known
-        solution.append(value / columns[k][0])
-    return jnp.stack(solution[::-1])
-
-
-def solve_positive_definite(
-    matrix: Float[Array, "n n"],
-    vector: Float[Array, " n"],
-    apply: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None,
-) -> Float[Array, " n"]:
-    """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
-
-    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation.
-
-    Args:
-        matrix: symmetric, positive definite.
-        vector: right-hand side.
-        apply: the matrix as a map, through which to differentiate in place of its entries.
-    """
-
-    def solve(_, b):
-        return batch_last(cholesky_solve)(matrix, b)
-
-    return jax.lax.custom_linear_solve(apply or (lambda x: matrix @ x), vector, solve, symmetric=True)
 
 
 def batch_last(function, batch: int | None = None):

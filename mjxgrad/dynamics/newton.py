@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, linear
+from mjxgrad.dynamics import constraint, factor, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.sparse import SparseRows
 
@@ -181,7 +181,7 @@ def minimise(
 
 def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:
     """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
-    newton = -linear.cholesky_solve(hessian, gradient)
+    newton = -factor.cholesky_solve(hessian, gradient)
     diagonal = jnp.stack([hessian[i, i] for i in range(len(gradient))])
     return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / diagonal)
 

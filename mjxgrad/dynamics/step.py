@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, events, forces, implicit, linear, noise, smooth
+from mjxgrad.dynamics import assembly, events, factor, forces, implicit, noise, smooth
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
@@ -255,7 +255,7 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or _is_zero(model.dof_damping):
         return data.qacc
     damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
-    slowed = linear.solve_positive_definite(
+    slowed = factor.solve_positive_definite(
         inertia.matrix + jnp.diag(damping), damping * data.qacc, lambda x: inertia.apply(x) + damping * x
     )
     return data.qacc - slowed
@@ -272,7 +272,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " n
     if derivative is None:
         return data.qacc
     mass = mjx.full_m(model, data) - model.opt.timestep * derivative
-    return linear.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+    return factor.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
 
 
 def _advance(
