@@ -38,7 +38,7 @@ def rest_depth(
         The depth below the distance at which contact begins, in m.
     """
     acceleration = jnp.broadcast_to(jnp.asarray(acceleration, stiffness.dtype), stiffness.shape)
-    _, largest, _ = jnp.moveaxis(_profile(jnp.zeros_like(stiffness), solimp), -1, 0)
+    largest = impedance(solimp, jnp.zeros_like(stiffness)).full
     # From the width on the impedance is constant, and the depth known.
     beyond = (1 - largest) * acceleration / stiffness
     upper = jnp.maximum(solimp[..., 2], beyond)
@@ -60,8 +60,8 @@ def rest_depth(
 
 def static_response(depth: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]) -> Float[Array, "*shape"]:
     r"""Give $d(\rho)^2 \rho / (d_w^2 (1 - d(\rho)))$, which the stiffness turns into an acceleration (m)."""
-    present, largest, _ = jnp.moveaxis(_profile(depth, solimp), -1, 0)
-    return present**2 * depth / (largest**2 * (1 - present))
+    profile = impedance(solimp, depth)
+    return profile.present**2 * depth / (profile.full**2 * (1 - profile.present))
 
 
 def compensated_stiffness(
@@ -87,7 +87,3 @@ def compensated_stiffness(
     """
     depth = rest_depth(acceleration, stiffness, solimp)
     return stiffness * static_response(depth, solimp) / static_response(depth + margin, solimp)
-
-
-def _profile(depth: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]) -> Float[Array, "*shape 3"]:
-    return impedance(solimp.reshape(-1, 5), depth.reshape(-1)).reshape(*depth.shape, 3)

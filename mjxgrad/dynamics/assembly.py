@@ -14,6 +14,7 @@ References:
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -77,7 +78,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
 def joined(blocks: list[Block]) -> Block:
     """Return all rows as one block; which of them begin and end together it no longer says."""
     leaves = {
-        field.name: jnp.concatenate([getattr(block, field.name) for block in blocks])
+        field.name: jax.tree.map(lambda *x: jnp.concatenate(x), *(getattr(block, field.name) for block in blocks))
         for field in dataclasses.fields(Block)
         if field.name != "map" and not field.metadata.get("static")
     }
@@ -91,7 +92,7 @@ def law(
     residual = jnp.where(block.is_active, block.residual, 0.0)
     rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block)
-    impedance = block.impedance[:, 0]
+    impedance = block.impedance.present
     weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
     return -damping * rate - stiffness * impedance * residual, weight
 
@@ -153,7 +154,7 @@ def stiffness_damping(model: mjx.Model, block: Block) -> tuple[Float[Array, " ro
     refsafe the time constant is clamped from below at two time steps; at the clamp itself the derivative is that of the
     unclamped side, since from there every larger value counts.
     """
-    first, second, largest = block.solref[:, 0], block.solref[:, 1], block.impedance[:, 1]
+    first, second, largest = block.solref[:, 0], block.solref[:, 1], block.impedance.full
     time_constant = jnp.where(first > 0, first, 1.0)
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         shortest = 2 * model.opt.timestep

@@ -3,6 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.jacobian import RowMap
 
 
@@ -12,7 +13,7 @@ class Block(eqx.Module):
     Attributes:
         map: from joint velocities to the rows, also where the row is inactive.
         residual: r in a_ref (m or rad).
-        impedance: d(r), and dw and d0, its values from the width on and at r = 0.
+        impedance: d(r), with dw and d0.
         solimp: what the impedance follows from.
         inverse_weight: Â, inverse inertia (1/kg).
         solref: stiffness and damping in MuJoCo's formats.
@@ -26,7 +27,7 @@ class Block(eqx.Module):
 
     map: RowMap
     residual: Float[Array, " rows"]
-    impedance: Float[Array, "rows 3"]
+    impedance: Impedance
     solimp: Float[Array, "rows 5"]
     inverse_weight: Float[Array, " rows"]
     solref: Float[Array, "rows 2"]

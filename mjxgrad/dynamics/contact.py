@@ -92,7 +92,7 @@ def _pyramids(
     def spread(x: Array) -> Array:
         return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
 
-    resistance = spread(impedance(contact.solimp, residual))
+    resistance = jax.tree.map(spread, impedance(contact.solimp, residual))
     residual = spread(residual)
     return Block(
         map=rows,
@@ -130,7 +130,7 @@ def _cones(model: mjx.Model, contact: Any, rows: RowMap, inverse_weight: Float[A
     return Block(
         map=rows,
         residual=residual.reshape(-1),
-        impedance=spread(impedance(contact.solimp, distance)),
+        impedance=jax.tree.map(spread, impedance(contact.solimp, distance)),
         solimp=spread(contact.solimp),
         inverse_weight=jnp.concatenate(weights, axis=1).reshape(-1),
         solref=jnp.concatenate(solref, axis=1).reshape(-1, 2),

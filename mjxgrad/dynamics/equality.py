@@ -1,5 +1,6 @@
 """Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order."""
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -45,7 +46,7 @@ def _block(
     return Block(
         map=DenseRows(jacobian.reshape(count * each, -1)),
         residual=flat,
-        impedance=spread(impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
+        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
         solimp=spread(model.eq_solimp[ids]),
         inverse_weight=inverse_weight.reshape(-1),
         solref=spread(model.eq_solref[ids]),

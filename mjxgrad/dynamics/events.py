@@ -65,6 +65,7 @@ from mjxgrad.contacts import safe_sqrt
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
+from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import System
 
 # Nodes and weights of Gauss and Legendre on (0, 1).
@@ -237,13 +238,13 @@ def _per_row(plan: _Plan, values: Array) -> Array:
 
 def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
     """Return rows with some of them at zero distance, in contact."""
-    impedance = jnp.where(which, block.impedance[:, 2], block.impedance[:, 0])
+    impedance = jnp.where(which, block.impedance.onset, block.impedance.present)
     return eqx.tree_at(
         lambda b: (b.residual, b.impedance, b.is_active),
         block,
         (
             jnp.where(which, 0.0, block.residual),
-            block.impedance.at[:, 0].set(impedance),
+            Impedance(impedance, block.impedance.full, block.impedance.onset),
             block.is_active | which,
         ),
     )

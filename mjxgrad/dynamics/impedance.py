@@ -1,17 +1,32 @@
 """The impedance of constraint rows: how much of what they ask for they get."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
 
-def impedance(solimp: Float[Array, "n 5"], violation: Float[Array, " n"]) -> Float[Array, "n 3"]:
-    """Return d(r), dw and d0: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
-    smallest = jnp.clip(solimp[:, 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    largest = jnp.clip(solimp[:, 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    width = jnp.maximum(solimp[:, 2], mujoco.mjMINVAL)
-    middle = jnp.clip(solimp[:, 3], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    power = jnp.maximum(solimp[:, 4], 1.0)
+class Impedance(eqx.Module):
+    """Impedance of rows; arrays of their own, since two of the three do not depend on the state.
+
+    Attributes:
+        present: d(r).
+        full: dw, from the width on.
+        onset: d0, at r = 0.
+    """
+
+    present: Float[Array, "*rows"]
+    full: Float[Array, "*rows"]
+    onset: Float[Array, "*rows"]
+
+
+def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"]) -> Impedance:
+    """Return d: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint."""
+    smallest = jnp.clip(solimp[..., 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    largest = jnp.clip(solimp[..., 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    width = jnp.maximum(solimp[..., 2], mujoco.mjMINVAL)
+    middle = jnp.clip(solimp[..., 3], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    power = jnp.maximum(solimp[..., 4], 1.0)
     # Beyond the width the powers are evaluated where they are finite and thrown away.
     is_inside = jnp.abs(violation) < width
     x = jnp.where(is_inside, jnp.abs(violation) / width, 0.5)
@@ -19,4 +34,4 @@ def impedance(solimp: Float[Array, "n 5"], violation: Float[Array, " n"]) -> Flo
     part = jnp.where(is_lower, middle, 1 - middle)
     climb = part * (jnp.where(is_lower, x, 1 - x) / part) ** power
     inside = smallest + (largest - smallest) * jnp.where(is_lower, climb, 1 - climb)
-    return jnp.stack([jnp.where(is_inside, inside, largest), largest, smallest], axis=1)
+    return Impedance(jnp.where(is_inside, inside, largest), largest, smallest)

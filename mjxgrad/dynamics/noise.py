@@ -24,6 +24,7 @@ slots have no rows.
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -105,13 +106,13 @@ def _noisy(
         return jnp.repeat(x, each, axis=0, total_repeat_length=len(block.residual))
 
     stiffness = assembly.stiffness_damping(model, block)[0][::each]
-    rate = jnp.maximum(stiffness * resistance[:, 0], _SOFTEST)
+    rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
     gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
     is_known = spread(known)
     present = eqx.tree_at(
         lambda b: (b.impedance, b.inverse_weight, b.is_active),
         block,
-        (spread(resistance), jnp.where(is_known, block.inverse_weight, _WEIGHTLESS), is_known),
+        (jax.tree.map(spread, resistance), jnp.where(is_known, block.inverse_weight, _WEIGHTLESS), is_known),
     )
     return present, Noise(spread(rate * length), spread(gate))
 
