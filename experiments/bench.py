@@ -9,6 +9,9 @@ reports for the compiled program.
 - `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
 - `C MuJoCo`: `mujoco.rollout` on as many threads as there are cores.
+
+With `--per-core` every core is a device of its own, and each row of JAX's, MJX's included, is split over them by
+`mg.over_devices`.
 """
 
 import argparse
@@ -63,9 +66,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
+    parser.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
     options = parser.parse_args()
+    if options.per_core:
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
     print(
-        f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores, batch {options.batch}, "
+        f"{len(jax.devices())} × {jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores, batch {options.batch}, "
         f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]; "
         f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}"
     )
@@ -84,15 +90,15 @@ def _measure(name: str, options: argparse.Namespace) -> Iterator[Row]:
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
     runs = options.runs
-    yield _time("mjx.step", jax.vmap(lambda s: _mjx_outcome(scene, s, options.steps)), states, runs)
+    yield _time("mjx.step", mg.over_devices(lambda s: _mjx_outcome(scene, s, options.steps)), states, runs)
     for checkpoint, label in ((True, ""), (False, ", all kept")):
 
         def outcome(state: Any, checkpoint: bool = checkpoint) -> Any:
             return _outcome(scene, state, options.steps, checkpoint)
 
         if checkpoint:
-            yield _time("mg.rollout", jax.vmap(outcome), states, runs)
-        yield _time(f"mg value_and_grad{label}", jax.vmap(jax.value_and_grad(outcome)), states, runs)
+            yield _time("mg.rollout", mg.over_devices(outcome), states, runs)
+        yield _time(f"mg value_and_grad{label}", mg.over_devices(jax.value_and_grad(outcome)), states, runs)
     if not options.skip_patched:
         yield _patched(scene, states, options)
     if jax.default_backend() == "cpu":
@@ -145,7 +151,7 @@ def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
 
     original, jax.lax.while_loop = jax.lax.while_loop, scan_loop
     try:
-        function = jax.vmap(jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps)))
+        function = mg.over_devices(jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps)))
         return _time("mjx patched, value_and_grad", function, states, min(options.runs, 3))
     finally:
         jax.lax.while_loop = original

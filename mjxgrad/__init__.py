@@ -1,6 +1,7 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
+from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
@@ -60,6 +61,7 @@ __all__ = [
     "mlp_policy",
     "open_loop",
     "optimise",
+    "over_devices",
     "parameter_noise",
     "planning",
     "rollout",

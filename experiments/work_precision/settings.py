@@ -53,7 +53,7 @@ SIZES = {
         ("pendulum", "push"), None, (0.5, 1.0, 2.0, 4.0), (1e-2,), 32, 128, (8, 32), (1.0, 2.0), (2.0,), 3, 0.1, False
     ),
     "default": Sizes(
-        _DEFAULT_SCENES, ("pendulum", "bounce", "slide", "push"), (0.5, 1.0, 2.0, 4.0, 8.0), (1e-2, 1e-4, 1e-6), 32, 256,
+        _DEFAULT_SCENES, ("pendulum", "bounce"), (0.5, 1.0, 2.0, 4.0, 8.0), (1e-2, 1e-4, 1e-6), 32, 256,
         (8, 32, 128), (0.5, 1.0, 2.0), (2.0, 4.0), 5, 0.4, False,
     ),
     "full": Sizes(

@@ -1,0 +1,64 @@
+"""A batch over several devices; in a process of its own, since their number is fixed at the first use of JAX."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+
+_PROGRAM = """
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", 3)
+    import jax.numpy as jnp
+    import numpy as np
+
+    import mjxgrad as mg
+
+
+    def root(x, start):  # a loop that each member leaves at its own time
+        return jax.lax.while_loop(lambda y: jnp.abs(y * y - x["square"]) > 1e-4, lambda y: (y + x["square"] / y) / 2, start)
+
+
+    squares, starts = {"square": jnp.linspace(1.0, 400.0, 6)}, jnp.ones(6)
+    function = jax.jit(mg.over_devices(root))
+    found = function(squares, starts)
+    assert len(found.sharding.device_set) == 3
+    np.testing.assert_array_equal(found, jax.vmap(root)(squares, starts))
+    text = function.lower(squares, starts).compile().as_text()
+    assert not any(word in text for word in ("all-reduce", "all-gather", "collective")), "devices wait for each other"
+    try:
+        function({"square": jnp.ones(4)}, jnp.ones(4))
+    except ValueError as error:
+        assert str(error) == "the batch must be a multiple of the 3 devices, got 4"
+    else:
+        raise AssertionError("an uneven batch was taken")
+"""
+
+
+def test_each_device_works_on_its_part_alone():
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(_PROGRAM)],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_one_device_is_vmap():
+    function = mg.over_devices(lambda x, y: x @ y, jax.devices()[:1])
+    x = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(function(x, x), [1.0, 13.0, 41.0])
+
+
+def test_arguments_without_a_common_batch_are_refused():
+    function = mg.over_devices(lambda x, y: x + y, jax.devices()[:1] * 2)
+    with pytest.raises(ValueError, match="all arguments must have the batch as leading axis, of one size"):
+        function(jnp.ones(4), jnp.ones(3))
