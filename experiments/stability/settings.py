@@ -26,7 +26,7 @@ class Size:
 
 
 SIZES = {
-    "quick": Size(8, 32, ("ball", "sphere, condim 3, elliptic", "two balls, pyramidal"), ("ball",)),
+    "quick": Size(8, 32, ("ball", "two balls, elliptic"), ()),
     "default": Size(
         12,
         256,
@@ -44,7 +44,7 @@ SIZES = {
             "box, pyramidal",
             "chain",
         ),
-        ("ball", "sphere, condim 3, pyramidal", "two balls, pyramidal", "chain"),
+        ("ball", "two balls, pyramidal"),
     ),
     "full": Size(24, 2048, None, None),
 }
