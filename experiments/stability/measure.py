@@ -214,7 +214,7 @@ def _of_c(
         tolerance=_TOLERANCE["float64"],
     )
     none = np.zeros(len(grid), bool)
-    return Behaviour(classify_motion(record), derivative, None, None, none, none, none, record.gain)
+    return Behaviour(classify_motion(record), derivative, None, None, none, none, none, none, record.gain)
 
 
 def _of_mjxgrad(
@@ -259,6 +259,7 @@ def _of_mjxgrad(
         kinds[1],
         None if event is None else _judge_event(record, event, bound),
         run.is_silent | (False if event is None else event.is_silent),
+        (classify_motion(record) == Motion.UNSOLVED) & ~run.is_unsolved,
         is_wild & record.is_sound,
         is_wild & record.is_sound & is_sound,
         record.gain,

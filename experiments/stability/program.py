@@ -28,6 +28,7 @@ class Run:
         gradient: of the outcome with respect to the model's fields, positions and velocities.
         is_silent: whether a rollout returned a number that is not finite without a flag.
         is_gradient_finite: whether all numbers of the gradient are.
+        is_unsolved: whether the rollout says that some step's forces are not in balance.
     """
 
     course: Course
@@ -35,6 +36,7 @@ class Run:
     gradient: tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]
     is_silent: np.ndarray
     is_gradient_finite: np.ndarray
+    is_unsolved: np.ndarray
 
 
 def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array]:
@@ -102,7 +104,7 @@ class Program:
             _until(residual, trajectory.first_bad_step).max(axis=1),
             trajectory.first_bad_step,
         )
-        return Run(course, value, gradient, is_silent, _all_finite(gradient))
+        return Run(course, value, gradient, is_silent, _all_finite(gradient), trajectory.unsolved > 0)
 
     def _outcome(
         self, fields: dict[str, Array], qpos: Array, qvel: Array, observe: Observe | None = _observe

@@ -32,13 +32,15 @@ def verdict(outcome: Outcome) -> str:
     ]
     for name in precisions:
         stopped = sum(int((one.behaviour[name].motion == Motion.UNSOLVED).sum()) for one in outcome.scenes)
+        untold = outcome.total(name, "is_out_of_balance")
         worse = sum(int(one.worse(name).sum()) for one in outcome.scenes)
         better = sum(int(one.better(name).sum()) for one in outcome.scenes)
         open_ones = _reasons(outcome, name)[UNEXPLAINED]
         sentences.append(
             f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} of the points"
             f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
-            f"{_count(stopped)} leave forces out of balance in some step, which no flag tells."
+            f"{_count(stopped)} leave forces out of balance in some step, which `Trajectory.unsolved` does not tell at "
+            f"{_count(untold)}."
         )
     return " ".join(sentences)
 

@@ -87,7 +87,8 @@ def solve(
     """Return the acceleration at which the forces of a system are in balance, differentiable with respect to it.
 
     Returns:
-        The acceleration, and the number of iterations that it took: one more than `max_iterations` where these were too few.
+        The acceleration, and the number of iterations that it took: one more than `max_iterations` where these, or
+        the digits of this precision, were too few.
     """
 
     def run(system, start, tolerance):

@@ -42,6 +42,8 @@ _MAX_LINE_STEPS = 40
 _LINE_TOLERANCE = 1e-2
 # Sums of a few terms are known to about this many units of rounding.
 _ROUNDING = 4
+# A solve that rounding ends counts as none where it leaves this part of the acceleration unknown.
+_RESOLVED = 1e-3
 
 
 class Problem(eqx.Module):
@@ -77,6 +79,20 @@ class Problem(eqx.Module):
         weight = jnp.where(point.row_force != 0, self.rows.weight, 0.0)
         terms = linear.dot(point.acceleration, point.inertia) + linear.dot(weight * size, size)
         return (_ROUNDING * jnp.finfo(size.dtype).eps) ** 2 * terms
+
+    def is_resolved(self, point: "Point") -> Bool[Array, "*batch"]:
+        """Return whether rounding leaves less than a thousandth of the acceleration unknown.
+
+        In single precision it leaves more where rows weigh 10⁷ times the bodies: the edges of a pyramid do, as 1/μ², at little
+        friction.
+        """
+        own, free = linear.dot(point.acceleration, point.inertia), linear.dot(self.force / self.diagonal, self.force)
+        return self.rounding(point) <= _RESOLVED**2 * (own + free)
+
+    @property
+    def diagonal(self) -> Float[Array, "nv *batch"]:
+        """The diagonal of M, positive."""
+        return jnp.maximum(jnp.stack([self.mass[i, i] for i in range(len(self.mass))]), mujoco.mjMINVAL)
 
     def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
         """Return the second derivative of the cost, M + Jᵀ s'' J."""
@@ -143,9 +159,9 @@ def minimise(
 
     Returns:
         The acceleration, NaN where the problem is not finite, and the number of iterations: one more than
-        `max_iterations` where these were too few.
+        `max_iterations` where these, or the digits of this precision, were too few.
     """
-    diagonal = jnp.maximum(jnp.stack([problem.mass[i, i] for i in range(len(start))]), mujoco.mjMINVAL)
+    diagonal = problem.diagonal
     smallest = tolerance**2 * linear.add(diagonal)
 
     def is_solved(state: _Iterate) -> Bool[Array, "*batch"]:
@@ -176,7 +192,9 @@ def minimise(
     last = jax.lax.while_loop(lambda state: ~jnp.all(is_done(state)), iterate, first)
     # Non-finite forces or rows have no minimiser: the start must not pass for one.
     is_sound = jnp.all(jnp.isfinite(last.point.gradient), axis=0)
-    return jnp.where(is_sound, last.point.acceleration, jnp.nan), last.num_iterations + ~is_solved(last)
+    finished = is_solved(last) & problem.is_resolved(last.point)
+    num_iterations = jnp.where(finished, last.num_iterations, max_iterations + 1)
+    return jnp.where(is_sound, last.point.acceleration, jnp.nan), num_iterations
 
 
 def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:

@@ -78,7 +78,7 @@ def step(
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
         them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
         `_impl.solver_niter` is the number of iterations that the solve took, of Runge-Kutta's four the largest: one more than
-        `opt.iterations` where these were too few.
+        `opt.iterations` where these, or the digits of the precision, were too few.
 
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or the smoothing

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
@@ -15,7 +16,7 @@ from mjxgrad.dynamics.sparse import SparseRows
 
 _BALL = """
 <mujoco>
-  <option cone="elliptic" tolerance="1e-15" timestep="{timestep}" iterations="{iterations}"/>
+  <option cone="{cone}" tolerance="1e-15" timestep="{timestep}" iterations="{iterations}"/>
   <worldbody>
     <geom type="plane" size="1 1 .1" friction="{friction} .005 .0001" solref="{solref}" solimp="{solimp}"/>
     <body pos="0 0 {height}"><freejoint/>
@@ -24,7 +25,8 @@ _BALL = """
 </mujoco>
 """
 _USUAL = {
-    "timestep": 0.002, "friction": 0.135, "solref": ".02 1", "solimp": ".9 .95 .001", "height": 0.05, "iterations": 100
+    "timestep": 0.002, "friction": 0.135, "solref": ".02 1", "solimp": ".9 .95 .001", "height": 0.05, "iterations": 100,
+    "cone": "elliptic",
 }  # fmt: skip
 _HARD = {"timestep": 0.03178, "solref": "7.293e-05 .1113", "solimp": ".9998 .9976 .0337", "friction": 0.0349}
 _SOFT = {"timestep": 0.04534, "solref": ".7462 .1337", "solimp": ".9545 .9921 .0002201", "friction": 0.1708}
@@ -80,6 +82,18 @@ def test_a_rollout_counts_the_steps_whose_solve_was_cut_short():
 
     rising, falling = jax.jit(jax.vmap(roll))(jnp.array([[0, 0, 10.0, 0, 0, 0], [0.5, 0.2, -1, 0, 6, 2]]))
     assert rising <= 1 < falling
+
+
+@pytest.mark.parametrize(
+    ("friction", "cone", "is_solved"), [(0.0, "pyramidal", False), (0.0, "elliptic", True), (0.5, "pyramidal", True)]
+)
+def test_a_rollout_counts_the_steps_that_single_precision_does_not_resolve(friction: float, cone: str, is_solved: bool):
+    """The edges of a pyramid weigh as 1/μ², and friction 0 counts as 1e-5: forces of 1e11 that all but cancel."""
+    with jax.enable_x64(False):
+        scene = mg.load_scene(_model(height=0.0499, cone=cone))
+        model = scene.model.replace(geom_friction=scene.model.geom_friction.at[:, 0].set(friction))
+        stepped = jax.jit(mg.step)(model, scene.data.replace(qvel=jnp.array([0.5, 0.2, -1, 0, 6, 2])))
+    assert (int(stepped._impl.solver_niter) <= 100) == is_solved
 
 
 def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():

@@ -92,7 +92,7 @@ def _outcome(scene, grid, ours, theirs, apart):
     def behaviour(motion):
         none = np.zeros(len(grid), bool)
         right = np.zeros(len(grid), int)
-        return Behaviour(np.array(motion), right, right, None, none, none, none, np.ones(len(grid)))
+        return Behaviour(np.array(motion), right, right, None, none, none, none, none, np.ones(len(grid)))
 
     kinds = {C_MUJOCO: behaviour(theirs), "float64": behaviour(ours)}
     return SceneOutcome(SCENES[scene], grid, kinds, {"float64": np.array(apart)})
