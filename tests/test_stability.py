@@ -1,5 +1,6 @@
 """A scene's springs beside its time step, against closed forms, the textbook's bounce and C MuJoCo's own steps."""
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -106,6 +107,20 @@ def test_joint_limits_are_looked_at_with_their_own_format_and_remedy():
     assert limit.name == "slide"
     assert limit.size == 2.0
     assert any(text.startswith("joint limit of slide") and "the direct format" in text for text in report.warnings)
+
+
+@pytest.mark.parametrize(("cone", "friction", "is_single", "warns"), [
+    ("pyramidal", 0.001, True, True),
+    ("pyramidal", 0.001, False, False),
+    ("elliptic", 0.001, True, False),
+    ("pyramidal", 0.5, True, False),
+])  # fmt: skip
+def test_a_pyramid_of_little_friction_is_too_much_for_single_precision(cone, friction, is_single, warns):
+    text = f"""<mujoco><option cone="{cone}"/><worldbody><geom type="plane" size="1 1 1" friction="{friction}"/>
+    <body pos="0 0 .1"><freejoint/><geom size=".1" friction="{friction}"/></body></worldbody></mujoco>"""
+    with jax.enable_x64(not is_single):
+        warnings = mg.check_stability(mg.load_scene(text)).warnings
+    assert any("a pyramid of friction 0.001 weighs" in one for one in warnings) == warns
 
 
 def test_a_switched_off_limit_is_not_looked_at():

@@ -42,7 +42,9 @@ def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: fl
     # Inside jit, operations on known values would be traced, too.
     with jax.ensure_compile_time_eval():
         springs = (*_contacts(scene), *_others(scene))
-    return StabilityReport(scene.name, springs, float(model.opt.timestep), speed, joint_speed)
+    return StabilityReport(
+        scene.name, springs, float(model.opt.timestep), speed, joint_speed, str(scene.data.qpos.dtype)
+    )
 
 
 def _contacts(scene: Scene) -> Iterator[Spring]:
@@ -51,6 +53,8 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
     parameters = scene.contact_parameters()
     columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
     stiffness, damping, impedance, width, solref = (np.asarray(column, float) for column in columns)
+    friction = np.asarray(parameters.friction[:, 0], float)
+    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     for i, pair in enumerate(scene.pairs):
         kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
         yield _spring(
@@ -64,6 +68,7 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
             solref[i],
             _thickness(scene, pair),
             COLLISION_FUNCTIONS[kinds].ncon,
+            float(friction[i]) if is_pyramidal and pair.condim > 1 else None,
         )
 
 
@@ -101,7 +106,17 @@ def _others(scene: Scene) -> Iterator[Spring]:
 
 
 def _spring(
-    scene: Scene, kind: str, name: str, stiffness, damping, impedance, width, solref, size: float, num_rows: int = 1
+    scene: Scene,
+    kind: str,
+    name: str,
+    stiffness,
+    damping,
+    impedance,
+    width,
+    solref,
+    size: float,
+    num_rows: int = 1,
+    pyramid: float | None = None,
 ) -> Spring:
     return Spring(
         kind,
@@ -115,6 +130,7 @@ def _spring(
         mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
         size,
         num_rows,
+        pyramid,
     )
 
 

@@ -10,6 +10,8 @@ from mjxgrad.diagnostics.onset import LARGEST_JUMP, STEPS_NEEDED
 from mjxgrad.diagnostics.stability.spring import Spring
 from mjxgrad.scene.contact_check import altered_by_refsafe, beyond_stability, format_number, name_pairs
 
+LEAST_FRICTION = 0.01
+"""Of pyramids, in single precision."""
 STEPS_IN_CONTACT = 6.0
 """Time steps below which a bounce is too short for the event gradient, by the experiment `bounce`."""
 _WIDTH = 118  # characters; what a laptop's terminal shows
@@ -31,6 +33,7 @@ class StabilityReport:
         timestep: in s.
         speed: of approach that was asked about, in m/s, or None.
         joint_speed: the same for joints and tendons, in rad/s or m/s.
+        precision: "float32" or "float64".
     """
 
     name: str
@@ -38,6 +41,7 @@ class StabilityReport:
     timestep: float
     speed: float | None = None
     joint_speed: float | None = None
+    precision: str = "float64"
 
     @property
     def largest_load(self) -> float:
@@ -60,6 +64,7 @@ class StabilityReport:
             self._passed,
             self._deep,
             self._unresolved,
+            self._steep,
         )
         found: dict[tuple[str, str], list[Spring]] = {}
         for spring in self.springs:
@@ -147,6 +152,14 @@ class StabilityReport:
     def _needed(self, spring: Spring, speed: float) -> float:
         # At the same damping ratio the depth goes as one over the root of the stiffness.
         return spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
+
+    def _steep(self, spring: Spring) -> str | None:
+        if self.precision == "float64" or spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:
+            return None
+        return (
+            f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does not "
+            f'resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
+        )
 
     def _unresolved(self, spring: Spring) -> str | None:
         speed = self._speed_of(spring)

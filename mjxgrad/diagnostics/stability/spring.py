@@ -35,6 +35,7 @@ class Spring:
         size: by how much it may be passed in one step and still be found: what a ball may move through another body, or
             the range of a limit, in m (rad); infinite for planes and equalities.
         num_rows: contacts that the pair can make at once.
+        pyramid: sliding friction μ of a pyramidal contact; None for all others.
     """
 
     kind: str
@@ -48,6 +49,7 @@ class Spring:
     integrator: mujoco.mjtIntegrator
     size: float
     num_rows: int = 1
+    pyramid: float | None = None
 
     def __str__(self) -> str:
         """The name, as messages print it."""
