@@ -7,6 +7,8 @@ are wide rather than long; as such kernels they were no faster than XLA's, and t
 as one was not compiled after four minutes.) The kernel is Triton's, by way of `jax.experimental.pallas`.
 """
 
+import functools
+import importlib
 from collections.abc import Callable
 
 import jax
@@ -30,7 +32,22 @@ def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *
         leading = jnp.moveaxis(matrix, (0, 1), (-2, -1)), jnp.moveaxis(vector, 0, -1)[..., None]
         factor = jnp.linalg.cholesky(leading[0])
         return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
-    return in_one_kernel(matrix, vector) if jax.default_backend() == "gpu" else written_out(matrix, vector)
+    if _has_kernels():
+        # The program may yet be compiled for the CPU beside the GPU.
+        return jax.lax.platform_dependent(matrix, vector, cuda=in_one_kernel, default=written_out)
+    return written_out(matrix, vector)
+
+
+@functools.cache
+def _has_kernels() -> bool:
+    """Whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
+    if jax.default_backend() != "gpu":
+        return False
+    try:
+        importlib.import_module("jax.experimental.pallas.triton")
+    except ImportError:
+        return False
+    return True
 
 
 def solve_positive_definite(
