@@ -55,7 +55,7 @@ class Row:
 
     @property
     def median(self) -> float:
-        return statistics.median(self.runs)
+        return statistics.median(self.runs) if self.runs else float("nan")
 
 
 def main() -> None:
@@ -64,7 +64,9 @@ def main() -> None:
     parser.add_argument("--scene", nargs="*", choices=list(_SCENES), default=list(_SCENES))
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument(
+        "--runs", type=int, default=5, help="0 compiles and reports memory, which may exceed the machine's"
+    )
     parser.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
     parser.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
     options = parser.parse_args()
@@ -101,7 +103,7 @@ def _measure(name: str, options: argparse.Namespace) -> Iterator[Row]:
         yield _time(f"mg value_and_grad{label}", mg.over_devices(jax.value_and_grad(outcome)), states, runs)
     if not options.skip_patched:
         yield _patched(scene, states, options)
-    if jax.default_backend() == "cpu":
+    if jax.default_backend() == "cpu" and runs:
         yield _native(mj_model, states, options)
 
 
@@ -161,8 +163,9 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
     begin = time.perf_counter()
     compiled = jax.jit(function).lower(states).compile()
     compilation = time.perf_counter() - begin
-    jax.block_until_ready(compiled(states))
     seconds = []
+    if runs:
+        jax.block_until_ready(compiled(states))
     for _ in range(runs):
         begin = time.perf_counter()
         jax.block_until_ready(compiled(states))
@@ -188,9 +191,10 @@ def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], optio
 
 def _format(row: Row, rows: list[Row], options: argparse.Namespace) -> str:
     steps = options.batch * options.steps
+    span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
     memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
     return (
-        f"  {row.name:28s} {row.median * 1e3:9.1f} ms [{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]"
+        f"  {row.name:28s} {row.median * 1e3:9.1f} ms {span}"
         f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / rows[0].median:6.2f} of mjx.step"
         f"  compile {row.compilation:5.1f} s {memory}"
     )
