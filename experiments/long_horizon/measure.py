@@ -43,7 +43,7 @@ def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     found, reference = {}, None
-    for index, name in enumerate(settings.problems):
+    for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)
         workspace.check(one.scene)
         rng = np.random.default_rng([settings.seed, index])

@@ -8,6 +8,7 @@ from pydantic import Field
 from experiments.config import RunSettings
 
 ProblemName = Literal["double_pendulum", "hopper"]
+_PROBLEMS: tuple[ProblemName, ...] = ("double_pendulum", "hopper")
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,7 @@ class Sizes:
     """What a size of the experiment stands for.
 
     Attributes:
+        problems: by name.
         num_times: at which the horizon may end.
         num_repeats: of every estimate.
         num_samples: rollouts of an estimate.
@@ -23,6 +25,7 @@ class Sizes:
         num_adaptive: times up to which the pendulum is integrated with error control.
     """
 
+    problems: tuple[ProblemName, ...]
     num_times: int
     num_repeats: int
     num_samples: int
@@ -37,9 +40,9 @@ class Sizes:
 
 
 SIZES = {
-    "quick": Sizes(16, 16, 8, 512, 8, 4),
-    "default": Sizes(32, 32, 16, 4096, 16, 12),
-    "full": Sizes(48, 64, 128, 131072, 64, 24),
+    "quick": Sizes(("hopper",), 16, 16, 8, 512, 8, 4),
+    "default": Sizes(_PROBLEMS, 32, 32, 16, 4096, 16, 12),
+    "full": Sizes(_PROBLEMS, 48, 64, 128, 131072, 64, 24),
 }
 
 
@@ -48,8 +51,8 @@ class LongHorizonSettings(RunSettings):
 
     size: Literal["quick", "default", "full"] = "default"
     """How many horizons, repeats and samples."""
-    problems: Annotated[tuple[ProblemName, ...], Field(min_length=1, max_length=2)] = ("double_pendulum", "hopper")
-    """To take."""
+    problems: Annotated[tuple[ProblemName, ...], Field(min_length=1, max_length=2)] | None = None
+    """To take, in place of those of the size."""
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.95
     """Of every interval."""
 
