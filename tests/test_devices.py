@@ -14,12 +14,12 @@ import mjxgrad as mg
 
 _PROGRAM = """
     import jax
-
-    jax.config.update("jax_num_cpu_devices", 3)
     import jax.numpy as jnp
     import numpy as np
 
     import mjxgrad as mg
+
+    jax.config.update("jax_num_cpu_devices", 3)  # which fails if importing mjxgrad has used a device
 
 
     def root(x, start):  # a loop that each member leaves at its own time

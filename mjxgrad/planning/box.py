@@ -3,12 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 # Newton steps of the projected method. Each settles bounds that are active for good, or shortens the way by backtracking; two or
 # three suffice for a few controls, and the rest cost nothing beside a step of the dynamics.
 _STEPS = 12
-_SHORTENING = 0.5 ** jnp.arange(8)
+_SHORTENING = 0.5 ** np.arange(8)
 
 
 class BoxMinimum(eqx.Module):
