@@ -1,7 +1,7 @@
 """A batch split over devices, each of which works on its part alone.
 
 XLA runs one small operation after another, and a processor's second core idles most of that time. As two devices
-(`jax.config.update("jax_num_cpu_devices", 2)` before anything else, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
+(`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
 the cores work side by side, and wait for the slowest member of half the batch, not of all. With several GPUs the same call uses
 them all.
 """
