@@ -33,7 +33,7 @@ def over_devices(function: Callable[..., Any], devices: Sequence[jax.Device] | N
         own = jax.devices() if devices is None else list(devices)
         if len(own) == 1:
             return batched(*args)
-        sizes = {x.shape[:1] for x in map(jax.numpy.asarray, jax.tree.leaves(args))}
+        sizes = {np.shape(x)[:1] for x in jax.tree.leaves(args)}
         if len(sizes) != 1 or sizes == {()}:
             raise ValueError("all arguments must have the batch as leading axis, of one size")
         ((size,),) = sizes

@@ -45,6 +45,11 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     return add(a * b for a, b in zip(x, y, strict=True))
 
 
+def diagonal(matrix: Float[Array, "n n *batch"]) -> Float[Array, "n *batch"]:
+    """Return the diagonal."""
+    return jnp.stack([matrix[i, i] for i in range(len(matrix))])
+
+
 def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "contacts 1 *rest"]:
     """Return the sum over the second axis, written out.
 

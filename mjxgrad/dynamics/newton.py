@@ -92,7 +92,7 @@ class Problem(eqx.Module):
     @property
     def diagonal(self) -> Float[Array, "nv *batch"]:
         """The diagonal of M, positive."""
-        return jnp.maximum(jnp.stack([self.mass[i, i] for i in range(len(self.mass))]), mujoco.mjMINVAL)
+        return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
     def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
         """Return the second derivative of the cost, M + Jᵀ s'' J."""
@@ -200,8 +200,7 @@ def minimise(
 def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:
     """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
     newton = -factor.cholesky_solve(hessian, gradient)
-    diagonal = jnp.stack([hessian[i, i] for i in range(len(gradient))])
-    return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / diagonal)
+    return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / linear.diagonal(hessian))
 
 
 class _Search(eqx.Module):
