@@ -51,10 +51,10 @@ class Trajectory(eqx.Module):
         diverged: whether some step gave a non-finite or runaway state.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
         unsolved: number of steps before it whose solve ran into the model's limit of iterations, short of its tolerance, or
-            whose forces, by an estimate of rounding, this precision does not resolve to a thousandth. There the motion is not quite that of the model, and
-            the derivative, which takes the solve for finished, not quite its own. Zero, unless `opt.iterations` is small or, in
-            single precision, pyramids have little friction (below 0.01; elliptic cones hardly have such a limit). Only
-            `rollout` counts it.
+            whose forces, by an estimate of rounding, this precision does not resolve to a thousandth. There the motion is not
+            quite that of the model, and the derivative, which takes the solve for finished, not quite its own. Zero, unless
+            `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
+            hardly have such a limit). Only `rollout` counts it.
     """
 
     qpos: Float[Array, "states nq"]
