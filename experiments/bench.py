@@ -16,7 +16,6 @@ With `--per-core` every core is a device of its own, and each row of JAX's, MJX'
 
 import argparse
 import dataclasses
-import os
 import platform
 import statistics
 import time
@@ -32,6 +31,7 @@ import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
+from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -71,9 +71,9 @@ def main() -> None:
     parser.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
     options = parser.parse_args()
     if options.per_core:
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+        jax.config.update("jax_num_cpu_devices", num_cores())
     print(
-        f"{len(jax.devices())} × {jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores, batch {options.batch}, "
+        f"{len(jax.devices())} × {jax.devices()[0].device_kind}, {num_cores()} cores, batch {options.batch}, "
         f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]; "
         f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}"
     )
@@ -174,7 +174,7 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
 
 
 def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
-    threads = len(os.sched_getaffinity(0))
+    threads = num_cores()
     data = [mujoco.MjData(mj_model) for _ in range(threads)]
     size = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     initial = np.zeros((options.batch, size))

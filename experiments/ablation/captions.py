@@ -1,6 +1,7 @@
 """What the figure shows and how to read it."""
 
 from experiments.ablation.outcome import Outcome
+from experiments.parallel import num_compilers
 
 
 def captions(outcome: Outcome) -> dict[str, str]:
@@ -16,7 +17,8 @@ def captions(outcome: Outcome) -> dict[str, str]:
     return {
         "ratios": (
             "Each as a share of the same scene with everything; left of the line is cheaper. Dots are medians of "
-            f"{sizes.repeats} turns, bars their quartiles; compilation is that of the gradient, once, without a cache. Only "
+            f"{sizes.repeats} turns, bars their quartiles; compilation is that of the gradient, once, without a cache, "
+            f"{num_compilers()} at a time. Only "
             "variants that make another program are drawn: all others are the scene with everything, letter for letter. Open "
             "dots: motion or gradient is another one. "
             f"{sizes.batch} rollouts of {sizes.horizon} steps, started along recorded motions."

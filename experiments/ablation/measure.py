@@ -15,6 +15,7 @@ from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOut
 from experiments.ablation.recording import record, scene_path, segments
 from experiments.ablation.settings import AblationSettings
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, REACHED, Variant, variants
+from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 
 _EPSILON_STEPS = 4  # roundings by which starts are moved, to see what rounding alone changes
@@ -123,15 +124,19 @@ def _compare(
 
     Where two variants make the same program, letter for letter, it is compiled and timed once: nothing could differ.
     """
-    programs: dict[str, _Program] = {}
-    by_text: dict[str, _Program] = {}
+    texts: dict[str, str] = {}
+    lowered: dict[str, tuple[jax.stages.Lowered, float]] = {}
     for variant in found:
-        lowered, seconds = _timed(lambda v=variant: jax.jit(jax.vmap(make(v.scene))).lower(*starts))
-        text = lowered.as_text()
-        if text not in by_text:
-            compiled, more = _timed(lowered.compile)
-            by_text[text] = _Program(compiled, text, seconds + more, _flops(compiled))
-        programs[variant.name] = by_text[text]
+        program, seconds = _timed(lambda v=variant: jax.jit(jax.vmap(make(v.scene))).lower(*starts))
+        texts[variant.name] = program.as_text()
+        lowered.setdefault(texts[variant.name], (program, seconds))
+
+    def finish(text: str) -> _Program:
+        compiled, seconds = _timed(lowered[text][0].compile)
+        return _Program(compiled, text, lowered[text][1] + seconds, _flops(compiled))
+
+    by_text = dict(zip(lowered, in_threads(finish, lowered), strict=True))
+    programs = {name: by_text[text] for name, text in texts.items()}
     results = {text: _numbers(program.run(*starts)) for text, program in by_text.items()}
     times: dict[str, list[float]] = {text: [] for text in by_text}
     for _ in range(repeats):

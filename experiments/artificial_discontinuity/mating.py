@@ -10,6 +10,7 @@ import mjxgrad as mg
 from experiments.artificial_discontinuity.outcome import Mating
 from experiments.artificial_discontinuity.pushes import slopes_at
 from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import jumps_along
 
@@ -44,14 +45,15 @@ def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> 
     Returns:
         One result per geometry.
     """
-    found = []
-    with workspace.stage("mating", "geometries", len(settings.sizes.geometries)) as advance_to:
-        for i, label in enumerate(settings.sizes.geometries):
-            scene = mg.load_scene(_mjcf(label))
-            workspace.check(scene, name=f"mating, {label}")
-            found.append(_mate(settings, label, scene, np.random.default_rng([settings.seed, 100 + i])))
-            advance_to(i + 1)
-    return found
+    scenes = {label: mg.load_scene(_mjcf(label)) for label in settings.sizes.geometries}
+    for label, scene in scenes.items():
+        workspace.check(scene, name=f"mating, {label}")
+
+    def mate(i: int, label: str) -> Mating:
+        return _mate(settings, label, scenes[label], np.random.default_rng([settings.seed, 100 + i]))
+
+    with workspace.stage("mating", "geometries", len(scenes)) as advance_to:
+        return in_threads(lambda one: mate(*one), enumerate(scenes), advance_to)
 
 
 def _mjcf(label: str) -> str:

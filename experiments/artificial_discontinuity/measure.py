@@ -15,6 +15,7 @@ from experiments.artificial_discontinuity.pushes import push_slopes
 from experiments.artificial_discontinuity.reference import overlap_force
 from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.artificial_discontinuity.shapes import HALF, Shape, lattice, shape
+from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Jumps, jumps_along
 
@@ -42,28 +43,25 @@ def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> 
     sizes = settings.sizes
     bodies = {name: shape(name) for name in sizes.shapes} | {count: lattice(count) for count in sizes.lattices}
     shapes = list(bodies.values())
-    statics = []
     with workspace.stage("held bodies", "bodies", len(shapes)) as advance_to:
-        for i, body in enumerate(shapes):
-            statics += [_static(settings, body, name) for name in sizes.paths]
-            advance_to(i + 1)
+        found = in_threads(lambda body: [_static(settings, body, name) for name in sizes.paths], shapes, advance_to)
+    statics = [one for each in found for one in each]
     box = [one for one in statics if one.shape == shapes[0].label]
     with workspace.stage("overlap volumes", "paths", len(sizes.paths)):
         reference = {one.path: _overlap(settings, shapes[0], one.path, one.plain.parameters) for one in box}
         judged = [found for one in box for found in _judged(settings, shapes[0], one)]
-    slopes = []
-    with workspace.stage("pushes", "bodies", len(sizes.pushed)) as advance_to:
-        for i, name in enumerate(sizes.pushed):
-            workspace.check(bodies[name].scene, name=bodies[name].label)
-            slopes += push_slopes(settings, bodies[name], {one.path: _where(one) for one in box}, i)
-            advance_to(i + 1)
+    pushed, places = [bodies[name] for name in sizes.pushed], {one.path: _where(one) for one in box}
+    for body in pushed:
+        workspace.check(body.scene, name=body.label)
+    with workspace.stage("pushes", "bodies", len(pushed)) as advance_to:
+        pushes = in_threads(lambda one: push_slopes(settings, one[1], places, one[0]), enumerate(pushed), advance_to)
     return Outcome(
         settings=settings,
         paths={name: PATHS[name] for name in sizes.paths},
         statics=statics,
         judged=judged,
         reference=reference,
-        slopes=slopes,
+        slopes=[one for each in pushes for one in each],
         matings=mating.measure(settings, workspace),
         friction=_friction(sizes.num_points),
     )

@@ -14,6 +14,7 @@ from experiments.artificial_discontinuity.outcome import Slopes
 from experiments.artificial_discontinuity.paths import PATHS
 from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.artificial_discontinuity.shapes import Shape
+from experiments.parallel import in_threads
 from mjxgrad.diagnostics import jumps_along
 
 _NUM_STEPS = 15  # of 2 ms: the body is still in contact, or has just left it
@@ -85,8 +86,8 @@ def slopes_at(
     shape = (sizes.num_repeats, sizes.num_strata)
     strata = norm.ppf((np.arange(sizes.num_strata) + rng.uniform(size=shape)) / sizes.num_strata)
     every = np.concatenate([noise, strata.ravel()])
-    values, discrete = simulate(place + stddev * every, "discrete")
-    _, event = simulate(place + stddev * every, "event")
+    gradients = ("discrete", "event")
+    (values, discrete), (_, event) = in_threads(lambda name: simulate(place + stddev * every, name), gradients)
     own, repeats = values[: sizes.num_samples], values[sizes.num_samples :].reshape(shape)
     # Less the mean of the others, which keeps it unbiased.
     baseline = (own.sum() - own) / (len(own) - 1)

@@ -52,7 +52,7 @@ _MOST: tuple[ShapeName | int, ...] = ("box", "edges", "balls", "rounded_lattice"
 SIZES = {
     "quick": Sizes(("box", "balls"), ("slide", "roll"), (2, 4, 8), ("box",), _GEOMETRIES[2:], 64, 256, 32, 8),
     "default": Sizes(_ALL, _PATHS, (2, 4, 8, 16), _MOST, _GEOMETRIES, 256, 512, 64, 8),
-    "full": Sizes(_ALL, _PATHS, (2, 4, 8, 16, 32), (*_ALL, 8, 16), _GEOMETRIES, 1024, 4096, 512, 16),
+    "full": Sizes(_ALL, _PATHS, (2, 4, 8, 16, 32), (*_ALL, 8, 16), _GEOMETRIES, 1024, 2048, 256, 16),
 }
 
 

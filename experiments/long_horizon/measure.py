@@ -10,10 +10,11 @@ from jaxtyping import Array, Float, Int
 
 from experiments.long_horizon.adaptive import adaptive
 from experiments.long_horizon.estimates import reference_gradient, zeroth
-from experiments.long_horizon.outcome import BEYOND_CHANCE, ZEROTH, Errors, Found, Outcome
+from experiments.long_horizon.outcome import BEYOND_CHANCE, ZEROTH, Errors, Found, Outcome, Windows
 from experiments.long_horizon.problems import Problem, problem
 from experiments.long_horizon.settings import LongHorizonSettings, Sizes
 from experiments.long_horizon.windows import cut
+from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import crossover, growth, root_mean_square_interval
 
@@ -68,12 +69,10 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
             _chosen(each, np.flatnonzero(np.isfinite(each.states).all(axis=(1, 2)))) for each in (pilot, many)
         )
         reference, reference_error = reference_gradient(one.stddev, _costs(one, pilot), _costs(one, many))
-    first = {}
+    labels = [f"first order, {gradient}" for gradient in one.gradients]
     with workspace.stage(f"{one.title}: estimates", "gradients", len(one.gradients)) as advance_to:
-        for i, gradient in enumerate(one.gradients):
-            rollouts, slopes = _run(one, noise, whole, whole, gradient, batch)
-            first[f"first order, {gradient}"] = (rollouts, slopes)
-            advance_to(i + 1)
+        found = in_threads(lambda gradient: _run(one, noise, whole, whole, gradient, batch), one.gradients, advance_to)
+    first = dict(zip(labels, found, strict=True))
     # What diverged is left out of all estimates alike, and the report says how much that was.
     is_finite = np.all([np.isfinite(slopes).all(axis=(1, 2)) for _, slopes in first.values()], axis=0)
     sizes = dataclasses.replace(sizes, num_samples=int(is_finite.sum()) // sizes.num_repeats)
@@ -96,17 +95,15 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
         params = one.params + jnp.asarray(noise[: sizes.num_jacobians])
         grown = growth(_jacobians(one, params, whole, one.gradients[-1]))
     log_largest = np.asarray(grown.log_largest)
-    windows = {}
+
+    def windows(gradient: str) -> Windows:
+        def again(length: int) -> np.ndarray:
+            return np.asarray(_run(one, noise, length, whole, gradient, batch)[0].tangents)
+
+        return cut(settings, sizes, one, again, many, first[f"first order, {gradient}"][0])
+
     with workspace.stage(f"{one.title}: windows", "gradients", len(one.gradients)) as advance_to:
-        for i, gradient in enumerate(one.gradients):
-
-            def again(length: int, gradient: str = gradient) -> np.ndarray:
-                return np.asarray(_run(one, noise, length, whole, gradient, batch)[0].tangents)
-
-            windows[f"first order, {gradient}"] = cut(
-                settings, sizes, one, again, many, first[f"first order, {gradient}"][0]
-            )
-            advance_to(i + 1)
+        cuts = in_threads(windows, one.gradients, advance_to)
     return Found(
         title=one.title,
         times=times,
@@ -119,7 +116,7 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
         exponents=np.median(np.asarray(grown.exponents(jnp.asarray(times))), axis=0),
         growth_rate=_rate(times, log_largest),
         variance_rate={each.label: _rate(times, np.log(each.variance)[None] / 2)[0] for each in estimators[:-1]},
-        windows=windows,
+        windows=dict(zip(labels, cuts, strict=True)),
         finite=float(is_finite.mean()),
     )
 

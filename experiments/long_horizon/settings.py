@@ -23,6 +23,7 @@ class Sizes:
         num_reference: rollouts of the reference.
         num_jacobians: rollouts whose Jacobians are multiplied.
         num_adaptive: times up to which the pendulum is integrated with error control.
+        batch: rollouts of a call, so that one compilation serves all.
     """
 
     problems: tuple[ProblemName, ...]
@@ -32,17 +33,13 @@ class Sizes:
     num_reference: int
     num_jacobians: int
     num_adaptive: int
-
-    @property
-    def batch(self) -> int:
-        """Rollouts of a call, so that one compilation serves all."""
-        return min(256, self.num_repeats * self.num_samples)
+    batch: int
 
 
 SIZES = {
-    "quick": Sizes(("hopper",), 16, 16, 8, 512, 8, 4),
-    "default": Sizes(_PROBLEMS, 32, 32, 16, 4096, 16, 12),
-    "full": Sizes(_PROBLEMS, 48, 64, 128, 131072, 64, 24),
+    "quick": Sizes(("hopper",), 16, 16, 8, 512, 8, 4, 128),
+    "default": Sizes(_PROBLEMS, 32, 32, 16, 4096, 16, 12, 256),
+    "full": Sizes(_PROBLEMS, 48, 64, 128, 131072, 64, 24, 8192),
 }
 
 

@@ -1,17 +1,17 @@
 """From settings to numbers."""
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from experiments.parallel import in_threads
 from experiments.stability.grid import Points, points
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along
-from experiments.stability.reference import NUM_THREADS, WIDTHS, Course, Reference, direction, simulate
+from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
 from experiments.stability.settings import SIZES, Size, StabilitySettings
 from experiments.workspace import Workspace
@@ -86,7 +86,7 @@ def _precision(name: str) -> Iterator[None]:
 def _run_all(
     cases: list[_Case], precision: str, size: Size, settings: StabilitySettings, workspace: Workspace
 ) -> list[tuple[Run, Run | None, np.ndarray | None]]:
-    """Run the programs of all scenes, two at a time: most of it is compilation, which takes one core each.
+    """Run the programs of all scenes, some at a time: most of it is compilation.
 
     Returns:
         Of each scene the discrete and the event gradient's run, and the differences that judge them.
@@ -95,21 +95,16 @@ def _run_all(
     def run(case: _Case) -> tuple[Run, Run | None, np.ndarray | None]:
         scene, grid, reference, _ = case
         arrays = (reference.fields, reference.qpos, reference.qvel)
-        program = Program(scene, settings.num_steps, "discrete", settings.chunk)
+        program = Program(scene, settings.num_steps, "discrete", size.chunk)
         has_event = size.event is None or scene.name in size.event
-        event = Program(scene, settings.num_steps, "event", settings.chunk).run(*arrays) if has_event else None
+        event = Program(scene, settings.num_steps, "event", size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
         is_judge = precision == "float64"
         truth = _differences(scene, grid, reference, program, settings.num_steps) if is_judge else None
         return program.run(*arrays), event, truth
 
-    done = []
-    stage = workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases))
-    with stage as advance_to, ThreadPoolExecutor(NUM_THREADS) as pool:
-        for result in pool.map(run, cases):
-            done.append(result)
-            advance_to(len(done))
-    return done
+    with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
+        return in_threads(run, cases, advance_to)
 
 
 def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):

@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from experiments.parallel import num_cores
 from experiments.stability.grid import Points
 from experiments.stability.scenes import FIELDS, StabilityScene, configure
 
-NUM_THREADS = 2
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
 WIDTHS = (1e-4, 2e-5)
@@ -95,7 +95,7 @@ def simulate(scene: StabilityScene, points: Points, num_steps: int) -> Reference
     """
     # A simulation that goes wrong is what is looked for; C MuJoCo would write a file about it.
     mujoco.set_mju_user_warning(lambda _: None)
-    slices = [slice(i, None, NUM_THREADS) for i in range(NUM_THREADS)]
+    slices = [slice(i, None, num_cores()) for i in range(num_cores())]
     shifts = direction(scene, num_steps, points.values["timestep"])
 
     def run(which: slice) -> list[tuple]:
@@ -103,7 +103,7 @@ def simulate(scene: StabilityScene, points: Points, num_steps: int) -> Reference
         worker = (scene, model, mujoco.MjData(model))
         return [_run_point(worker, points[i], shifts[0][i], shifts[1][i], num_steps) for i in range(len(points))[which]]
 
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
+    with ThreadPoolExecutor(len(slices)) as pool:
         parts = list(pool.map(run, slices))
     order = np.argsort(np.concatenate([np.arange(len(points))[which] for which in slices]), kind="stable")
     rows = [row for part in parts for row in part]

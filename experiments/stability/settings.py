@@ -17,16 +17,18 @@ class Size:
         num_random: points of a Latin hypercube over all parameters of a scene.
         scenes: by name; None for all.
         event: scenes whose event gradient is looked at, too; None for all.
+        chunk: rollouts that go through a program at once.
     """
 
     resolution: int
     num_random: int
     scenes: tuple[str, ...] | None
     event: tuple[str, ...] | None
+    chunk: int
 
 
 SIZES = {
-    "quick": Size(8, 32, ("ball", "two balls, elliptic"), ()),
+    "quick": Size(8, 32, ("ball", "two balls, elliptic"), (), 256),
     "default": Size(
         12,
         256,
@@ -45,8 +47,9 @@ SIZES = {
             "chain",
         ),
         ("ball", "two balls, pyramidal"),
+        256,
     ),
-    "full": Size(24, 2048, None, None),
+    "full": Size(24, 2048, None, None, 4096),
 }
 
 
@@ -62,8 +65,6 @@ class StabilitySettings(RunSettings):
         "float32",
     )
     """In which mjxgrad runs; C MuJoCo runs in float64."""
-    chunk: Annotated[int, Field(ge=1)] = 256
-    """Rollouts that go through a program at once."""
 
     @model_validator(mode="after")
     def _check(self) -> "StabilitySettings":

@@ -58,12 +58,12 @@ def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> li
         found += [Variant(library, cone=own, precision="float32")] if has_asides else []
         if library == "mg" or everything:
             found += [Variant(library, "RK4", own, batch=batch)]
-            cones: list[Cone] = [name for name in CONES if name != own and has_friction(one) and has_asides]
-            found += [Variant(library, cone=name, batch=batch) for name in cones]
             found += [Variant(library, "implicitfast", own, batch=batch)] if has_own_implicit(one) else []
-        if everything:
-            found += [Variant(library, "RK4", own, "float32", batch)]
-            found += [Variant(library, cone=own, batch=batch, iterations=count) for count in FEW_ITERATIONS]
+    cones: list[Cone] = [name for name in CONES if name != own and has_friction(one) and has_asides]
+    found += [Variant("mg", cone=name, batch=batch) for name in cones]
+    if everything:
+        found += [Variant("mg", "RK4", own, "float32", batch)]
+        found += [Variant("mg", cone=own, batch=batch, iterations=count) for count in FEW_ITERATIONS]
     return found
 
 
@@ -84,7 +84,7 @@ def _course(name: str, one: Case, settings: WorkPrecisionSettings) -> Course:
     programs = compiled(one, variants(one, settings, settings.has_asides(name)))
     compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
-    right = simulation.truths(one, programs, qvel, settings.threads)
+    right = simulation.truths(one, programs, qvel, settings.num_threads)
     points = simulation.measured(one, programs, qvel, right, settings)
     gradient_reference, estimates = gradient.measured(one, programs, settings)
     return Course(

@@ -1,7 +1,7 @@
 """Programs that simulate a batch: few, for what compiles is each scene with each integrator, cone, precision and library.
 
 Time step, number of steps and solver tolerance are arguments. A program is traced in the main thread, where the precision is
-set, and compiled in another, two at a time, since XLA compiles one on a single core.
+set, and compiled in another, several at a time.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import mjxgrad as mg
+from experiments.parallel import num_compilers
 from experiments.work_precision.cases import Case
 from experiments.work_precision.outcome import NUM_ITERATIONS
 from mjxgrad._mjx import mjx
@@ -42,7 +43,6 @@ CONES: dict[Cone, mujoco.mjtCone] = {
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 # And too few, to see what they cost in error.
 FEW_ITERATIONS = (1, 3)
-_AT_A_TIME = 2
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def compiled(case: Case, variants: Sequence[Variant]) -> dict[Variant, Program]:
         By variant.
     """
     waiting: dict[Variant, tuple[mjx.Model, float, Future]] = {}
-    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+    with ThreadPoolExecutor(num_compilers()) as pool:
         for variant in variants:
             begun = time.perf_counter()
             model, lowered = _lowered(case, variant)

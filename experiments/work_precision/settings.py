@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from experiments.config import Positive, RunSettings
+from experiments.parallel import num_cores
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
@@ -31,7 +32,8 @@ class Sizes:
         softenings: factors on the contacts' time constant, beside 1.
         repeats: at most, of every timing.
         seconds: after which a timing is not repeated again, once it has been repeated.
-        has_all_variants: whether MJX is run with every integrator and cone, and single precision too.
+        has_all_variants: whether MJX is run with every integrator, mg.step in single precision with more, and with few
+            iterations.
     """
 
     scenes: tuple[SceneName, ...]
@@ -57,8 +59,8 @@ SIZES = {
         (8, 32, 128), (0.5, 1.0, 2.0), (2.0, 4.0), 5, 0.4, False,
     ),
     "full": Sizes(
-        (*_DEFAULT_SCENES, "half_cheetah", "walker2d", "ant"), None, (0.5, 1.0, 2.0, 4.0, 8.0, 16.0),
-        (1e-2, 1e-4, 1e-6, 1e-8), 1024, 4096, (8, 32, 128, 512), (0.5, 1.0, 2.0, 4.0), (2.0, 4.0, 8.0), 7, 3.0, True,
+        (*_DEFAULT_SCENES, "half_cheetah", "walker2d", "ant"), None, (0.5, 1.0, 2.0, 4.0, 8.0),
+        (1e-2, 1e-4, 1e-6), 1024, 4096, (8, 32, 128, 512), (0.5, 1.0, 2.0, 4.0), (2.0, 4.0, 8.0), 5, 1.0, True,
     ),
 }  # fmt: skip
 
@@ -75,8 +77,8 @@ class WorkPrecisionSettings(RunSettings):
         1e-3,
     )
     """Relative errors for which a setting is recommended."""
-    threads: Annotated[int, Field(ge=1, le=64)] = 2
-    """Of C MuJoCo's rollout."""
+    threads: Annotated[int, Field(ge=1, le=256)] | None = None
+    """Of C MuJoCo's rollout; one for every core, if none is given."""
     tight_tolerance: Positive = 1e-8
     """Of the solver where tolerance is not what is varied; in single precision at least 1e-6, which is what it resolves."""
 
@@ -89,6 +91,11 @@ class WorkPrecisionSettings(RunSettings):
     def scene_names(self) -> tuple[SceneName, ...]:
         """Give the scenes to run."""
         return self.sizes.scenes if self.scenes is None else self.scenes
+
+    @property
+    def num_threads(self) -> int:
+        """Give the number of threads of C MuJoCo's rollout."""
+        return self.threads or num_cores()
 
     def has_asides(self, name: str) -> bool:
         """Say whether a scene is looked at in every way that the size has."""

@@ -204,7 +204,7 @@ def _c_points(
     integrator: Integrator = "Euler",
     iterations: int = NUM_ITERATIONS,
 ) -> list[Point]:
-    threads, simulated = (settings.threads if len(qvel) > 1 else 1), len(qvel) * case.duration
+    threads, simulated = (settings.num_threads if len(qvel) > 1 else 1), len(qvel) * case.duration
     points = []
     for knobs in every:
         runs = [

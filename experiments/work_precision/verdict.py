@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from experiments.parallel import num_compilers
 from experiments.report import Table, quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Outcome, Point
@@ -68,7 +69,8 @@ def findings(outcome: Outcome) -> list[str]:
     programs = sum(course.num_programs for course in outcome.courses)
     seconds = sum(course.compile_wall_seconds for course in outcome.courses)
     sentences.append(
-        f"{programs} programs were compiled, two at a time, in {seconds:.0f} s (less where a former run had compiled them)."
+        f"{programs} programs were compiled, {num_compilers()} at a time, in {seconds:.0f} s (less where a former run had "
+        "compiled them)."
     )
     return sentences
 
@@ -119,10 +121,9 @@ def batches(outcome: Outcome) -> Table:
         "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
         f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). A "
         "dash: not tried on this scene. The figures are about batches, which MJX is made for, and so are estimators. "
-        "Seconds to trace and compile one program, two at a time. Then how far the other cone's motion ends, and MJX's from "
-        "C MuJoCo's; last what is known of the reference "
-        "gradient: standard error, change with the last halving of the step, distance to the same gradient by differences of "
-        "smoothed outcomes."
+        f"Seconds to trace and compile one program, {num_compilers()} at a time. Then how far the other cone's motion ends, "
+        "and MJX's from C MuJoCo's; last what is known of the reference gradient: standard error, change with the last "
+        "halving of the step, distance to the same gradient by differences of smoothed outcomes."
     )
     return Table(columns, rows, caption)
 
@@ -217,7 +218,7 @@ def _over(ratios: list[float], outcome: Outcome) -> str:
 
 
 def _threads(outcome: Outcome) -> str:
-    count = outcome.settings.threads
+    count = outcome.settings.num_threads
     return f"{count} threads" if count > 1 else "one thread"
 
 

@@ -1,0 +1,47 @@
+"""Several programs at once: XLA compiles each of them mostly on one core, and leaves Python to the others meanwhile."""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+_Item, _Result = TypeVar("_Item"), TypeVar("_Result")
+
+# Programs that are compiled side by side, at most: the largest take a gigabyte each.
+_MOST = 8
+
+
+def num_cores() -> int:
+    """Count the cores that this process may use."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+
+
+def num_compilers() -> int:
+    """Say how many programs to compile side by side: one per core, and no more than memory has room for."""
+    return min(num_cores(), _MOST)
+
+
+def in_threads(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], advance_to: Callable[[int], None] | None = None
+) -> list[_Result]:
+    """Call a function on every item, as many at a time as programs are compiled.
+
+    Args:
+        function: which spends its time compiling, or in compiled programs.
+        items: what it is called on.
+        advance_to: is told how many are done, in order.
+
+    Returns:
+        What it returned, in the order of the items.
+
+    Raises:
+        Exception: the first that a call raised.
+    """
+    done = []
+    with ThreadPoolExecutor(num_compilers()) as pool:
+        for result in pool.map(function, items):
+            done.append(result)
+            if advance_to is not None:
+                advance_to(len(done))
+    return done
