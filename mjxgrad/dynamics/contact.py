@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import COLLISION_FUNCTIONS, custom_number, geom_groups, mjx
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.impedance import impedance, is_square
 from mjxgrad.dynamics.jacobian import ContactRows, DenseRows, RowMap, Side
 
 
@@ -92,7 +92,8 @@ def _pyramids(
     def spread(x: Array) -> Array:
         return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
 
-    resistance = jax.tree.map(spread, impedance(contact.solimp, residual))
+    is_parabola = is_square(model.geom_solimp, model.pair_solimp)
+    resistance = jax.tree.map(spread, impedance(contact.solimp, residual, is_square=is_parabola))
     residual = spread(residual)
     return Block(
         map=rows,
@@ -113,6 +114,7 @@ def _pyramids(
 def _cones(model: mjx.Model, contact: Any, rows: RowMap, inverse_weight: Float[Array, " contacts"], dim: int) -> Block:
     """Return the normal row and the rows of friction of each contact, elliptic or frictionless."""
     distance = contact.dist - contact.includemargin
+    is_parabola = is_square(model.geom_solimp, model.pair_solimp)
     count = len(distance)
     residual = jnp.zeros((count, dim), distance.dtype).at[:, 0].set(distance)
     weights, solref = [inverse_weight[:, None]], [contact.solref[:, None]]
@@ -130,7 +132,7 @@ def _cones(model: mjx.Model, contact: Any, rows: RowMap, inverse_weight: Float[A
     return Block(
         map=rows,
         residual=residual.reshape(-1),
-        impedance=jax.tree.map(spread, impedance(contact.solimp, distance)),
+        impedance=jax.tree.map(spread, impedance(contact.solimp, distance, is_square=is_parabola)),
         solimp=spread(contact.solimp),
         inverse_weight=jnp.concatenate(weights, axis=1).reshape(-1),
         solref=jnp.concatenate(solref, axis=1).reshape(-1, 2),

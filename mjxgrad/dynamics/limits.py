@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import rotation
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.impedance import impedance
+from mjxgrad.dynamics.impedance import impedance, is_square
 from mjxgrad.dynamics.jacobian import AxisRows, DenseRows, JoinedRows, RowMap
 
 
@@ -52,13 +52,14 @@ def _limit(
     inverse_weight: Float[Array, " rows"],
     solref: Float[Array, "rows 2"],
     solimp: Float[Array, "rows 5"],
+    is_parabola: bool,
 ) -> Block:
     residual = distance - margin
     zero = jnp.zeros_like(residual)
     return Block(
         map,
         residual,
-        impedance(solimp, residual),
+        impedance(solimp, residual, is_square=is_parabola),
         solimp,
         inverse_weight,
         solref,
@@ -89,6 +90,7 @@ def ball_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
         inverse_weight=model.dof_invweight0[dofs],
         solref=model.jnt_solref[joints],
         solimp=model.jnt_solimp[joints],
+        is_parabola=is_square(model.jnt_solimp),
     )
 
 
@@ -108,6 +110,7 @@ def joint_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
         inverse_weight=model.dof_invweight0[dofs],
         solref=model.jnt_solref[joints],
         solimp=model.jnt_solimp[joints],
+        is_parabola=is_square(model.jnt_solimp),
     )
 
 
@@ -124,6 +127,7 @@ def tendon_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
         inverse_weight=model.tendon_invweight0[tendons],
         solref=model.tendon_solref_lim[tendons],
         solimp=model.tendon_solimp_lim[tendons],
+        is_parabola=is_square(model.tendon_solimp_lim),
     )
 
 

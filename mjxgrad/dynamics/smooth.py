@@ -14,6 +14,8 @@ References:
     MuJoCo documentation, "Computation", "General framework".
 """
 
+import functools
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -21,6 +23,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics.orientation import Orientation, orientation
 from mjxgrad.dynamics.spatial import combine, contract, pick
 
 _Joint = mujoco.mjtJoint
@@ -40,33 +43,33 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """
     frames = tree.frames(model)
     qpos, turn, way, origin = _joint_motion(model, data.qpos)
-    quat, mat = _orientations(model, data, frames, turn)
+    turned = orientation(model, data, frames, turn)
     fixed = spatial.rotation_matrix(pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY))
     is_free = (model.jnt_type == _Joint.mjJNT_FREE)[:, None]
     axis = jnp.where(is_free, jnp.asarray(_UP, qpos.dtype), spatial.rotate(fixed, model.jnt_axis))
     before = np.concatenate([frames.before_body, frames.before_joint, frames.before_joint])
     local = jnp.concatenate([model.body_pos, spatial.rotate(fixed, model.jnt_pos), axis])
-    turned = spatial.rotate(pick(before, mat, np.eye(3)), local)
-    from_parent, to_anchor, axis = jnp.split(turned, [model.nbody, model.nbody + model.njnt])
+    from_parent, to_anchor, axis = jnp.split(turned.rotate(before, local), [model.nbody, model.nbody + model.njnt])
     if model.nmocap:
         is_mocap = (model.body_mocapid >= 0)[:, None]
         from_parent = jnp.where(is_mocap, pick(model.body_mocapid, data.mocap_pos), from_parent)
     moved = origin + spatial.scale(way, axis)
-    moved -= spatial.rotate(pick(frames.after_joint, mat), model.jnt_pos)
+    moved -= turned.rotate(frames.after_joint, model.jnt_pos * (frames.after_joint >= 0)[:, None])
     of_bodies, of_anchors = tree.displacements(model)
     steps = jnp.concatenate([from_parent, to_anchor, moved])
     positions = combine(np.concatenate([of_bodies, of_anchors]), steps)
     xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
-    xquat, xmat = pick(frames.of_body, quat), pick(frames.of_body, mat)
-    bodies = np.arange(model.nbody)
-    xipos, ximat = _place(bodies, xpos, xmat, model.body_ipos, model.body_iquat)
+    place = functools.partial(_place, turned, frames, xpos)
+    xmat = turned.compose(frames.of_body, jnp.broadcast_to(jnp.eye(3, dtype=xpos.dtype), (model.nbody, 3, 3)))
+    xquat = turned.quaternions(frames.of_body)
+    xipos, ximat = place(np.arange(model.nbody), model.body_ipos, model.body_iquat)
     data = data.replace(qpos=qpos, xanchor=xanchor, xaxis=axis, xpos=xpos, xquat=xquat, xmat=xmat)
     data = data.replace(xipos=xipos, ximat=ximat)
     if model.ngeom:
-        placed = _place(model.geom_bodyid, xpos, xmat, model.geom_pos, model.geom_quat)
+        placed = place(model.geom_bodyid, model.geom_pos, model.geom_quat)
         data = data.replace(geom_xpos=placed[0], geom_xmat=placed[1])
     if model.nsite:
-        placed = _place(model.site_bodyid, xpos, xmat, model.site_pos, model.site_quat)
+        placed = place(model.site_bodyid, model.site_pos, model.site_quat)
         data = data.replace(site_xpos=placed[0], site_xmat=placed[1])
     return data
 
@@ -102,39 +105,17 @@ def _joint_motion(
     return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
 
 
-def _orientations(
-    model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
-) -> tuple[Float[Array, "turns 4"], Float[Array, "turns 3 3"]]:
-    """Return quaternions and matrices after each turn, in the world.
-
-    Both are carried through the products, so that XLA can remove the quaternions where nobody reads them.
-    """
-    has_joint = frames.joint >= 0
-    own = pick(frames.joint, turn, _IDENTITY * (frames.mocap < 0)[:, None])
-    if model.nmocap:
-        own += pick(frames.mocap, spatial.normalise(data.mocap_quat))
-    quat = own
-    if (frames.body >= 0).any():
-        fixed = pick(frames.body, model.body_quat, _IDENTITY)
-        quat = spatial.multiply(fixed, own) if has_joint.any() else fixed
-    mat = spatial.rotation_matrix(quat)
-    for jump in frames.jumps:
-        quat = spatial.multiply(pick(jump, quat, _IDENTITY), quat)
-        mat = spatial.compose(pick(jump, mat, np.eye(3)), mat)
-    return quat, mat
-
-
 def _place(
-    body: np.ndarray,
+    turned: Orientation,
+    frames: tree.Frames,
     xpos: Float[Array, "nbody 3"],
-    xmat: Float[Array, "nbody 3 3"],
+    body: np.ndarray,
     pos: Float[Array, "n 3"],
     quat: Float[Array, "n 4"],
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
     """Return world position and orientation of what is fixed to bodies."""
-    mat = pick(body, xmat)
-    placed = pick(body, xpos) + spatial.rotate(mat, pos)
-    return placed, spatial.compose(mat, spatial.rotation_matrix(quat))
+    last = frames.of_body[body]
+    return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:

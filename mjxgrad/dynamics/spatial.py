@@ -120,7 +120,19 @@ def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
 
 def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Return items times a factor each."""
-    return Bilinear(np.eye(x.shape[1])[:, None])(factor[:, None], x)
+    return _scale(factor, x)
+
+
+@jax.custom_jvp
+def _scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    return factor[:, None] * x
+
+
+@_scale.defjvp
+def _scale_jvp(primals, tangents):
+    (factor, x), (change, dx) = primals, tangents
+    scaled = Bilinear(np.eye(x.shape[1])[:, None])
+    return _scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
 
 
 def rotate(matrix: Float[Array, "n 3 3"], x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

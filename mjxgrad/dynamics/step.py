@@ -16,7 +16,6 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
@@ -28,6 +27,7 @@ from mjxgrad.dynamics.implicit import System
 from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows
+from mjxgrad.dynamics.known import is_known_to_be
 from mjxgrad.smoothing import Smoothing
 
 _Disable = mujoco.mjtDisableBit
@@ -252,18 +252,15 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     (M + h D) a' = M a, and M a the sum of all forces, is a' = a - (M + h D)⁻¹ h D a: so the forces need not be added up, nor
     their derivatives.
     """
-    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or _is_zero(model.dof_damping):
+    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or is_known_to_be(
+        0, model.dof_damping
+    ):
         return data.qacc
     damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
     slowed = factor.solve_positive_definite(
         inertia.matrix + jnp.diag(damping), damping * data.qacc, lambda x: inertia.apply(x) + damping * x
     )
     return data.qacc - slowed
-
-
-def _is_zero(values: Array) -> bool:
-    """Whether numbers are known to be zero: those of a model that is an argument are not known."""
-    return not isinstance(values, jax.core.Tracer) and not np.any(np.asarray(values))
 
 
 def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
