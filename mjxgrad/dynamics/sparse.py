@@ -5,6 +5,7 @@ is compiled: those between its two bodies. Arrays may carry the batch as trailin
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -42,7 +43,8 @@ class SparseRows(eqx.Module):
         for group, entries in zip(rows.groups, rows.directions(), strict=True):
             active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
             active = active[:, :1] if group.is_pyramid else active
-            pieces.append(jnp.where(active[:, :, None], entries, 0.0))
+            # A barrier, since XLA computes the entries once for each shape in which they are read.
+            pieces.append(jax.lax.optimization_barrier(jnp.where(active[:, :, None], entries, 0.0)))
             start += group.num_rows
         return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)
 

@@ -151,7 +151,7 @@ def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, 
 
 @jax.custom_jvp
 def _compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
-    return _product(p.reshape(-1, 9), q.reshape(-1, 9)).reshape(-1, 3, 3)
+    return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
 
 @_compose.defjvp
