@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad.dynamics.known import is_known_to_be
@@ -22,7 +23,7 @@ class Impedance(eqx.Module):
     onset: Float[Array, "*rows"]
 
 
-def is_square(*solimps: Float[Array, "*n 5"]) -> bool:
+def is_square(*solimps: Float[Array | np.ndarray, "_ 5"]) -> bool:
     """Return whether the power laws of a model's rows are known to be parabolas."""
     return all(is_known_to_be(2.0, solimp, column=4) for solimp in solimps)
 

@@ -17,21 +17,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
-_LONGEST_SUM = 64
+LONGEST_SUM = 64
 
 
 def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
     """Return matrix x."""
     if matrix.ndim == 2:
         return matrix @ x
-    if matrix.shape[1] > _LONGEST_SUM:
+    if matrix.shape[1] > LONGEST_SUM:
         return jnp.einsum("mn...,n...->m...", matrix, x, precision="highest")
     return add(matrix[:, i] * x[i] for i in range(matrix.shape[1]))
 
 
 def rmatvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
     """Return matrixᵀ x."""
-    if matrix.ndim == 2 or len(matrix) > _LONGEST_SUM:
+    if matrix.ndim == 2 or len(matrix) > LONGEST_SUM:
         return matvec(jnp.swapaxes(matrix, 0, 1), x)
     return add(row * factor for row, factor in zip(matrix, x, strict=True))
 
@@ -40,7 +40,7 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     """Return the inner product."""
     if x.ndim == 1:
         return jnp.sum(x * y)
-    if len(x) > _LONGEST_SUM:
+    if len(x) > LONGEST_SUM:
         return jnp.sum(x * y, axis=0)
     return add(a * b for a, b in zip(x, y, strict=True))
 
@@ -61,7 +61,7 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
 
 def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
     """Return leftᵀ right."""
-    if left.ndim > 2 and len(left) <= _LONGEST_SUM:
+    if left.ndim > 2 and len(left) <= LONGEST_SUM:
         return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
@@ -110,12 +110,15 @@ def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[
         if has_batch:
             by_type.setdefault(leaves[place].dtype, []).append(place)
     for places in by_type.values():
-        rows = jnp.concatenate([leaves[place].reshape(size, -1) for place in places], axis=1).T
-        start = 0
+        # One array under two names is moved once.
+        distinct = {id(leaves[place]): leaves[place] for place in places}
+        rows = jnp.concatenate([leaf.reshape(size, -1) for leaf in distinct.values()], axis=1).T
+        start, found = 0, {}
+        for name, leaf in distinct.items():
+            stop = start + math.prod(leaf.shape[1:])
+            found[name], start = rows[start:stop].reshape(*leaf.shape[1:], size), stop
         for place in places:
-            shape = leaves[place].shape[1:]
-            stop = start + math.prod(shape)
-            moved[place], start = rows[start:stop].reshape(*shape, size), stop
+            moved[place] = found[id(leaves[place])]
     return moved  # pyright: ignore[reportReturnType]
 
 

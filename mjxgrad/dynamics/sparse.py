@@ -5,7 +5,6 @@ is compiled: those between its two bodies. Arrays may carry the batch as trailin
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -43,8 +42,7 @@ class SparseRows(eqx.Module):
         for group, entries in zip(rows.groups, rows.directions(), strict=True):
             active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
             active = active[:, :1] if group.is_pyramid else active
-            # A barrier, since XLA computes the entries once for each shape in which they are read.
-            pieces.append(jax.lax.optimization_barrier(jnp.where(active[:, :, None], entries, 0.0)))
+            pieces.append(jnp.where(active[:, :, None], entries, 0.0))
             start += group.num_rows
         return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)
 
@@ -56,7 +54,7 @@ class SparseRows(eqx.Module):
             if group.is_diagonal:
                 along = entries[:, :, 0] * moving[:, None]
             else:
-                along = linear.matvec(flat(entries), moving).reshape(group.num, group.dim, *x.shape[1:])
+                along = linear.add(entries[:, :, k] * moving[k] for k in range(len(moving)))
             rows.append(edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
         return jnp.concatenate(rows)
 
@@ -67,7 +65,7 @@ class SparseRows(eqx.Module):
             own = force[start : start + group.num_rows].reshape(group.num, group.rows_each, *force.shape[1:])
             start += group.num_rows
             push = fold(own, tilt)
-            part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else linear.rmatvec(flat(entries), flat(push))
+            part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else _over_rows(entries, push)
             total = linear.add_at(total, group.dofs, part)
         return total
 
@@ -84,17 +82,40 @@ class SparseRows(eqx.Module):
             rows = slice(start, start + group.num_rows)
             start = rows.stop
             if rows.start >= layout.simple_stop:
-                square = linear.gram(flat(entries), flat(_cone_product(layout, bend, rows, entries)))
+                square = _gram(entries, _cone_product(layout, bend, rows, entries))
             elif group.is_diagonal:
                 total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * bend.simple[rows])
                 continue
             elif tilt is None:
-                own = flat(entries)
-                square = linear.gram(own, bend.simple[rows][:, None] * own)
+                bent = bend.simple[rows].reshape(*entries.shape[:2], 1, *mass.shape[2:])
+                square = _gram(entries, bent * entries)
             else:
                 square = _pyramid_square(bend.simple[rows].reshape(*tilt.shape[:2], 2, *mass.shape[2:]), tilt, entries)
             total = linear.add_to_block(total, group.dofs, square)
         return total
+
+
+def _gram(
+    left: Float[Array, "num dim dofs *batch"], right: Float[Array, "num dim dofs *batch"]
+) -> Float[Array, "dofs dofs *batch"]:
+    """Return leftᵀ right."""
+    if left.ndim == 3 or left.shape[0] * left.shape[1] > linear.LONGEST_SUM:
+        return linear.gram(flat(left), flat(right))
+    return linear.add(a[:, None] * b[None] for a, b in zip(_rows(left), _rows(right), strict=True))
+
+
+def _over_rows(
+    entries: Float[Array, "num dim dofs *batch"], force: Float[Array, "num dim *batch"]
+) -> Float[Array, "dofs *batch"]:
+    """Return entriesᵀ force."""
+    if entries.ndim == 3 or entries.shape[0] * entries.shape[1] > linear.LONGEST_SUM:
+        return linear.rmatvec(flat(entries), flat(force))
+    return linear.add(a * f for a, f in zip(_rows(entries), _rows(force), strict=True))
+
+
+def _rows(entries: Array) -> list[Array]:
+    """Return all rows, one by one. As one array of another shape XLA would compute the entries again for it."""
+    return [entries[i, k] for i in range(entries.shape[0]) for k in range(entries.shape[1])]
 
 
 def _pyramid_square(
@@ -107,7 +128,7 @@ def _pyramid_square(
     normal, tangents = entries[:, 0], entries[:, 1:]
     of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
     of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
-    return linear.gram(normal, of_normal) + linear.gram(flat(tangents), flat(of_tangents))
+    return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
 
 
 def _cone_product(

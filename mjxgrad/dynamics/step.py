@@ -253,7 +253,7 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     their derivatives.
     """
     if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or is_known_to_be(
-        0, model.dof_damping
+        0.0, model.dof_damping
     ):
         return data.qacc
     damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
