@@ -201,7 +201,7 @@ def chains(model: mjx.Model, frames: tree.Frames) -> Chains | None:
         sums[t, joint] = sign
     c = np.array([rotation.as_matrix() for rotation in fixed])
     along = axis[:, :, None] * axis[:, None]
-    is_turning = sums.any(axis=1)[:, None, None]
+    is_turning = (sums != 0).sum(axis=1)[:, None, None] > 0
     quaternion = np.array([rotation.as_quat(scalar_first=True) for rotation in fixed])
     return Chains(
         sums=sums,
