@@ -134,8 +134,8 @@ def rotate(matrix: Float[Array, "n 3 3"], x: Float[Array, "n 3"]) -> Float[Array
 def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
     """Return the matrix product of each item.
 
-    Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices takes a
-    tenth of a step longer (CPU); a product for the derivative, which written out is longer to compile.
+    Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices
+    takes a tenth of a step longer (CPU); a product for the derivative, which written out is longer to compile.
     """
     return _compose(p, q)
 
