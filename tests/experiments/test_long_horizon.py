@@ -15,7 +15,7 @@ from experiments.long_horizon.problems import problem
 from experiments.long_horizon.settings import Sizes
 
 STDDEV = 0.3
-SIZES = Sizes((), 2, 400, 16, 0, 0, 0)
+SIZES = Sizes((), 2, 400, 16, 0, 0, 0, 16)
 
 
 def costs(noise):
