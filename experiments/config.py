@@ -136,10 +136,12 @@ def _apply(table: dict[str, Any], override: str) -> str | None:
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
-        # A shell eats the quotes of a TOML string, so a bare word stands for one.
-        if not re.fullmatch(r"[A-Za-z_][\w./-]*", value):
+        # A shell eats the quotes of a TOML string, so a bare word stands for one, alone or in a list.
+        words = value[1:-1].split(",") if value.startswith("[") and value.endswith("]") else [value]
+        words = [word.strip() for word in words]
+        if not all(re.fullmatch(r"[A-Za-z_][\w./-]*", word) for word in words):
             return f"{override}: {value or 'nothing'} is not a TOML value"
-        parsed = value
+        parsed = words if value.startswith("[") else value
     if isinstance(table.get("sweep"), dict):
         table["sweep"].pop(key, None)
     return _assign(table, key.split("."), parsed)

@@ -98,6 +98,14 @@ def test_overrides_are_toml_and_a_bare_word_is_a_string(write):
     assert run.settings.include_default is False
 
 
+def test_bare_words_in_a_list_are_strings():
+    """What is left of scenes=["hopper","reacher"] after a shell."""
+    (run,) = load_runs("ablation", ["scenes=[hopper,reacher]"])
+    assert run.settings.scenes == ("hopper", "reacher")
+    (found,) = mistakes("ablation", "scenes=[hoper]")
+    assert found == 'scenes[0]: there is no "hoper"; did you mean "hopper"?'
+
+
 def test_a_sweep_is_every_combination_with_its_last_key_changing_fastest(write):
     runs = load_runs(write(VALID + "[sweep]\nseed = [0, 1]\nstddev = [0.1, 0.2, 0.3]\n"), [])
     assert [(run.settings.seed, run.settings.stddev) for run in runs] == [
