@@ -209,10 +209,5 @@ def chains(model: mjx.Model, frames: tree.Frames) -> Chains | None:
         odd=np.cross(axis[:, :, None], c, axis=1),
         constant=np.where(is_turning, along @ c, c),
         quaternion=quaternion,
-        turned_quaternion=_quaternion_product(np.column_stack([np.zeros(count), axis]), quaternion),
+        turned_quaternion=np.einsum("kij,ni,nj->nk", spatial.QUATERNION[:, 1:], axis, quaternion),
     )
-
-
-def _quaternion_product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    real = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
-    return np.concatenate([real, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])], axis=1)

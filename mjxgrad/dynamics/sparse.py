@@ -54,7 +54,7 @@ class SparseRows(eqx.Module):
             if group.is_diagonal:
                 along = entries[:, :, 0] * moving[:, None]
             else:
-                along = linear.add(entries[:, :, k] * moving[k] for k in range(len(moving)))
+                along = _over_dofs(entries, moving)
             rows.append(edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
         return jnp.concatenate(rows)
 
@@ -102,6 +102,15 @@ def _gram(
     if left.ndim == 3 or left.shape[0] * left.shape[1] > linear.LONGEST_SUM:
         return linear.gram(flat(left), flat(right))
     return linear.add(a[:, None] * b[None] for a, b in zip(_rows(left), _rows(right), strict=True))
+
+
+def _over_dofs(
+    entries: Float[Array, "num dim dofs *batch"], x: Float[Array, "dofs *batch"]
+) -> Float[Array, "num dim *batch"]:
+    """Return entries x."""
+    if entries.ndim == 3 or len(x) > linear.LONGEST_SUM:
+        return linear.matvec(flat(entries), x).reshape(*entries.shape[:2], *x.shape[1:])
+    return linear.add(entries[:, :, k] * one for k, one in enumerate(x))
 
 
 def _over_rows(

@@ -36,7 +36,7 @@ def _quaternion_table() -> np.ndarray:
 def _rotation_table() -> np.ndarray:
     """Return the table of the matrix of v ↦ q v q*, with each pair of entries of q once."""
     conjugate = np.array([1, -1, -1, -1])
-    turned = np.einsum("man,nlb,b->malb", _QUATERNION, _QUATERNION, conjugate)
+    turned = np.einsum("man,nlb,b->malb", QUATERNION, QUATERNION, conjugate)
     table = turned[1:, :, 1:].transpose(0, 2, 1, 3).reshape(9, 4, 4)
     return np.triu(table + np.tril(table, -1).transpose(0, 2, 1))
 
@@ -70,9 +70,9 @@ def _steiner_table() -> np.ndarray:
 
 
 _CROSS = _cross_table()
-_QUATERNION = _quaternion_table()
+QUATERNION = _quaternion_table()
 _cross = Bilinear(_CROSS)
-_multiply = Bilinear(_QUATERNION)
+_multiply = Bilinear(QUATERNION)
 _rotation = Bilinear(_rotation_table())
 _cross_motion = Bilinear(_motion_table())
 _cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
