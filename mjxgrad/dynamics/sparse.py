@@ -51,10 +51,7 @@ class SparseRows(eqx.Module):
         rows = []
         for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
             moving = linear.take(x, group.dofs)
-            if group.is_diagonal:
-                along = entries[:, :, 0] * moving[:, None]
-            else:
-                along = _over_dofs(entries, moving)
+            along = entries[:, :, 0] * moving[:, None] if group.is_diagonal else _over_dofs(entries, moving)
             rows.append(edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
         return jnp.concatenate(rows)
 
