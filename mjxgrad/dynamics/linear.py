@@ -78,7 +78,9 @@ def batch_last(function, batch: int | None = None):
 
     @functools.wraps(function)
     def wrapped(*args):
-        batched = jax.custom_batching.custom_vmap(function)
+        # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
+        # `jax.lax.cond` asks for where its condition differs between members of the batch.
+        batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
         @batched.def_vmap
         def rule(size, is_batched, *args):

@@ -223,3 +223,21 @@ def test_a_batch_is_its_members():
     together = jax.jit(jax.vmap(outcome))(velocities)
     alone = jnp.stack([jax.jit(outcome)(v) for v in velocities])
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
+
+
+def test_a_batch_whose_members_choose_whether_to_step():
+    """`jax.lax.cond` on a condition that differs, as of environments of which some are done, is a choice of either."""
+    model, data = _sliding()
+    velocities = jnp.array([-0.5, -0.2, 0.1])
+
+    def stepped(v):
+        return mg.step(model, data.replace(qvel=jnp.stack([v, v]))).qvel[0]
+
+    def chosen(v):
+        return jax.lax.cond(v > -0.3, stepped, lambda v: v, v)
+
+    def either(v):
+        return jnp.where(v > -0.3, stepped(v), v)
+
+    found, wanted = (jax.jit(jax.vmap(jax.value_and_grad(f)))(velocities) for f in (chosen, either))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
