@@ -1,8 +1,10 @@
-"""Several programs at once: XLA compiles each of them mostly on one core, and leaves Python to the others meanwhile."""
+"""Several at once: threads for programs, which XLA compiles mostly on one core each and without Python; processes for Python."""
 
+import multiprocessing
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 _Item, _Result = TypeVar("_Item"), TypeVar("_Result")
@@ -45,3 +47,10 @@ def in_threads(
             if advance_to is not None:
                 advance_to(len(done))
     return done
+
+
+@contextmanager
+def processes() -> Iterator[ProcessPoolExecutor]:
+    """Give one process per core, each begun afresh: one that is forked from a process with JAX's threads may hang."""
+    with ProcessPoolExecutor(num_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool

@@ -2,20 +2,28 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from experiments.parallel import in_threads
+from experiments.parallel import in_threads, processes
 from experiments.stability.grid import Points, points
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
-from experiments.stability.program import Program, Run, along
+from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
 from experiments.stability.settings import SIZES, Size, StabilitySettings
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics.stability import Motion, MotionRecord, classify_derivative, classify_motion, soundness
+from mjxgrad.diagnostics.stability import (
+    UNSOLVED,
+    Motion,
+    MotionRecord,
+    classify_derivative,
+    classify_motion,
+    soundness,
+)
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
 
 _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
@@ -26,6 +34,21 @@ _EVENT_TOLERANCE = 0.1
 
 
 _Case = tuple[StabilityScene, Points, Reference, np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """What mjxgrad did on all points of a scene in one precision.
+
+    Attributes:
+        discrete: motion and discrete gradient.
+        event: the same with the event gradient; None where it was not asked for.
+        differences: of the outcome (start and parameters, widths, points), in float64.
+    """
+
+    discrete: Run
+    event: Run | None
+    differences: np.ndarray | None
 
 
 def largest(num_steps: int) -> float:
@@ -52,9 +75,9 @@ def measure(settings: StabilitySettings, workspace: Workspace) -> Outcome:
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
     grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]
     references = []
-    with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to:
+    with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to, processes() as pool:
         for scene, grid in zip(scenes, grids, strict=True):
-            references.append(simulate(scene, grid, settings.num_steps))
+            references.append(simulate(scene, grid, settings.num_steps, pool))
             advance_to(len(references))
     expected = [_expected(scene, grid) for scene, grid in zip(scenes, grids, strict=True)]
     cases = list(zip(scenes, grids, references, expected, strict=True))
@@ -65,10 +88,12 @@ def measure(settings: StabilitySettings, workspace: Workspace) -> Outcome:
         with _precision(precision):
             runs = _run_all(cases, precision, size, settings, workspace)
         if precision == "float64":
-            truths = [truth for _, _, truth in runs if truth is not None]
-        for i, (case, (discrete, event, _)) in enumerate(zip(cases, runs, strict=True)):
-            behaviours[i][precision] = _of_mjxgrad(*case, discrete, event, truths[i], precision, settings)
-            apart[i][precision] = _apart(case[1], discrete.course, case[2].course, settings.num_steps)
+            truths = [run.differences for run in runs if run.differences is not None]
+        else:
+            runs = _judge_solves(cases, runs, size.chunk, workspace)
+        for i, (case, run) in enumerate(zip(cases, runs, strict=True)):
+            behaviours[i][precision] = _of_mjxgrad(*case, run, truths[i], precision, settings)
+            apart[i][precision] = _apart(case[1], run.discrete.course, case[2].course, settings.num_steps)
     found = zip(scenes, grids, behaviours, apart, strict=True)
     return Outcome(settings, [SceneOutcome(*one) for one in found])
 
@@ -85,14 +110,10 @@ def _precision(name: str) -> Iterator[None]:
 
 def _run_all(
     cases: list[_Case], precision: str, size: Size, settings: StabilitySettings, workspace: Workspace
-) -> list[tuple[Run, Run | None, np.ndarray | None]]:
-    """Run the programs of all scenes, some at a time: most of it is compilation.
+) -> list[_Runs]:
+    """Run the programs of all scenes, some at a time: most of it is compilation."""
 
-    Returns:
-        Of each scene the discrete and the event gradient's run, and the differences that judge them.
-    """
-
-    def run(case: _Case) -> tuple[Run, Run | None, np.ndarray | None]:
+    def run(case: _Case) -> _Runs:
         scene, grid, reference, _ = case
         arrays = (reference.fields, reference.qpos, reference.qvel)
         program = Program(scene, settings.num_steps, "discrete", size.chunk)
@@ -101,10 +122,31 @@ def _run_all(
         # In float64 alone, whose differences judge the derivatives of both.
         is_judge = precision == "float64"
         truth = _differences(scene, grid, reference, program, settings.num_steps) if is_judge else None
-        return program.run(*arrays), event, truth
+        return _Runs(program.run(*arrays), event, truth)
 
     with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
         return in_threads(run, cases, advance_to)
+
+
+def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: Workspace) -> list[_Runs]:
+    """Judge what seems not to be solved in single precision by the forces in double precision."""
+
+    def judge(pair: tuple[_Case, _Runs]) -> _Runs:
+        (scene, _, reference, _), run = pair
+        course, steps = run.discrete.course, run.discrete.steps
+        seems_wrong = np.flatnonzero(~(course.residual <= UNSOLVED))
+        if not len(seems_wrong):
+            return run
+        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, reference.fields))
+        # The numbers that were given to the solves.
+        fields = {name: value.astype(steps.qpos.dtype) for name, value in fields.items()}
+        errors = errors_of_solves(scene, fields, steps, chunk)
+        residual = course.residual.copy()
+        residual[seems_wrong] = np.fmin(steps.unbalanced, errors).max(axis=1)
+        return replace(run, discrete=replace(run.discrete, course=replace(course, residual=residual)))
+
+    with _precision("float64"), workspace.stage("solves, again in float64", "scenes", len(cases)) as advance_to:
+        return in_threads(judge, zip(cases, runs, strict=True), advance_to)
 
 
 def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):
@@ -217,12 +259,12 @@ def _of_mjxgrad(
     grid: Points,
     reference: Reference,
     expected: np.ndarray,
-    run: Run,
-    event: Run | None,
+    runs: _Runs,
     truth: np.ndarray,
     precision: str,
     settings: StabilitySettings,
 ) -> Behaviour:
+    run, event = runs.discrete, runs.event
     record = _record(scene, grid, reference.qpos, run.course, expected)
     shift, push = direction(scene, settings.num_steps, grid.values["timestep"])
     flown = _flown_in_step(grid) * settings.num_steps

@@ -24,7 +24,7 @@ class Behaviour:
         by_parameters: the same along a change of the model's parameters; none for C MuJoCo.
         event: the same of the event gradient; none where it was not asked for.
         is_silent: numbers that are not finite left the rollout without a flag.
-        is_out_of_balance: forces are out of balance in some step, and `Trajectory.unsolved` is zero.
+        is_untold: some step is not solved, and `Trajectory.unsolved` is zero.
         is_unflagged: the gradient is not finite or explodes where `Trajectory.diverged` is false.
         is_missed: the same where `soundness` finds nothing wrong either.
         gain: largest kinetic energy over what there was to draw on.
@@ -35,7 +35,7 @@ class Behaviour:
     by_parameters: Int[np.ndarray, " points"] | None
     event: Int[np.ndarray, " points"] | None
     is_silent: Bool[np.ndarray, " points"]
-    is_out_of_balance: Bool[np.ndarray, " points"]
+    is_untold: Bool[np.ndarray, " points"]
     is_unflagged: Bool[np.ndarray, " points"]
     is_missed: Bool[np.ndarray, " points"]
     gain: Float[np.ndarray, " points"]
@@ -138,7 +138,7 @@ def _rows(one: SceneOutcome, precisions: tuple[str, ...]) -> list[dict[str, Any]
                 f"{name}_derivative_by_parameters": _label(behaviour.by_parameters, i),
                 f"{name}_event_derivative": _label(behaviour.event, i),
                 f"{name}_silent": bool(behaviour.is_silent[i]),
-                f"{name}_out_of_balance": bool(behaviour.is_out_of_balance[i]),
+                f"{name}_untold": bool(behaviour.is_untold[i]),
                 f"{name}_gradient_unflagged_by_rollout": bool(behaviour.is_unflagged[i]),
                 f"{name}_apart_from_c": float(one.apart[name][i]),
                 f"{name}_energy": float(behaviour.gain[i]),

@@ -18,6 +18,22 @@ from mjxgrad.dynamics import Gradient
 from mjxgrad.rollout import Observe, Trajectory
 
 
+class Steps(eqx.Module):
+    """What the solves of a rollout were given and found.
+
+    Attributes:
+        qpos: positions before each step.
+        qvel: velocities, likewise.
+        qacc: the acceleration found.
+        unbalanced: share of the forces that it leaves; 0 from the first bad step on.
+    """
+
+    qpos: Float[np.ndarray, "points steps nq"]
+    qvel: Float[np.ndarray, "points steps nv"]
+    qacc: Float[np.ndarray, "points steps nv"]
+    unbalanced: Float[np.ndarray, "points steps"]
+
+
 @dataclass(frozen=True)
 class Run:
     """What mjxgrad did on every point.
@@ -29,6 +45,7 @@ class Run:
         is_silent: whether a rollout returned a number that is not finite without a flag.
         is_gradient_finite: whether all numbers of the gradient are.
         is_unsolved: whether the rollout says that some step's forces are not in balance.
+        steps: state and solution at each step, for a closer look at those that seem wrong.
     """
 
     course: Course
@@ -37,13 +54,14 @@ class Run:
     is_silent: np.ndarray
     is_gradient_finite: np.ndarray
     is_unsolved: np.ndarray
+    steps: "Steps"
 
 
-def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array]:
+def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Array]:
     mass, forces = mjx.full_m(model, data), (data.qfrc_smooth, data.qfrc_constraint)
     kinetic = 0.5 * data.qvel @ mass @ data.qvel
     potential = -model.body_mass @ (data.xipos @ model.opt.gravity)
-    return kinetic, potential, unbalanced(mass, data.qacc, data.qvel, *forces, model.opt.timestep)
+    return kinetic, potential, unbalanced(mass, data.qacc, data.qvel, *forces, model.opt.timestep), data.qacc
 
 
 class Program:
@@ -93,36 +111,77 @@ class Program:
             (value, trajectory), gradient = self._both(*arrays)
             parts.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], (value, trajectory, gradient)))
         value, trajectory, gradient = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-        kinetic, potential, residual = trajectory.observations
+        kinetic, potential, residual, qacc = trajectory.observations
+        # From the first bad step on the solver is asked what has no answer.
+        residual = _until(residual, trajectory.first_bad_step)
         is_silent = ~trajectory.diverged & ~_all_finite((trajectory, value))
         course = Course(
             trajectory.qpos[:, -1],
             trajectory.qvel[:, -1],
             kinetic,
             potential,
-            # From the first bad step on the solver is asked what has no answer.
-            _until(residual, trajectory.first_bad_step).max(axis=1),
+            residual.max(axis=1),
             trajectory.first_bad_step,
         )
-        return Run(course, value, gradient, is_silent, _all_finite(gradient), trajectory.unsolved > 0)
+        last = self._num_steps
+        steps = Steps(trajectory.qpos[:, :last], trajectory.qvel[:, :last], qacc[:, :last], residual[:, :last])
+        return Run(course, value, gradient, is_silent, _all_finite(gradient), trajectory.unsolved > 0, steps)
 
     def _outcome(
         self, fields: dict[str, Array], qpos: Array, qvel: Array, observe: Observe | None = _observe
     ) -> tuple[Array, Trajectory]:
-        others = {name: value for name, value in fields.items() if name != "timestep"}
-        model = self._scene.model.replace(**others).tree_replace({"opt.timestep": fields["timestep"]})
-        scene = eqx.tree_at(lambda scene: scene.model, self._scene, model)
+        scene = _with_fields(self._scene, fields)
         state = mg.initial_state(scene, qpos, qvel)
         trajectory = mg.rollout(scene, state, horizon=self._num_steps, observe=observe, gradient=self._gradient)
         return trajectory.qpos[-1] @ self._weights, trajectory
 
     def _chunks(self, arrays) -> Iterator[tuple[int, Any]]:
-        """Cut into pieces of one length, the last filled up with its last point."""
-        total = len(arrays[1])
-        dtype = self._scene.data.qpos.dtype
-        for start in range(0, total, self._chunk):
-            index = np.minimum(np.arange(start, start + self._chunk), total - 1)
-            yield min(self._chunk, total - start), jax.tree.map(lambda x, i=index: x[i].astype(dtype), arrays)
+        return _chunks(arrays, self._chunk, self._scene.data.qpos.dtype)
+
+
+def errors_of_solves(
+    scene: StabilityScene, fields: dict[str, np.ndarray], steps: Steps, chunk: int
+) -> Float[np.ndarray, "points steps"]:
+    """Ask the forces of a solve of the same states, in the present precision, whether they balance accelerations found.
+
+    Forces out of balance bound the error of an acceleration, but in single precision those of stiff rows may be out of balance
+    by rounding alone, with hardly an error.
+
+    Args:
+        scene: of the catalogue.
+        fields: of the model, for every point, as they were for the solves.
+        steps: to be judged.
+        chunk: states at once.
+
+    Returns:
+        Share of a step's velocity by which each is off.
+    """
+    loaded = mg.load_scene(scene.model())
+
+    def error(fields: dict[str, Array], qpos: Array, qvel: Array, qacc: Array) -> Array:
+        model = _with_fields(loaded, fields).model
+        data = mg.forward(model, loaded.data.replace(qpos=qpos, qvel=qvel))
+        forces = (data.qfrc_smooth, data.qfrc_constraint)
+        return unbalanced(mjx.full_m(model, data), qacc, qvel, *forces, model.opt.timestep)
+
+    run = jax.jit(jax.vmap(jax.vmap(error, in_axes=(None, 0, 0, 0))))
+    at_once = max(1, chunk // steps.qpos.shape[1])
+    pieces = _chunks((fields, steps.qpos, steps.qvel, steps.qacc), at_once, loaded.data.qpos.dtype)
+    return np.concatenate([np.asarray(run(*arrays))[:count] for count, arrays in pieces])
+
+
+def _with_fields(scene: mg.Scene, fields: dict[str, Array]) -> mg.Scene:
+    others = {name: value for name, value in fields.items() if name != "timestep"}
+    model = scene.model.replace(**others).tree_replace({"opt.timestep": fields["timestep"]})
+    return eqx.tree_at(lambda scene: scene.model, scene, model)
+
+
+def _chunks(arrays: Any, size: int, dtype: Any) -> Iterator[tuple[int, Any]]:
+    """Cut into pieces of one length, the last filled up with its last point."""
+    total = len(arrays[1])
+    for start in range(0, total, size):
+        index = np.minimum(np.arange(start, start + size), total - 1)
+        yield min(size, total - start), jax.tree.map(lambda x, i=index: x[i].astype(dtype), arrays)
 
 
 def along(run: Run, changes: dict[str, np.ndarray]) -> Float[np.ndarray, " points"]:

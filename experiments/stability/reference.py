@@ -1,7 +1,9 @@
 """C MuJoCo on every point of the grid, and the models and starts that mjxgrad takes over from it."""
 
-from concurrent.futures import ThreadPoolExecutor
+import math
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -9,12 +11,14 @@ from jaxtyping import Float
 
 from experiments.parallel import num_cores
 from experiments.stability.grid import Points
-from experiments.stability.scenes import FIELDS, StabilityScene, configure
+from experiments.stability.scenes import FIELDS, StabilityScene, catalogue, configure
 
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
 WIDTHS = (1e-4, 2e-5)
 """Of finite differences, in units of what a body flies in one step."""
+_SHARES = 4
+"""Pieces of work for each process: some points take longer than others."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class Course:
         qvel: velocities, likewise.
         kinetic: energy of motion before each step and at the end, in J.
         potential: energy of height, likewise.
-        residual: largest share of the forces left unbalanced by a solve.
+        residual: largest share of a step's velocity by which a solve is off, or that its forces leave unbalanced.
         first_bad_step: −1 if there is none.
     """
 
@@ -82,34 +86,35 @@ def scale(points: Points) -> Float[np.ndarray, " points"]:
     return points.values["speed"] * points.values["timestep"]
 
 
-def simulate(scene: StabilityScene, points: Points, num_steps: int) -> Reference:
+def simulate(scene: StabilityScene, points: Points, num_steps: int, pool: Executor) -> Reference:
     """Run C MuJoCo on every point.
 
     Args:
         scene: of the catalogue.
         points: of its grid.
         num_steps: of every rollout.
+        pool: of processes: most of the time goes into Python, a step at a time.
 
     Returns:
         What it did.
     """
+    shifts = np.concatenate(direction(scene, num_steps, points.values["timestep"]), axis=1)
+    cases = list(zip((points[i] for i in range(len(points))), shifts, strict=True))
+    share = math.ceil(len(cases) / (_SHARES * num_cores()))
+    parts = [cases[start : start + share] for start in range(0, len(cases), share)]
+    rows = [row for part in pool.map(partial(_run_points, scene.name, num_steps), parts) for row in part]
+    columns = [np.array(column) for column in zip(*[row[:-1] for row in rows], strict=True)]
+    fields = {name: np.array([row[-1][name] for row in rows]) for name in rows[0][-1]}
+    return Reference(Course(*columns[:6]), fields, columns[6], columns[7], columns[8].T)
+
+
+def _run_points(name: str, num_steps: int, cases: list[tuple[dict[str, float], np.ndarray]]) -> list[tuple]:
     # A simulation that goes wrong is what is looked for; C MuJoCo would write a file about it.
     mujoco.set_mju_user_warning(lambda _: None)
-    slices = [slice(i, None, num_cores()) for i in range(num_cores())]
-    shifts = direction(scene, num_steps, points.values["timestep"])
-
-    def run(which: slice) -> list[tuple]:
-        model = scene.model()
-        worker = (scene, model, mujoco.MjData(model))
-        return [_run_point(worker, points[i], shifts[0][i], shifts[1][i], num_steps) for i in range(len(points))[which]]
-
-    with ThreadPoolExecutor(len(slices)) as pool:
-        parts = list(pool.map(run, slices))
-    order = np.argsort(np.concatenate([np.arange(len(points))[which] for which in slices]), kind="stable")
-    rows = [row for part in parts for row in part]
-    columns = [np.array(column)[order] for column in zip(*[row[:-1] for row in rows], strict=True)]
-    fields = {name: np.array([row[-1][name] for row in rows])[order] for name in rows[0][-1]}
-    return Reference(Course(*columns[:6]), fields, columns[6], columns[7], columns[8].T)
+    scene = next(scene for scene in catalogue() if scene.name == name)
+    model = scene.model()
+    worker = (scene, model, mujoco.MjData(model))
+    return [_run_point(worker, point, shift[: model.nq], shift[model.nq :], num_steps) for point, shift in cases]
 
 
 def _run_point(
@@ -143,48 +148,59 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, qvel: n
 
 
 def _follow(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, qvel: np.ndarray, num_steps: int) -> tuple:
-    """Step, look at every state, and stop at the first bad one."""
+    """Step, then look at every state up to the first bad one."""
     _place(model, data, qpos, qvel)
-    good = (qpos, qvel)
-    energies, residual, bad, mass = np.zeros((2, num_steps + 1)), 0.0, -1, np.zeros((model.nv, model.nv))
+    positions, velocities = np.zeros((num_steps + 1, model.nq)), np.zeros((num_steps + 1, model.nv))
+    positions[0], velocities[0] = qpos, qvel
+    energies = np.zeros((num_steps + 1, 2))
+    masses = np.zeros((num_steps, model.nv, model.nv))
+    accelerations, smooth, constraint = np.zeros((3, num_steps, model.nv))
     for i in range(num_steps):
         mujoco.mj_step(model, data)
-        energies[:, i] = data.energy[1], data.energy[0]
-        mujoco.mj_fullM(model, data, mass)
-        forces = (data.qfrc_smooth, data.qfrc_constraint)
-        residual = max(residual, float(unbalanced(mass, data.qacc, good[1], *forces, model.opt.timestep)))
-        if not (np.isfinite(data.qpos).all() and np.abs(data.qvel).max() < VELOCITY_LIMIT):
-            bad = i
-            energies[:, i + 1 :] = energies[:, i : i + 1]
-            break
-        good = (data.qpos.copy(), data.qvel.copy())
-    else:
-        mujoco.mj_forward(model, data)
-        energies[:, -1] = data.energy[1], data.energy[0]
-    return (*good, energies[0], energies[1], residual, bad)
+        energies[i] = data.energy
+        mujoco.mj_fullM(model, data, masses[i])
+        accelerations[i], smooth[i], constraint[i] = data.qacc, data.qfrc_smooth, data.qfrc_constraint
+        positions[i + 1], velocities[i + 1] = data.qpos, data.qvel
+    mujoco.mj_forward(model, data)
+    energies[-1] = data.energy
+    is_good = np.isfinite(positions[1:]).all(axis=1) & (np.abs(velocities[1:]).max(axis=1) < VELOCITY_LIMIT)
+    bad, last = -1, num_steps
+    if not is_good.all():
+        bad = last = int(np.argmin(is_good))
+        energies[bad + 1 :] = energies[bad]
+    seen = slice(0, last + 1)
+    residual = unbalanced(
+        masses[seen],
+        accelerations[seen],
+        velocities[:num_steps][seen],
+        smooth[seen],
+        constraint[seen],
+        model.opt.timestep,
+    )
+    return positions[last], velocities[last], energies[:, 1], energies[:, 0], float(residual.max()), bad
 
 
 def unbalanced(mass, acceleration, velocity, smooth, constraint, timestep):
     """Share of a step's velocity by which a solve is off, in the norm of kinetic energy; of NumPy or JAX arrays.
 
     Args:
-        mass: matrix, of which the diagonal counts.
-        acceleration: that the solve has found.
+        mass: matrix (..., nv, nv), of which the diagonal counts.
+        acceleration: that the solve has found (..., nv).
         velocity: before the step.
         smooth: forces but those of constraints.
         constraint: forces of constraints.
         timestep: in s.
 
     Returns:
-        A number; 0 where nothing moves and nothing pulls.
+        A number (...); 0 where nothing moves and nothing pulls.
     """
-    inertia = mass @ acceleration
-    weight = mass.diagonal()
+    inertia = (mass @ acceleration[..., None])[..., 0]
+    weight = mass.diagonal(axis1=-2, axis2=-1)
 
     def norm(force):
         # Scaled, for squares of large forces overflow in float32.
-        largest = abs(force).max() + 1e-30
-        return largest * ((force / largest) ** 2 / weight).sum() ** 0.5
+        largest = abs(force).max(axis=-1) + 1e-30
+        return largest * ((force / largest[..., None]) ** 2 / weight).sum(axis=-1) ** 0.5
 
     moved = norm(weight * velocity) + timestep * (norm(inertia) + norm(smooth) + norm(constraint))
     return timestep * norm(inertia - smooth - constraint) / (moved + 1e-30)

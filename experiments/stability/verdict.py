@@ -32,14 +32,14 @@ def verdict(outcome: Outcome) -> str:
     ]
     for name in precisions:
         stopped = sum(int((one.behaviour[name].motion == Motion.UNSOLVED).sum()) for one in outcome.scenes)
-        untold = outcome.total(name, "is_out_of_balance")
+        untold = outcome.total(name, "is_untold")
         worse = sum(int(one.worse(name).sum()) for one in outcome.scenes)
         better = sum(int(one.better(name).sum()) for one in outcome.scenes)
         open_ones = _reasons(outcome, name)[UNEXPLAINED]
         sentences.append(
             f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} of the points"
             f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
-            f"{_count(stopped)} leave forces out of balance in some step, which `Trajectory.unsolved` does not tell at "
+            f"{_count(stopped)} have a step that is not solved to a thousandth, which `Trajectory.unsolved` does not tell at "
             f"{_count(untold)}."
         )
     return " ".join(sentences)
@@ -149,7 +149,9 @@ def _motions(outcome: Outcome) -> Table:
         ("scene", "simulator", *(kind.label for kind in Motion)),
         rows,
         "Points by what the motion does. Bounces are judged by their restitution where it is known, by closed form or quadrature"
-        "; “gains energy” is more kinetic energy than start, gravity and compressed springs had to give.",
+        "; “gains energy” is more kinetic energy than start, gravity and compressed springs had to give; “not solved” is an "
+        "acceleration that is off by a thousandth of a step’s velocity, by the forces that it leaves unbalanced; where these are "
+        "rounded, in float32, by the forces of the same state in float64.",
     )
 
 

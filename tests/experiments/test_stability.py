@@ -1,5 +1,7 @@
 """The grid reaches what it is to reach, and what is said of it follows from its numbers."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import mujoco
 import numpy as np
 import pytest
@@ -24,6 +26,11 @@ def _points(count=1, **values):
         np.full(count, -1),
         (),
     )
+
+
+def _simulate(grid, num_steps):
+    with ThreadPoolExecutor(1) as pool:
+        return simulate(SCENES["ball"], grid, num_steps, pool).course
 
 
 def test_every_size_names_scenes_that_there_are():
@@ -69,7 +76,7 @@ def test_the_load_is_that_of_the_closed_form_and_knows_refsafe():
 
 def test_c_mujoco_bounces_with_the_restitution_of_the_closed_form():
     grid = _points(timestep=1e-4, time_constant=1e-3, impedance_first=0.9, impedance_last=0.9)
-    course = simulate(SCENES["ball"], grid, 100).course
+    course = _simulate(grid, 100)
     # e⁻² at critical damping; the time step is a tenth of the time constant
     assert course.qvel[0, 0] == pytest.approx(np.exp(-2), abs=0.02)
     assert course.residual[0] < 1e-9
@@ -77,7 +84,7 @@ def test_c_mujoco_bounces_with_the_restitution_of_the_closed_form():
 
 
 def test_a_start_that_is_not_finite_is_bad_from_its_first_step():
-    course = simulate(SCENES["ball"], _points(stiffness=1e300), 20).course
+    course = _simulate(_points(stiffness=1e300), 20)
     assert 0 <= course.first_bad_step[0] < 20
     assert np.isfinite(course.qpos).all()
 

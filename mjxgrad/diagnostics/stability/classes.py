@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 UNSOLVED = 1e-3
-"""Share of the forces that may remain unbalanced after a solve."""
+"""Share of a step's velocity by which a solve may be off."""
 GAIN = 0.05
 """Share by which kinetic energy may exceed what there was to draw on."""
 AT_REST = 1e-3
@@ -78,7 +78,8 @@ class MotionRecord(eqx.Module):
 
     Attributes:
         is_sound: whether all states were finite and below the velocity limit.
-        residual: largest share of the forces left unbalanced by a solve.
+        residual: largest share of a step's velocity by which a solve is off, or a bound on it: the share of the forces that it
+            leaves unbalanced.
         gain: largest kinetic energy over what there was to draw on: that of the start, of gravity and of springs
             compressed at the start.
         rest: final kinetic energy over the same.
