@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOut
 from experiments.ablation.recording import record, scene_path, segments
 from experiments.ablation.settings import AblationSettings
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, REACHED, Variant, variants
-from experiments.parallel import in_threads
+from experiments.parallel import num_compilers
 from experiments.workspace import Workspace
 
 _EPSILON_STEPS = 4  # roundings by which starts are moved, to see what rounding alone changes
@@ -74,14 +75,23 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
     )
     found = variants(path, recorded, settings.beyond_limits)
     starts = segments(recorded, batch=sizes.batch, horizon=sizes.horizon, seed=settings.seed)
-    wanted = [v for v in found if sizes.has_every_gradient or v.name in (EVERYTHING, FUSED, NEEDED, REACHED)]
-    steps = _compare(found, _motion, starts, sizes.repeats)
-    gradients = _compare(wanted, _gradient, starts, sizes.repeats)
+    with ThreadPoolExecutor(num_compilers()) as pool:
+        motions = _Programs(found, _motion, starts, pool)
+        # Of the same motion, letter for letter, the gradient is the same: it has nothing else to be made from.
+        other = [v for v in found[1:] if not motions.is_same(v)] if sizes.has_every_gradient else []
+        chosen = (EVERYTHING, FUSED, NEEDED, REACHED, *(v.name for v in other))
+        gradients = _Programs([v for v in found if v.name in chosen], _gradient, starts, pool)
+        # XLA leaves Python to this meanwhile.
+        checks = {
+            v.name: [mg.check_omissions(v.scene, seen) for seen in (recorded, others)]
+            for v in found
+            if v.name in (NEEDED, REACHED)
+        }
+    # All have been compiled, so that nothing else runs while they are timed.
+    steps, slopes = motions.compare(sizes.repeats), gradients.compare(sizes.repeats)
     outcomes = []
     for variant in found:
-        checks = [None, None]
-        if variant.name in (NEEDED, REACHED):
-            checks = [mg.check_omissions(variant.scene, seen) for seen in (recorded, others)]
+        in_recorded, in_others = checks.get(variant.name, (None, None))
         outcomes.append(
             VariantOutcome(
                 name=variant.name,
@@ -90,9 +100,9 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
                 num_rows=int(variant.scene.data._impl.nefc),
                 num_bodies=int(variant.scene.model.nbody),
                 step=steps[variant.name],
-                gradient=gradients.get(variant.name),
-                recorded=checks[0],
-                others=checks[1],
+                gradient=slopes.get(variant.name),
+                recorded=in_recorded,
+                others=in_others,
             )
         )
     return SceneOutcome(name, outcomes, sizes.batch * sizes.horizon)
@@ -117,49 +127,63 @@ def _gradient(scene: mg.Scene) -> Callable[..., Any]:
     return jax.grad(cost, argnums=(0, 1, 2))
 
 
-def _compare(
-    found: list[Variant], make: Callable[[mg.Scene], Callable[..., Any]], starts: _Starts, repeats: int
-) -> dict[str, Cost]:
-    """Compile all variants, let them take turns, and compare what they give with the first one's.
+class _Programs:
+    """One program of every variant; where two make the same, letter for letter, it is compiled and timed once.
 
-    Where two variants make the same program, letter for letter, it is compiled and timed once: nothing could differ.
+    Args:
+        found: the variants, the one with everything first.
+        make: from a scene to what is compiled.
+        starts: that it is compiled for and run on.
+        pool: of threads, in which compilation goes on after the return.
     """
-    texts: dict[str, str] = {}
-    lowered: dict[str, tuple[jax.stages.Lowered, float]] = {}
-    for variant in found:
-        program, seconds = _timed(lambda v=variant: jax.jit(jax.vmap(make(v.scene))).lower(*starts))
-        texts[variant.name] = program.as_text()
-        lowered.setdefault(texts[variant.name], (program, seconds))
 
-    def finish(text: str) -> _Program:
-        compiled, seconds = _timed(lowered[text][0].compile)
-        return _Program(compiled, text, lowered[text][1] + seconds, _flops(compiled))
+    def __init__(
+        self, found: list[Variant], make: Callable[[mg.Scene], Callable[..., Any]], starts: _Starts, pool: Executor
+    ):
+        self._starts = starts
+        self._texts: dict[str, str] = {}
+        self._by_text: dict[str, Future[_Program]] = {}
+        for variant in found:
+            lowered, seconds = _timed(lambda v=variant: jax.jit(jax.vmap(make(v.scene))).lower(*starts))
+            text = self._texts[variant.name] = lowered.as_text()
+            if text not in self._by_text:
+                self._by_text[text] = pool.submit(_compiled, lowered, text, seconds)
 
-    by_text = dict(zip(lowered, in_threads(finish, lowered), strict=True))
-    programs = {name: by_text[text] for name, text in texts.items()}
-    results = {text: _numbers(program.run(*starts)) for text, program in by_text.items()}
-    times: dict[str, list[float]] = {text: [] for text in by_text}
-    for _ in range(repeats):
-        for text, program in by_text.items():
-            times[text].append(_timed(lambda p=program: jax.block_until_ready(p.run(*starts)))[1])
-    first = programs[EVERYTHING]
-    base = results[first.text]
-    rounding = np.abs(_numbers(first.run(*_rounded(starts))) - base).max(initial=0.0)
-    return {
-        name: Cost(
-            seconds=np.array(times[program.text]),
-            base_seconds=np.array(times[first.text]),
-            compile_seconds=program.seconds,
-            base_compile_seconds=first.seconds,
-            flops=program.flops,
-            base_flops=first.flops,
-            is_same_program=program.text == first.text,
-            difference=float(np.abs(results[program.text] - base).max(initial=0.0)),
-            rounding=float(rounding),
-            scale=float(np.abs(base).max(initial=0.0)),
-        )
-        for name, program in programs.items()
-    }
+    def is_same(self, variant: Variant) -> bool:
+        """Whether a variant makes the same program as the scene with everything."""
+        return self._texts[variant.name] == self._texts[EVERYTHING]
+
+    def compare(self, repeats: int) -> dict[str, Cost]:
+        """Let the programs take turns, and compare what they give with the first one's."""
+        starts, by_text = self._starts, {text: future.result() for text, future in self._by_text.items()}
+        results = {text: _numbers(program.run(*starts)) for text, program in by_text.items()}
+        times: dict[str, list[float]] = {text: [] for text in by_text}
+        for _ in range(repeats):
+            for text, program in by_text.items():
+                times[text].append(_timed(lambda p=program: jax.block_until_ready(p.run(*starts)))[1])
+        first = by_text[self._texts[EVERYTHING]]
+        base = results[first.text]
+        rounding = np.abs(_numbers(first.run(*_rounded(starts))) - base).max(initial=0.0)
+        return {
+            name: Cost(
+                seconds=np.array(times[text]),
+                base_seconds=np.array(times[first.text]),
+                compile_seconds=by_text[text].seconds,
+                base_compile_seconds=first.seconds,
+                flops=by_text[text].flops,
+                base_flops=first.flops,
+                is_same_program=text == first.text,
+                difference=float(np.abs(results[text] - base).max(initial=0.0)),
+                rounding=float(rounding),
+                scale=float(np.abs(base).max(initial=0.0)),
+            )
+            for name, text in self._texts.items()
+        }
+
+
+def _compiled(lowered: jax.stages.Lowered, text: str, traced_in: float) -> _Program:
+    compiled, seconds = _timed(lowered.compile)
+    return _Program(compiled, text, traced_in + seconds, _flops(compiled))
 
 
 def _timed(function: Callable[[], Any]) -> tuple[Any, float]:

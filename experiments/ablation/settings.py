@@ -27,7 +27,8 @@ class Sizes:
         horizon: of each, in steps.
         repeats: of every timing.
         num_recorded: rollouts recorded for what motions reach, and as many others to check it on.
-        has_every_gradient: whether gradients are compiled for every group, or only for those that change the constraints.
+        has_every_gradient: whether the gradient is measured of every group that makes another motion's program, or only of fixed
+            bodies and of all that is left out together.
     """
 
     scenes: tuple[SceneName, ...]

@@ -39,8 +39,8 @@ def verdict(outcome: Outcome) -> str:
         sentences.append(
             f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} of the points"
             f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
-            f"{_count(stopped)} have a step that is not solved to a thousandth, which `Trajectory.unsolved` does not tell at "
-            f"{_count(untold)}."
+            f"{_count(stopped)} {'have' if stopped > 1 else 'has'} a step that is not solved to a thousandth"
+            + (f", which `Trajectory.unsolved` does not tell at {_count(untold)}." if stopped else ".")
         )
     return " ".join(sentences)
 

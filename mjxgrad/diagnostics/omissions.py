@@ -189,10 +189,10 @@ class _Ledger:
     def enter(self, data: mujoco.MjData, index: int) -> None:
         """Note what acts in a state."""
         deepest: dict[str, float] = {}
-        for contact in data.contact:
-            what = self._pairs.get(frozenset(int(geom) for geom in contact.geom))
-            if what is not None and contact.dist < contact.includemargin:
-                depth = float(contact.includemargin - contact.dist)
+        depths = data.contact.includemargin - data.contact.dist
+        for geoms, depth in zip(data.contact.geom.tolist(), depths.tolist(), strict=True):
+            what = self._pairs.get(frozenset(geoms))
+            if what is not None and depth > 0:
                 deepest[f"contact of {what}"] = max(deepest.get(f"contact of {what}", 0.0), depth)
         beyond = _beyond_limit(self._model, data.qpos)
         for joint in self._joints[beyond[self._joints] > 0]:
