@@ -15,7 +15,7 @@ from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, RENDERING, 
 @pytest.fixture(scope="module")
 def recorded():
     scene = mg.load_scene(scene_path("reacher"), keep_everything=True)
-    return record(scene, num_rollouts=2, duration=0.4, control_share=0.5, seed=0)
+    return record(scene, num_rollouts=2, duration=0.4, least_steps=1, control_share=0.5, seed=0)
 
 
 def test_a_group_deletes_what_it_says_and_no_inertia(recorded):
@@ -41,6 +41,14 @@ def test_starts_are_recorded_states_with_the_controls_that_followed(recorded):
         i, t = np.argwhere((np.asarray(recorded.qpos) == position).all(axis=-1))[0]
         np.testing.assert_array_equal(recorded.qvel[i, t], velocity)
         np.testing.assert_array_equal(recorded.ctrl[i, t : t + 7], follow)
+
+
+def test_a_long_time_step_leaves_steps_enough_to_start_from():
+    scene = mg.load_scene(scene_path("reacher"), keep_everything=True)
+    found = record(scene, num_rollouts=1, duration=0.02, least_steps=14, control_share=0.5, seed=0)
+    qpos, _, _ = segments(found, batch=3, horizon=7, seed=0)
+    assert found.ctrl.shape[1] == 14
+    assert len(qpos) == 3
 
 
 def test_a_difference_is_called_so_only_beyond_what_rounding_makes():

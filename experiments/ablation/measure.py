@@ -68,6 +68,7 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
             everything,
             num_rollouts=sizes.num_recorded,
             duration=settings.duration,
+            least_steps=2 * sizes.horizon,
             control_share=settings.control_share,
             seed=settings.seed + i,
         )

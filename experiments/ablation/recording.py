@@ -22,13 +22,16 @@ def scene_path(name: str) -> Path:
     return own if own.exists() else _GYMNASIUM / f"{name}.xml"
 
 
-def record(scene: mg.Scene, *, num_rollouts: int, duration: float, control_share: float, seed: int) -> mg.Trajectory:
+def record(
+    scene: mg.Scene, *, num_rollouts: int, duration: float, least_steps: int, control_share: float, seed: int
+) -> mg.Trajectory:
     """Roll out random controls, held for a few steps, from the reference pose with random velocities.
 
     Args:
         scene: with nothing of its constraints left out.
         num_rollouts: with different starts and controls.
         duration: of each (s).
+        least_steps: of each, where the time step is large.
         control_share: of the range of each control, about its middle.
         seed: of controls and starts.
 
@@ -37,7 +40,7 @@ def record(scene: mg.Scene, *, num_rollouts: int, duration: float, control_share
     """
     model = scene.to_mujoco()
     random = np.random.default_rng(seed)
-    horizon = round(duration / model.opt.timestep)
+    horizon = max(round(duration / model.opt.timestep), least_steps)
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     middle, reach = (low + high) / 2, control_share * (high - low) / 2
