@@ -115,3 +115,39 @@ def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
     tolerance = jnp.asarray(1e-6, jnp.float32)
     found, _ = newton.minimise(RowLayout(0, 0, 2), Problem(inertia, force, jacobian, rows), start, tolerance, 100)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("num_hard", [0, 5, 40], ids=["none", "some", "most"])
+def test_the_last_of_a_large_batch_are_finished_as_in_a_small_one(num_hard: int):
+    """In flight there is nothing to iterate; those that slide take up to ten turns, what is not finite has no answer.
+
+    The same numbers to rounding, since the operations are the same, in programs of other shapes. Where the last turns only
+    move digits, rounding decides how many there are.
+    """
+    model = _model()
+    mjx_model, data = mjx.put_model(model), mjx.make_data(model)
+    size = 128
+    heights, qvel = np.full(size, 0.2), np.tile(_ROLL, (size, 1)).astype(float)
+    hard = np.random.default_rng(0).permutation(size)[:num_hard]
+    heights[hard] = 0.0499
+    qvel[hard] *= np.linspace(1, 60, num_hard)[:, None]
+    if num_hard:
+        qvel[hard[0]] = np.nan
+    qpos = np.tile(data.qpos, (size, 1))
+    qpos[:, 2] = heights
+
+    @jax.jit
+    @jax.vmap
+    def push(qpos, qvel):
+        moved = mg.forward(mjx_model, data.replace(qpos=qpos, qvel=qvel))
+        return moved.qacc, moved._impl.solver_niter
+
+    assert size >= newton._LEAST_BATCH > size // 4
+    whole = push(qpos, qvel)
+    parts = [push(qpos[i::4], qvel[i::4]) for i in range(4)]
+    for i, (acceleration, iterations) in enumerate(parts):
+        np.testing.assert_allclose(whole[0][i::4], acceleration, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(whole[1][i::4] <= 100, iterations <= 100)
+    if num_hard:
+        assert np.isnan(whole[0][hard[0]]).all()
+        assert 3 < np.sort(np.asarray(whole[1])[hard])[-2] <= 20
