@@ -13,8 +13,9 @@ SceneName = Literal[
     "hopper", "half_cheetah", "walker2d", "swimmer", "reacher", "inverted_pendulum", "inverted_double_pendulum", "ant",
     "humanoid",
 ]  # fmt: skip
-# The humanoid takes as long as all others together: in the full size.
 _SOME: tuple[SceneName, ...] = ("two_bodies", "motion_planning", "hopper", "reacher", "ant")
+# The humanoid takes about as long as all others together, so it is left to who asks for it by name.
+_MOST: tuple[SceneName, ...] = tuple(name for name in get_args(SceneName) if name != "humanoid")
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Sizes:
 SIZES = {
     "quick": Sizes(("two_bodies", "reacher", "inverted_pendulum"), 32, 10, 5, 8, False),
     "default": Sizes(_SOME, 64, 20, 7, 16, False),
-    "full": Sizes(get_args(SceneName), 1024, 20, 9, 64, True),
+    "full": Sizes(_MOST, 1024, 20, 9, 64, True),
 }
 
 
