@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from experiments.stability.grid import Points
 from experiments.stability.scenes import RADIUS, StabilityScene, effective
-from mjxgrad.scene.contact_check import largest_stable_step
+from mjxgrad.scene.contact_check import largest_stable_step, steepest
 from mjxgrad.tasks.textbook import Bounce
 
 
@@ -21,7 +21,10 @@ def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
     """
     found = np.empty(len(points))
     for i in range(len(points)):
-        stiffness, damping = effective(scene, points[i])
+        point = points[i]
+        impedance = (point["impedance_first"], point["impedance_last"])
+        impedance = np.clip(impedance, mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
         frequency = np.sqrt(stiffness)
         limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
         found[i] = points.values["timestep"][i] * frequency / limit

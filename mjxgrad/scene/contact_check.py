@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contacts import ContactPair, contact_parameters
@@ -59,16 +60,18 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     # Inside jit, operations on known values would be traced, too.
     with jax.ensure_compile_time_eval():
         parameters = contact_parameters(model, pairs)
-    solref, stiffness, damping = (
-        np.asarray(x, dtype=float) for x in (parameters.solref, parameters.stiffness, parameters.damping)
+    solref, impedance, width = (
+        np.asarray(x, dtype=float) for x in (parameters.solref, parameters.impedance, parameters.width)
     )
+    stiffness, damping = (np.asarray(x, dtype=float) for x in (parameters.stiffness, parameters.damping))
+    springs = [steepest(*one) for one in zip(stiffness, damping, impedance, width, strict=True)]
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
     messages: dict[str, list[ContactPair]] = {}
-    for pair, first, k, b in zip(pairs, solref[:, 0], stiffness, damping, strict=True):
+    for pair, first, b, spring in zip(pairs, solref[:, 0], damping, springs, strict=True):
         for message in (
             altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
-            beyond_stability(k, b, timestep, integrator),
+            beyond_stability(*spring, timestep, integrator),
         ):
             if message:
                 messages.setdefault(message, []).append(pair)
@@ -110,6 +113,24 @@ def format_number(x: float) -> str:
     if 1e3 <= abs(x) < 99999.5:
         return f"{x:.0f}"
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def steepest(
+    stiffness: float, damping: float, impedance: Float[np.ndarray, "2"] | tuple[float, float], width: float
+) -> tuple[float, float]:
+    r"""Give stiffness and damping where the impedance is largest, which is at first touch if it falls with depth.
+
+    The force on a body is $d(r)$ of the acceleration $-B \dot r - K d(r) r$ that is asked for, so that stiffness goes as the
+    square of the impedance and damping as the impedance.
+
+    Args:
+        stiffness: at full depth, $k = K d_w^2$, in 1/s².
+        damping: at full depth, $b = B d_w$, in 1/s.
+        impedance: $d_0$ and $d_w$.
+        width: over which it changes; without one it is $d_w$ everywhere.
+    """
+    share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
+    return float(share**2 * stiffness), float(share * damping)
 
 
 def altered_by_refsafe(time_constant: float, damping: float, timestep: float, remedy: str) -> str | None:

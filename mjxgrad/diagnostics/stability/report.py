@@ -190,7 +190,7 @@ def _hidden(spring: Spring) -> str | None:
 def _unstable(spring: Spring) -> str | None:
     if spring.stiffness <= 0:
         return None
-    return beyond_stability(spring.stiffness, spring.damping, spring.timestep, spring.integrator)
+    return beyond_stability(*spring.steepest, spring.timestep, spring.integrator)
 
 
 def _unstable_together(spring: Spring) -> str | None:

@@ -4,7 +4,8 @@ Contacts, limits and equalities have one law: at full impedance $\ddot r = -k r 
 row's effective mass. Semi-implicit Euler follows it without gaining energy while $h^2 k + 2 h b < 4$, which in MuJoCo's
 standard format is $h / t_c < 2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$, $t_c = 2 / b$.
 
-That is one row alone, at the impedance $d_w$. The n contacts of a box that lands flat add up to the impedance
+That is one row alone, at the impedance $d_w$; where the impedance falls with depth, stiffness and damping are largest at
+first touch. The n contacts of a box that lands flat add up to the impedance
 $n d / (1 + (n - 1) d)$, and pull with $n / (1 + (n - 1) d_w)$ times $k$ and $b$; contacts with other bodies add to it, up to
 $1 / d_w$ times, where a row gets the whole of the acceleration that it asks for.
 """
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from mjxgrad.scene.contact_check import largest_stable_step
+from mjxgrad.scene.contact_check import largest_stable_step, steepest
 from mjxgrad.tasks.textbook.bounce import Bounce
 
 
@@ -73,10 +74,15 @@ class Spring:
     @property
     def coupled_load(self) -> float:
         """The same where all contacts of the pair hold the body at once; never below `load`."""
-        return self._load(self.num_rows / (1 + (self.num_rows - 1) * self.impedance[1]))
+        return self._load(self.num_rows / (1 + (self.num_rows - 1) * max(self.impedance)))
+
+    @property
+    def steepest(self) -> tuple[float, float]:
+        """Stiffness (1/s²) and damping (1/s) where the impedance is largest."""
+        return steepest(self.stiffness, self.damping, self.impedance, self.width)
 
     def _load(self, factor: float) -> float:
-        stiffness, damping = factor * self.stiffness, factor * self.damping
+        stiffness, damping = (factor * value for value in self.steepest)
         if stiffness <= 0:
             # A damper alone: h b < 2 for Euler, the real axis of RK4's region of stability.
             limit = 2.785 if self.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
