@@ -9,9 +9,10 @@ import pytest
 from experiments.stability.grid import PLANES, Points, points
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
+from experiments.stability.program import Steps, errors_of_solves
 from experiments.stability.reasons import UNEXPLAINED, reasons
 from experiments.stability.reference import simulate, unbalanced
-from experiments.stability.scenes import DEFAULTS, catalogue, configure
+from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
 from experiments.stability.settings import SIZES, StabilitySettings
 from experiments.stability.verdict import findings
 from mjxgrad.diagnostics.stability import Motion
@@ -93,6 +94,24 @@ def test_unbalanced_is_the_share_of_the_velocity_that_a_solve_misses():
     # 3 N too much on 2 kg for 0.1 s, beside a speed of 1 m/s: 0.15 m/s of 1 + 0.1·(2·2 + 1 + 0)/2 m/s
     found = unbalanced(np.array([[2.0]]), np.array([2.0]), np.array([1.0]), np.array([1.0]), np.array([0.0]), 0.1)
     assert found == pytest.approx(0.15 / 1.25)
+
+
+def test_a_solve_is_judged_by_the_forces_of_its_state_and_not_by_those_it_reports():
+    """A ball on its way through contact: the acceleration of C MuJoCo has no error, one that is off by 2 % of a step has."""
+    scene, grid = SCENES["ball"], _points(timestep=1e-3)
+    model = scene.model()
+    data = mujoco.MjData(model)
+    configure(scene, model, data, grid[0])
+    data.qpos[:], data.qvel[:] = -1e-3, -1.0
+    mujoco.mj_forward(model, data)
+    fields = {name: np.array(getattr(model, name))[None] for name in FIELDS} | {"timestep": np.array([1e-3])}
+    off = data.qacc + 0.02 * 1.0 / 1e-3
+    # Out of balance as it seems.
+    steps = Steps(np.full((1, 2, 1), -1e-3), np.full((1, 2, 1), -1.0), np.array([[data.qacc, off]]), np.ones((1, 2)))
+    right, wrong = errors_of_solves(scene, fields, steps, chunk=256)[0]
+    moved = 1.0 + 1e-3 * (abs(off[0]) + abs(data.qacc[0]))  # gravity is off in this scene
+    assert right < 1e-9
+    assert wrong == pytest.approx(0.02 / moved, rel=1e-6)
 
 
 def _outcome(scene, grid, ours, theirs, apart):
