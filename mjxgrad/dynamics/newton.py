@@ -173,7 +173,7 @@ def minimise(
     batch = start.shape[1:]
     solver = _Solver(layout, problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
-    # Not tried on a GPU, where a small batch takes hardly less time than a large one.
+    # On a CPU, where it was measured.
     splits = jax.default_backend() == "cpu" and bool(batch) and batch[0] >= _LEAST_BATCH
     num_last = batch[0] // _SHARE if splits else 0
     state = solver.run(first, num_last)
