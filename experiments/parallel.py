@@ -19,9 +19,13 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
 
 
-def num_compilers() -> int:
-    """Say how many programs to compile side by side: one per core, and no more than memory has room for."""
-    return min(num_cores(), _MOST)
+def num_compilers(*, besides: int = 0) -> int:
+    """Say how many programs to compile side by side: one per core, and no more than memory has room for.
+
+    Args:
+        besides: cores to leave to something else.
+    """
+    return max(1, min(num_cores() - besides, _MOST))
 
 
 def in_threads(

@@ -76,7 +76,8 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
     )
     found = variants(path, recorded, settings.beyond_limits)
     starts = segments(recorded, batch=sizes.batch, horizon=sizes.horizon, seed=settings.seed)
-    with ThreadPoolExecutor(num_compilers()) as pool:
+    # Compile times are measured, so Python keeps a core to itself.
+    with ThreadPoolExecutor(num_compilers(besides=1)) as pool:
         motions = _Programs(found, _motion, starts, pool)
         # Of the same motion, letter for letter, the gradient is the same: it has nothing else to be made from.
         other = [v for v in found[1:] if not motions.is_same(v)] if sizes.has_every_gradient else []
