@@ -28,7 +28,7 @@ class Size:
 
 
 SIZES = {
-    "quick": Size(8, 32, ("ball", "two balls, elliptic"), (), 256),
+    "quick": Size(8, 32, ("ball", "two balls, elliptic"), (), 128),
     "default": Size(
         12,
         256,
@@ -47,7 +47,7 @@ SIZES = {
             "chain",
         ),
         ("ball", "two balls, pyramidal"),
-        256,
+        128,
     ),
     "full": Size(24, 2048, None, None, 4096),
 }
