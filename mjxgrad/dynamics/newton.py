@@ -41,8 +41,8 @@ _MAX_LINE_STEPS = 40
 # problems 0.1, 0.01 and 0.001 took the same number of outer iterations.
 _LINE_TOLERANCE = 1e-2
 # A batch is iterated as a whole until this part of it is left: of 256 states of two bodies that slide about the slowest takes 5.0
-# iterations in the mean over steps, the average one 1.3. It is a second loop to compile, a seventh of the time for the gradient of
-# a hopper and a third for that of elliptic cones, which smaller batches are not worth.
+# iterations in the mean over steps, the average one 1.3. It is a second loop to compile, which smaller batches are not worth: a
+# fifth more for the gradient of a hopper, a third for that of elliptic cones.
 _SHARE = 8
 _LEAST_BATCH = 256
 # Sums of a few terms are known to about this many units of rounding.
