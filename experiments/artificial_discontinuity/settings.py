@@ -50,7 +50,7 @@ _GEOMETRIES: tuple[GeometryName, ...] = ("boxes", "points on the peg", "points o
 _MOST: tuple[ShapeName | int, ...] = ("box", "edges", "balls", "rounded_lattice", 8)
 # Samples and strata together are a multiple of 16, so that one compilation serves them and the search for jumps.
 SIZES = {
-    "quick": Sizes(("box", "balls"), ("slide", "roll"), (2, 4, 8), ("box",), _GEOMETRIES[2:], 64, 128, 14, 8),
+    "quick": Sizes(("box", "balls"), ("slide", "roll"), (2, 4, 8), ("box",), _GEOMETRIES[2:], 64, 112, 16, 8),
     "default": Sizes(_ALL, _PATHS, (2, 4, 8, 16), _MOST, _GEOMETRIES, 256, 512, 64, 8),
     "full": Sizes(_ALL, _PATHS, (2, 4, 8, 16, 32), (*_ALL, 8, 16), _GEOMETRIES, 1024, 2048, 256, 16),
 }
