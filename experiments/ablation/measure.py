@@ -79,7 +79,8 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
     # Compile times are measured, so Python keeps a core to itself.
     with ThreadPoolExecutor(num_compilers(besides=1)) as pool:
         motions = _Programs(found, _motion, starts, pool)
-        # Of the same motion, letter for letter, the gradient is the same: it has nothing else to be made from.
+        # Of the same motion, letter for letter, the gradient is taken to be the same: what is left out has no derivative rule of
+        # its own, which alone the text would not show.
         other = [v for v in found[1:] if not motions.is_same(v)] if sizes.has_every_gradient else []
         chosen = (EVERYTHING, FUSED, NEEDED, REACHED, *(v.name for v in other))
         gradients = _Programs([v for v in found if v.name in chosen], _gradient, starts, pool)

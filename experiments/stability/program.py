@@ -54,7 +54,7 @@ class Run:
     is_silent: np.ndarray
     is_gradient_finite: np.ndarray
     is_unsolved: np.ndarray
-    steps: "Steps"
+    steps: Steps
 
 
 def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Array]:

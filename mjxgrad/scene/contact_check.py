@@ -60,10 +60,10 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     # Inside jit, operations on known values would be traced, too.
     with jax.ensure_compile_time_eval():
         parameters = contact_parameters(model, pairs)
-    solref, impedance, width = (
-        np.asarray(x, dtype=float) for x in (parameters.solref, parameters.impedance, parameters.width)
+    solref, stiffness, damping, impedance, width = (
+        np.asarray(getattr(parameters, name), dtype=float)
+        for name in ("solref", "stiffness", "damping", "impedance", "width")
     )
-    stiffness, damping = (np.asarray(x, dtype=float) for x in (parameters.stiffness, parameters.damping))
     springs = [steepest(*one) for one in zip(stiffness, damping, impedance, width, strict=True)]
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
