@@ -19,15 +19,18 @@ try:
         # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
         # has: second implementations of these rules could disagree with them.
         from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as COLLISION_FUNCTIONS
+        from mujoco.mjx._src.collision_driver import _contact_groups as contact_groups
         from mujoco.mjx._src.collision_driver import _geom_groups as geom_groups
         from mujoco.mjx._src.collision_driver import _numeric as custom_number
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
         from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
+        from mujoco.mjx._src.math import make_frame
 finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 __all__ = [
     "COLLISION_FUNCTIONS",
+    "contact_groups",
     "counts",
     "custom_number",
     "geom_groups",
@@ -35,5 +38,6 @@ __all__ = [
     "has_collision_fn",
     "make_efc_address",
     "make_efc_type",
+    "make_frame",
     "mjx",
 ]

@@ -221,10 +221,10 @@ def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
 
 
 def test_a_budget_of_seconds_buys_the_samples_that_it_lasts_for():
-    """An estimator whose time is known: 20 µs per sample, and more on a busy machine but never less."""
+    """An estimator whose time is known: 0.1 ms per sample, and more on a busy machine but never less."""
 
     def wait(num_samples, value):
-        time.sleep(2e-5 * num_samples)
+        time.sleep(1e-4 * num_samples)
         return value
 
     def slow(objective, params, key, *, num_samples):
@@ -233,11 +233,11 @@ def test_a_budget_of_seconds_buys_the_samples_that_it_lasts_for():
         value = jax.pure_callback(functools.partial(wait, num_samples), shape, estimate.value)
         return eqx.tree_at(lambda e: e.value, estimate, value)
 
-    budget = Seconds(0.02, num_runs=3)
+    budget = Seconds(0.1, num_runs=3)
     bought = affordable(slow, RAMP.objective(STDDEV), jnp.array([POINT]), jax.random.key(0), budget)
-    assert 0 < bought.seconds <= 0.02
+    assert 0 < bought.seconds <= 0.1
     assert 300 < bought.num_samples <= 1000
-    assert bought.seconds > 2e-5 * bought.num_samples
+    assert bought.seconds > 1e-4 * bought.num_samples
 
 
 @pytest.mark.parametrize(

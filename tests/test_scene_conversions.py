@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
+from mjxgrad.dynamics.collision import collide
 from mjxgrad.scene import SceneWarning, load_scene
 
 PENDULUM = """
@@ -42,6 +43,7 @@ BOX = """
   </worldbody>
 </mujoco>
 """
+CUBE = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
 TENDON = "<tendon><fixed name='t'><joint joint='j' coef='2'/></fixed></tendon>"
 
 
@@ -187,11 +189,10 @@ def test_the_search_on_distance_fields_is_warned_about_because_its_normal_is_off
 
 
 def _num_touching(scene):
-    """Contacts found in C MuJoCo and in MJX."""
+    """Contacts found in C MuJoCo and by the library."""
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    collide = jax.jit(lambda m, d: mjx.collision(m, mjx.kinematics(m, d)))
-    distances = collide(scene.model, scene.data)._impl.contact.dist
+    distances = jax.jit(lambda m, d: collide(m, mjx.kinematics(m, d)))(scene.model, scene.data)._impl.contact.dist
     return data.ncon, int((distances < 0).sum())
 
 
@@ -210,11 +211,17 @@ def test_where_mjx_finds_other_contacts_the_summary_says_so():
     )
     assert _num_touching(lying) == (2, 1)
     assert "parallel capsules: MJX makes one contact, C MuJoCo two" in lying.summary()
-    tilted = load_scene(BOX.format(option=""))
     # The lower corners are at 95 − 100 (1 ± 0.0175 ± 0.035) mm: −10.2, −6.7, −3.2 and 0.3.
-    assert _num_touching(tilted) == (3, 1)
-    assert "corners within 1 mm of the deepest" in tilted.summary()
-    assert "unlike C MuJoCo" not in load_scene(_ball()).summary()
+    tilted = load_scene(BOX.format(option=""))
+    assert _num_touching(tilted) == (3, 3)
+    assert "unlike C MuJoCo" not in tilted.summary()
+    as_mesh = load_scene(
+        BOX.format(option="")
+        .replace('type="box" size="0.1 0.1 0.1"', 'type="mesh" mesh="cube"')
+        .replace("<worldbody>", f"<asset><mesh name='cube' vertex='{CUBE}'/></asset><worldbody>")
+    )
+    assert _num_touching(as_mesh) == (3, 1)
+    assert "mesh on plane: MJX keeps only corners within 1 mm of the deepest" in as_mesh.summary()
 
 
 def test_a_sensor_that_mjx_lacks_is_warned_about_and_the_others_stay():

@@ -36,7 +36,6 @@ def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
         (takes_other_impedance, "width 0: C MuJoCo takes the mean of both impedances, MJX the second"),
         (one.apart[precision] <= _SAME_MOTION, "the same motion, on either side of the bound between two classes"),
         (is_single, "single precision: right in float64"),
-        (np.full(len(one.points), one.scene.family == "box"), "box on plane: MJX keeps other corners than C MuJoCo"),
         (theirs.motion >= Motion.GAINS_ENERGY, "C MuJoCo fails, too, in another way"),
         (load(one.scene, one.points) >= 1, "beyond the explicit limit, where rounding grows"),
     )

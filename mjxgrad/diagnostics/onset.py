@@ -38,6 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contacts import ContactPair
+from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.contact import contact_jacobian
 from mjxgrad.rollout import Trajectory
 from mjxgrad.scene import Scene
@@ -157,7 +158,7 @@ def _pair_states(
     if not scene.pairs:
         return jnp.zeros(0, qpos.dtype), jnp.zeros(0, qpos.dtype)
     data = scene.data.replace(qpos=qpos, qvel=qvel)
-    data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+    data = collide(model, mjx.com_pos(model, mjx.kinematics(model, data)))
     contact = data._impl.contact
     bodies = jnp.asarray(model.geom_bodyid)[contact.geom]
     normals = contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim=1)[:, 0]

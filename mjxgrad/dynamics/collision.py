@@ -1,33 +1,112 @@
-"""Contacts between geoms, by MJX, with the derivative that it drops for a cylinder standing on a plane.
+"""Contacts between geoms: MJX's pairs, slots and functions, but for two kinds of pair whose points MJX finds in another way.
 
-MJX takes three points of the rim, the lowest one first, and gives the other two the height that follows from the first. Standing
-upright there is no lowest point; it then picks a fixed one, and the heights of the other two no longer feel a tilt about it.
-The positions of the contacts do: each lies half its distance from the rim towards the plane, n·(p - o) + d/2 is the height
-of the rim above the plane, and its derivative is the right one in every pose.
+A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
+and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
+there is nothing to search, and a contact belongs to one diagonal for good.
+
+A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and gives the other two the height that
+follows from the first. Standing upright there is no lowest point; it then picks a fixed one, and the heights of the other two
+no longer feel a tilt about it. The positions of the contacts do: each lies half its distance from the rim towards the plane,
+n·(p - o) + d/2 is the height of the rim above the plane, and its derivative is the right one in every pose.
 """
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float, Int
 
-from mjxgrad._mjx import mjx
+from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
+from mjxgrad.dynamics.spatial import contract, dot, pick
+
+# Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
+_PLANE, _HEIGHT_FIELD, _BOX, _CYLINDER = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "BOX", "CYLINDER")
+)
+_WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
+"""What has no bounding sphere."""
+_DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
+
+_Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
+"""Distances, positions and frames."""
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill in the contacts; a drop-in for `mjx.collision`."""
-    data = mjx.collision(model, data)
-    kinds = np.asarray(model.geom_type)
-    is_plane, is_cylinder = (
-        kinds == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER)
-    )
-    contact = data._impl.contact
-    if not (is_plane.any() and is_cylinder.any() and len(contact.dist)):
+    """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs."""
+    if not data._impl.ncon:
         return data
-    first, second = contact.geom[:, 0], contact.geom[:, 1]
-    stands = jnp.asarray(is_plane)[first] & jnp.asarray(is_cylinder)[second]
-    normal = contact.frame[:, 0]
-    height = jnp.sum(normal * (contact.pos - data.geom_xpos[first]), axis=1) + 0.5 * contact.dist
+    most_pairs, most_contacts = (custom_number(model, name) for name in ("max_geom_pairs", "max_contact_points"))
+    by_dim: dict[int, list] = {}
+    members = geom_groups(model)
+    for key, contact in contact_groups(model, data).items():
+        geoms = np.array(members[key])[:, :2]
+        if len(geoms) > most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types):
+            contact = _greatest(contact, -_gaps(model, data, geoms), most_pairs)
+            geoms = contact.geom
+        find = _FUNCTIONS.get(key.types) or COLLISION_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
+        dist, pos, frame = find(model, data, key, geoms)
+        count = len(dist) // len(geoms)
+        contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), contact)
+        by_dim.setdefault(int(key.condim), []).append(contact.replace(dist=dist, pos=pos, frame=frame))
+    ordered = []
+    for dim in sorted(by_dim):
+        contact = _joined(by_dim[dim])
+        if len(contact.dist) > most_contacts > -1:
+            contact = _greatest(contact, -contact.dist, most_contacts)
+        ordered.append(contact)
+    return data.tree_replace({"_impl.contact": _joined(ordered)})  # pyright: ignore[reportReturnType]
+
+
+def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
+    """Return the two geoms of each contact slot; None where it is decided at run time who gets a slot."""
+    if custom_number(model, "max_geom_pairs") > -1 or custom_number(model, "max_contact_points") > -1:
+        return None
+    by_dim: dict[int, list[np.ndarray]] = {}
+    for key, members in geom_groups(model).items():
+        count = COLLISION_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
+        by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
+    slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
+    return np.concatenate(slots) if slots else np.zeros((0, 2), int)
+
+
+def _joined(contacts: list):
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
+
+
+def _greatest(contact, score: Float[Array, " contacts"], count: int):
+    index = jax.lax.top_k(score, k=count)[1]
+    return jax.tree.map(lambda x: x[index], contact)
+
+
+def _gaps(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> Float[Array, " pairs"]:
+    """Return the distances of bounding spheres."""
+    first, second = data.geom_xpos[geoms.T]
+    return jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
+
+
+def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+    """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
+    plane, box = geoms.T
+    normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
+    height = dot(normal, centre - pick(plane, data.geom_xpos))
+    halves = jnp.asarray(_DIAGONALS, centre.dtype) * pick(box, model.geom_size)[:, None]
+    diagonal = contract("pij,pdj->pdi", pick(box, data.geom_xmat), halves)
+    rise = contract("pi,pdi->pd", normal, diagonal)
+    to_lower = jnp.where(rise > 0, -1, 1)
+    dist = height[:, None] + to_lower * rise
+    corner = centre[:, None] + to_lower[..., None] * diagonal
+    pos = corner - 0.5 * dist[..., None] * normal[:, None]
+    frame = jnp.repeat(jax.vmap(make_frame)(normal), len(_DIAGONALS), axis=0)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame
+
+
+def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+    """Return MJX's contacts with the derivative of the distance that it drops."""
+    dist, pos, frame = COLLISION_FUNCTIONS[key.types](model, data, key, geoms)
+    on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
+    height = dot(frame[:, 0], pos - on_plane) + 0.5 * dist
     # The value stays MJX's own; only the derivative is replaced.
-    mended = jax.lax.stop_gradient(contact.dist - height) + height
-    return data.tree_replace({"_impl.contact.dist": jnp.where(stands, mended, contact.dist)})  # pyright: ignore[reportReturnType]
+    return jax.lax.stop_gradient(dist - height) + height, pos, frame
+
+
+_FUNCTIONS = {(_PLANE, _BOX): _plane_box, (_PLANE, _CYLINDER): _plane_cylinder}

@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._mjx import COLLISION_FUNCTIONS, custom_number, geom_groups, mjx
+from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.impedance import impedance, is_square
 from mjxgrad.dynamics.jacobian import ContactRows, DenseRows, RowMap, Side
 
@@ -47,16 +48,9 @@ def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contac
 
 
 def slot_bodies(model: mjx.Model) -> np.ndarray | None:
-    """Return the two bodies of each contact slot, (contacts, 2); None where MJX chooses at run time who gets a slot."""
-    if custom_number(model, "max_geom_pairs") > -1 or custom_number(model, "max_contact_points") > -1:
-        return None
-    by_dim: dict[int, list[np.ndarray]] = {}
-    for key, members in geom_groups(model).items():
-        geoms = np.array(members)[:, :2]
-        count = COLLISION_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
-        by_dim.setdefault(int(key.condim), []).append(np.repeat(geoms, count, axis=0))
-    slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
-    return np.asarray(model.geom_bodyid)[np.concatenate(slots)] if slots else np.zeros((0, 2), int)
+    """Return the two bodies of each contact slot, (contacts, 2); None where it is decided at run time who gets a slot."""
+    geoms = slot_geoms(model)
+    return None if geoms is None else np.asarray(model.geom_bodyid)[geoms]
 
 
 def contact_rows(

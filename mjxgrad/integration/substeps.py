@@ -24,7 +24,7 @@ def substepped_rollout(
     """Roll out, and repeat each step in which a contact or limit begins or ends in short steps.
 
     A step holds an event if a distance changes its sign, judged by the distances at its beginning and the velocities at its end.
-    Contacts that one end of the step does not know (MJX keeps four of a box's corners) are judged by those that it does.
+    Contacts that one end of the step does not know (MJX keeps four corners of a mesh) are judged by those that it does.
 
     Single rollouts only: under `jax.vmap` every member takes the short steps in every step and throws them away.
 

@@ -1,0 +1,96 @@
+"""Contacts against C MuJoCo's and against MJX's."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import smooth
+from mjxgrad.dynamics.collision import collide, slot_geoms
+from tests.dynamics.scenes import central_difference
+
+# Two boxes that do not meet, over two tilted planes; margins beyond all distances, so that C MuJoCo reports every corner.
+BOXES = """
+<mujoco>
+  <default><geom margin="5"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 1" euler="10 20 0"/>
+    <geom type="plane" size="1 1 1" pos="0 0 -.05" euler="-15 0 0"/>
+    <body><freejoint/><geom type="box" size=".1 .2 .05" contype="2"/></body>
+    <body><freejoint/><geom type="box" size=".1 .02 .05" contype="2"/></body>
+  </worldbody>
+</mujoco>
+"""
+BALLS = """
+<mujoco>
+  <custom>{numbers}</custom>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 .09"><freejoint/><geom size=".1" condim="1"/></body>
+    <body pos=".17 0 .08"><freejoint/><geom size=".1" condim="1"/></body>
+    <body pos=".05 .2 .11"><freejoint/><geom size=".12"/></body>
+    <body pos=".3 .1 .095"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def _finder(model):
+    return jax.jit(lambda data: collide(model, smooth.com_pos(model, smooth.kinematics(model, data)))._impl.contact)
+
+
+def _poses(seed, num_boxes=2):
+    random = np.random.default_rng(seed)
+    quaternions = random.normal(size=(num_boxes, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.concatenate([random.normal(scale=0.1, size=(num_boxes, 3)), quaternions], axis=1).ravel()
+
+
+def test_a_box_on_a_plane_touches_where_it_does_in_c():
+    mj_model = mujoco.MjModel.from_xml_string(BOXES)
+    mj_data = mujoco.MjData(mj_model)
+    model = mjx.put_model(mj_model)
+    start, find, geoms = mjx.make_data(mj_model), _finder(model), slot_geoms(model)
+    for seed in range(20):
+        mj_data.qpos[:] = _poses(seed)
+        mujoco.mj_forward(mj_model, mj_data)
+        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
+        ours = np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]])
+        theirs = np.column_stack(
+            [mj_data.contact.geom, mj_data.contact.dist, mj_data.contact.pos, mj_data.contact.frame[:, :3]]
+        )
+        # Two planes, two boxes, four corners each: in C's order after sorting by pair and depth.
+        assert len(theirs) == 16
+        order = [np.lexsort((found[:, 2], found[:, 1], found[:, 0])) for found in (ours, theirs)]
+        np.testing.assert_allclose(ours[order[0]], theirs[order[1]], atol=1e-14)
+
+
+def test_the_contacts_of_a_box_have_the_derivative_of_its_corners():
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOXES))
+    start, find = mjx.make_data(model), _finder(model)
+
+    def outcome(qpos):
+        contact = find(start.replace(qpos=qpos))
+        return jnp.concatenate([contact.dist, contact.pos.ravel()])
+
+    qpos = jnp.asarray(_poses(7))
+    # Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5.
+    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "limits", [{}, {"max_geom_pairs": 2}, {"max_contact_points": 2}, {"max_geom_pairs": 2, "max_contact_points": 1}]
+)
+def test_slots_are_given_as_in_mjx(limits):
+    numbers = "".join(f'<numeric name="{name}" data="{limit}"/>' for name, limit in limits.items())
+    mj_model = mujoco.MjModel.from_xml_string(BALLS.format(numbers=numbers))
+    model = mjx.put_model(mj_model)
+    data = mjx.kinematics(model, mjx.make_data(mj_model))
+    ours, theirs = collide(model, data)._impl.contact, mjx.collision(model, data)._impl.contact
+    assert len(theirs.dist) == len(theirs.dim)
+    jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+    assert (slot_geoms(model) is None) == bool(limits)
+    if not limits:
+        np.testing.assert_array_equal(slot_geoms(model), theirs.geom)
