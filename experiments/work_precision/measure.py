@@ -1,6 +1,8 @@
 """From settings to numbers."""
 
+import itertools
 import time
+from collections.abc import Callable
 
 import mjxgrad as mg
 from experiments.work_precision import gradient, simulation
@@ -24,13 +26,14 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
     """
     cases = {name: case(name) for name in settings.scene_names}
     courses = []
-    # Compiling is most of the time, so progress is counted in programs.
-    total = sum(len(variants(one, settings, settings.has_asides(name))) for name, one in cases.items())
+    # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.
+    total = sum(len(variants(one, settings, settings.has_asides(name))) + 1 for name, one in cases.items())
+    done = itertools.count(1)
     with workspace.stage("scenes", "programs", total) as advance_to:
         for name, one in cases.items():
             workspace.check(mg.load_scene(one.model), name=one.title)
-            courses.append(_course(name, one, settings))
-            advance_to(sum(course.num_programs for course in courses))
+            courses.append(_course(name, one, settings, lambda: advance_to(next(done))))
+            advance_to(next(done))
     return Outcome(settings, tuple(courses))
 
 
@@ -79,9 +82,9 @@ def has_friction(one: Case) -> bool:
     return bool((model.geom_condim[touching] > 1).any()) or bool((model.pair_dim > 1).any())
 
 
-def _course(name: str, one: Case, settings: WorkPrecisionSettings) -> Course:
+def _course(name: str, one: Case, settings: WorkPrecisionSettings, on_each: Callable[[], None]) -> Course:
     begun = time.perf_counter()
-    programs = compiled(one, variants(one, settings, settings.has_asides(name)))
+    programs = compiled(one, variants(one, settings, settings.has_asides(name)), on_each)
     compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
     right = simulation.truths(one, programs, qvel, settings.num_threads)

@@ -129,12 +129,13 @@ def steps(case: Case, timestep: float) -> int:
     return round(case.duration / timestep)
 
 
-def compiled(case: Case, variants: Sequence[Variant]) -> dict[Variant, Program]:
+def compiled(case: Case, variants: Sequence[Variant], on_each: Callable[[], None]) -> dict[Variant, Program]:
     """Compile the programs of a scene.
 
     Args:
         case: the scene.
         variants: what to compile it for.
+        on_each: called as each is done, in their order.
 
     Returns:
         By variant.
@@ -145,10 +146,12 @@ def compiled(case: Case, variants: Sequence[Variant]) -> dict[Variant, Program]:
             begun = time.perf_counter()
             model, lowered = _lowered(case, variant)
             waiting[variant] = model, time.perf_counter() - begun, pool.submit(_compile, lowered)
-    return {
-        variant: Program(case, variant, model, result.result()[0], traced, result.result()[1])
-        for variant, (model, traced, result) in waiting.items()
-    }
+        programs = {}
+        for variant, (model, traced, result) in waiting.items():
+            call, seconds = result.result()
+            programs[variant] = Program(case, variant, model, call, traced, seconds)
+            on_each()
+    return programs
 
 
 def softened(model: mjx.Model, factor: float) -> mjx.Model:

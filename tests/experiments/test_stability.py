@@ -15,7 +15,7 @@ from experiments.stability.reference import simulate, unbalanced
 from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
 from experiments.stability.settings import SIZES, StabilitySettings
 from experiments.stability.verdict import findings
-from mjxgrad.diagnostics.stability import Motion
+from mjxgrad.diagnostics.stability import Derivative, Motion
 
 SCENES = {scene.name: scene for scene in catalogue()}
 
@@ -114,10 +114,10 @@ def test_a_solve_is_judged_by_the_forces_of_its_state_and_not_by_those_it_report
     assert wrong == pytest.approx(0.02 / moved, rel=1e-6)
 
 
-def _outcome(scene, grid, ours, theirs, apart):
+def _outcome(scene, grid, ours, theirs, apart, derivative=Derivative.RIGHT):
     def behaviour(motion):
         none = np.zeros(len(grid), bool)
-        right = np.zeros(len(grid), int)
+        right = np.full(len(grid), derivative)
         return Behaviour(np.array(motion), right, right, None, none, none, none, none, np.ones(len(grid)))
 
     kinds = {C_MUJOCO: behaviour(theirs), "float64": behaviour(ours)}
@@ -154,6 +154,16 @@ def test_other_impedances_at_no_width_are_told_apart():
     one = _outcome("ball", grid, [Motion.GAINS_ENERGY] * 2, [Motion.MOVES] * 2, [1.0, 1.0])
     assert reasons(one, "float64")[0] == UNEXPLAINED
     assert "width 0" in reasons(one, "float64")[1]
+
+
+def test_balls_that_part_from_one_point_and_motions_that_explode_are_told_apart():
+    worse = [Motion.TUNNELS] * 2, [Motion.MOVES] * 2, [1.0, 1.0]
+    found = reasons(_outcome("stack", _points(2, depth=[1.9, 2.0]), *worse), "float64")
+    assert found[0] == UNEXPLAINED
+    assert "centres coincide" in found[1]
+    assert reasons(_outcome("box, pyramidal", _points(2, depth=2.0), *worse), "float64")[0] == UNEXPLAINED
+    found = reasons(_outcome("box, pyramidal", _points(2), *worse, Derivative.EXPLODES), "float64")
+    assert "explodes" in found[0]
 
 
 def test_a_workspace_notes_what_a_scene_s_time_step_does_not_follow(tmp_path):
