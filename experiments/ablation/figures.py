@@ -10,6 +10,11 @@ from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
 _TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
+_KINDS = {
+    NEEDED: (ZEROTH, "all that no motion needs"),
+    REACHED: (FIRST, "and what recorded motions did not reach"),
+    None: (MUTED, "one group"),
+}
 
 
 def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
@@ -47,18 +52,24 @@ def ratios(drawn: list[tuple[SceneOutcome, VariantOutcome]]):
         axis.set_xlabel("share")
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
+    kinds = {_kind(variant) for _, variant in drawn}
     handles = [
-        Line2D([], [], color=ZEROTH, marker="o", ls="", label="all that no motion needs"),
-        Line2D([], [], color=FIRST, marker="o", ls="", label="and what recorded motions did not reach"),
-        Line2D([], [], color=MUTED, marker="o", ls="", label="one group"),
-        Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="changes motion or gradient"),
+        Line2D([], [], color=colour, marker="o", ls="", label=label)
+        for kind, (colour, label) in _KINDS.items()
+        if kind in kinds
     ]
+    if not all(variant.is_unchanged for _, variant in drawn):
+        handles.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="changes motion or gradient"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
 
 
+def _kind(variant: VariantOutcome) -> str | None:
+    return variant.name if variant.name in _KINDS else None
+
+
 def _colour(variant: VariantOutcome) -> str:
-    return {NEEDED: ZEROTH, REACHED: FIRST}.get(variant.name, MUTED)
+    return _KINDS[_kind(variant)][0]
 
 
 def _shares(variant: VariantOutcome) -> list[tuple[float | None, float | None, float | None]]:
