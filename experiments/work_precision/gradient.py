@@ -23,7 +23,7 @@ from experiments.work_precision.programs import Knobs, Program, Variant, timed
 from experiments.work_precision.settings import WorkPrecisionSettings
 from mjxgrad.objective import Differentiated, Objective
 
-# Step of the reference, as a share of the scene's own: four times finer than the finest estimate's by default.
+# Step of the reference, as a share of the scene's own: eight times finer than the finest estimate's by default.
 _FINEST = 8
 _SCRAMBLES = 8
 _REPEATS = 64

@@ -1,28 +1,21 @@
 """From settings to numbers."""
 
+import itertools
 import time
+from collections.abc import Callable
 
 import mjxgrad as mg
 from experiments.work_precision import gradient, simulation
 from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
 from experiments.work_precision.outcome import Course, Outcome
-from experiments.work_precision.programs import (
-    CONES,
-    FEW_ITERATIONS,
-    Cone,
-    Library,
-    Program,
-    Variant,
-    compiled,
-    own_cone,
-)
+from experiments.work_precision.programs import CONES, FEW_ITERATIONS, Cone, Library, Variant, compiled, own_cone
 from experiments.work_precision.settings import WorkPrecisionSettings
 from experiments.workspace import Workspace
 
 
 def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
-    """Compile the programs of all scenes, then measure one scene after the other: nothing is compiled while it is timed.
+    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed.
 
     Args:
         settings: of the run.
@@ -32,20 +25,16 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
         The numbers.
     """
     cases = {name: case(name) for name in settings.scene_names}
-    for one in cases.values():
-        workspace.check(mg.load_scene(one.model), name=one.title)
-    wanted = [(one, variants(one, settings, settings.has_asides(name))) for name, one in cases.items()]
-    num_programs = sum(len(of_scene) for _, of_scene in wanted)
-    begun = time.perf_counter()
-    with workspace.stage("compiling", "programs", num_programs) as advance_to:
-        programs = compiled(wanted, advance_to)
-    compiling = time.perf_counter() - begun
     courses = []
-    with workspace.stage("measuring", "scenes", len(cases)) as advance_to:
-        for (name, one), of_scene in zip(cases.items(), programs, strict=True):
-            courses.append(_course(name, one, of_scene, settings))
-            advance_to(len(courses))
-    return Outcome(settings, tuple(courses), num_programs, compiling)
+    # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.
+    total = sum(len(variants(one, settings, settings.has_asides(name))) + 1 for name, one in cases.items())
+    done = itertools.count(1)
+    with workspace.stage("scenes", "programs", total) as advance_to:
+        for name, one in cases.items():
+            workspace.check(mg.load_scene(one.model), name=one.title)
+            courses.append(_course(name, one, settings, lambda: advance_to(next(done))))
+            advance_to(next(done))
+    return Outcome(settings, tuple(courses))
 
 
 def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> list[Variant]:
@@ -93,7 +82,10 @@ def has_friction(one: Case) -> bool:
     return bool((model.geom_condim[touching] > 1).any()) or bool((model.pair_dim > 1).any())
 
 
-def _course(name: str, one: Case, programs: dict[Variant, Program], settings: WorkPrecisionSettings) -> Course:
+def _course(name: str, one: Case, settings: WorkPrecisionSettings, on_each: Callable[[], None]) -> Course:
+    begun = time.perf_counter()
+    programs = compiled(one, variants(one, settings, settings.has_asides(name)), on_each)
+    compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
     right = simulation.truths(one, programs, qvel, settings.num_threads)
     points = simulation.measured(one, programs, qvel, right, settings)
@@ -107,4 +99,6 @@ def _course(name: str, one: Case, programs: dict[Variant, Program], settings: Wo
         references=tuple(truth.found for truth in right.values()),
         estimates=tuple(estimates),
         gradient_reference=gradient_reference,
+        num_programs=len(programs),
+        compile_wall_seconds=compiling,
     )

@@ -192,6 +192,8 @@ class Course:
         references: of the motion.
         estimates: of the gradient.
         gradient_reference: what they are compared with.
+        num_programs: that were compiled.
+        compile_wall_seconds: until all were.
     """
 
     name: str
@@ -202,6 +204,8 @@ class Course:
     references: tuple[Reference, ...]
     estimates: tuple[Estimate, ...]
     gradient_reference: GradientReference
+    num_programs: int
+    compile_wall_seconds: float
 
     def reference(self, engine: str, cone: str) -> Reference:
         """Give the reference of an engine with a cone."""
@@ -224,14 +228,10 @@ class Outcome:
     Attributes:
         settings: of the run.
         courses: one per scene.
-        num_programs: that were compiled.
-        compile_wall_seconds: until all were.
     """
 
     settings: WorkPrecisionSettings
     courses: tuple[Course, ...]
-    num_programs: int
-    compile_wall_seconds: float
 
     def rows(self) -> list[dict[str, Any]]:
         """Give the rows of metrics.csv: points of the motion first, then estimates of the gradient."""

@@ -129,32 +129,28 @@ def steps(case: Case, timestep: float) -> int:
     return round(case.duration / timestep)
 
 
-def compiled(
-    wanted: Sequence[tuple[Case, Sequence[Variant]]], advance_to: Callable[[int], None]
-) -> list[dict[Variant, Program]]:
-    """Compile the programs of all scenes; those of one while the next is traced, so that no core waits.
+def compiled(case: Case, variants: Sequence[Variant], on_each: Callable[[], None]) -> dict[Variant, Program]:
+    """Compile the programs of a scene.
 
     Args:
-        wanted: scenes, each with what to compile it for.
-        advance_to: is told how many are done, in order.
+        case: the scene.
+        variants: what to compile it for.
+        on_each: called as each is done, in their order.
 
     Returns:
-        By variant, scene by scene.
+        By variant.
     """
-    waiting: list[tuple[int, Variant, mjx.Model, float, Future]] = []
-    programs: list[dict[Variant, Program]] = [{} for _ in wanted]
+    waiting: dict[Variant, tuple[mjx.Model, float, Future]] = {}
     with ThreadPoolExecutor(num_compilers()) as pool:
-        for place, (case, variants) in enumerate(wanted):
-            for variant in variants:
-                begun = time.perf_counter()
-                model, lowered = _lowered(case, variant)
-                traced = time.perf_counter() - begun
-                waiting.append((place, variant, model, traced, pool.submit(_compile, lowered)))
-                advance_to(sum(result.done() for *_, result in waiting))
-        for done, (place, variant, model, traced, result) in enumerate(waiting, start=1):
+        for variant in variants:
+            begun = time.perf_counter()
+            model, lowered = _lowered(case, variant)
+            waiting[variant] = model, time.perf_counter() - begun, pool.submit(_compile, lowered)
+        programs = {}
+        for variant, (model, traced, result) in waiting.items():
             call, seconds = result.result()
-            programs[place][variant] = Program(wanted[place][0], variant, model, call, traced, seconds)
-            advance_to(max(done, sum(result.done() for *_, result in waiting)))
+            programs[variant] = Program(case, variant, model, call, traced, seconds)
+            on_each()
     return programs
 
 

@@ -56,7 +56,7 @@ SIZES = {
     ),
     "default": Sizes(
         _DEFAULT_SCENES, ("pendulum", "bounce"), (0.5, 1.0, 2.0, 4.0, 8.0), (1e-2, 1e-4, 1e-6), 32, 256,
-        (8, 32, 128), (0.5, 1.0, 2.0), (2.0, 4.0), 5, 0.4, False,
+        (8, 32, 128), (0.5, 1.0), (2.0, 4.0), 5, 0.4, False,
     ),
     "full": Sizes(
         (*_DEFAULT_SCENES, "half_cheetah", "walker2d", "ant"), None, (0.5, 1.0, 2.0, 4.0, 8.0),

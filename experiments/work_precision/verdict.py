@@ -66,9 +66,11 @@ def findings(outcome: Outcome) -> list[str]:
             "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful: "
             f"{'; '.join(doubtful)}."
         )
+    programs = sum(course.num_programs for course in outcome.courses)
+    seconds = sum(course.compile_wall_seconds for course in outcome.courses)
     sentences.append(
-        f"{outcome.num_programs} programs were compiled, {num_compilers()} at a time, in {outcome.compile_wall_seconds:.0f} s "
-        "(less where a former run had compiled them)."
+        f"{programs} programs were compiled, {num_compilers()} at a time, in {seconds:.0f} s (less where a former run had "
+        "compiled them)."
     )
     return sentences
 

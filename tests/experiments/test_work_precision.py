@@ -89,8 +89,8 @@ def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendatio
     references = tuple(Reference(name, "pyramidal", "RK4", 1e-5, 1e-4, 2e-4, 0.0) for name in ("mg.step", "C MuJoCo"))
     known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01, 1e-4)
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
-    course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known)
-    outcome = Outcome(WorkPrecisionSettings(experiment="work_precision"), (course,), 3, 1.0)
+    course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known, 3, 1.0)
+    outcome = Outcome(WorkPrecisionSettings(experiment="work_precision"), (course,))
     for draw in (figures.motion, figures.gradient):
         figure = draw(course, outcome)
         figure.canvas.draw()
