@@ -109,8 +109,54 @@ def _solve_jvp(layout, max_iterations, primals, tangents):
     return (acceleration, num_iterations), (-respond(layout, system, bend, change), no_change)
 
 
-def respond(layout: RowLayout, system: System, bend: Bend, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def solve_where(
+    layout: RowLayout,
+    max_iterations: int,
+    system: System,
+    is_needed: Bool[Array, ""],
+    start: Float[Array, " nv"],
+    tolerance: Float[Array, ""],
+) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
+    """Solve where it is needed; elsewhere the start is returned, whose derivative must not count, for it is zero.
+
+    Returns:
+        As `solve` does.
+    """
+
+    def run(system, is_needed, start, tolerance):
+        def minimise(system, start, tolerance):
+            return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)
+
+        none = jnp.zeros(is_needed.shape, jnp.int32)
+        return linear.on_few(minimise, is_needed, (start, none), system, start, tolerance)
+
+    return linear.batch_last(run)(system, is_needed, start, tolerance)
+
+
+@solve_where.defjvp
+def _solve_where_jvp(layout, max_iterations, primals, tangents):
+    system, is_needed, start, tolerance = primals
+    acceleration, num_iterations = solve_where(layout, max_iterations, system, is_needed, start, tolerance)
+    acceleration = checkpoint_name(acceleration, CHECKPOINT_NAME)
+    _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
+    bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
+    no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)
+    moved = -respond(layout, system, bend, change, is_needed)
+    return (acceleration, num_iterations), (moved, no_change)
+
+
+def respond(
+    layout: RowLayout,
+    system: System,
+    bend: Bend,
+    force: Float[Array, " nv"],
+    is_needed: Bool[Array, ""] | None = None,
+) -> Float[Array, " nv"]:
+    """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force.
+
+    Where it is not needed it is zero.
+    """
 
     def apply(x: Float[Array, " nv"]) -> Float[Array, " nv"]:
         return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
@@ -119,7 +165,12 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: Float[Array, "
         problem = system.problem()
         return factor.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
 
+    def run_where(system, bend, force, is_needed):
+        return linear.on_few(run, is_needed, jnp.zeros_like(force), system, bend, force)
+
     def invert(_, force):
-        return linear.batch_last(run)(system, bend, force)
+        if is_needed is None:
+            return linear.batch_last(run)(system, bend, force)
+        return linear.batch_last(run_where)(system, bend, force, is_needed)
 
     return jax.lax.custom_linear_solve(apply, force, invert, symmetric=True)

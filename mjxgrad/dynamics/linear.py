@@ -10,14 +10,16 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
+# What only some of a batch need is computed for this part of it at a time.
+_FEW = 8
 
 
 def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
@@ -99,6 +101,37 @@ def batch_last(function, batch: int | None = None):
         return batched(*args)
 
     return wrapped
+
+
+def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
+    """Return what a function gives where it is needed, and the default elsewhere.
+
+    Of a batch an eighth is taken at a time, until none is left: for what few of its members need.
+
+    Args:
+        function: of arrays whose trailing axis is the batch, as are those of its result.
+        is_needed: by whom; without axes for a single problem.
+        default: shaped as the result.
+        args: to the function.
+    """
+    if not is_needed.ndim:
+        return jax.lax.cond(is_needed, lambda: function(*args), lambda: default)
+    count = -(-is_needed.shape[0] // _FEW)
+
+    def turn(state):
+        is_left, result = state
+        # Of equals the first come first.
+        _, index = jax.lax.top_k(is_left.astype(jnp.float32), count)
+        part = function(*jax.tree.map(lambda x: jnp.take(x, index, axis=-1, mode="clip"), args))
+        place = jnp.cumsum(is_left) - 1
+        is_done = is_left & (place < count)
+
+        def put(whole: Array, few: Array) -> Array:
+            return jnp.where(is_done, jnp.take(few, place, axis=-1, mode="clip"), whole)
+
+        return is_left & ~is_done, jax.tree.map(put, result, part)
+
+    return jax.lax.while_loop(lambda state: jnp.any(state[0]), turn, (is_needed, default))[1]
 
 
 def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:

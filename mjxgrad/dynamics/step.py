@@ -13,13 +13,15 @@ import functools
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, events, factor, forces, implicit, noise, smooth
+from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
@@ -28,6 +30,7 @@ from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.known import is_known_to_be
+from mjxgrad.dynamics.onset import Onset, Shares
 from mjxgrad.smoothing import Smoothing
 
 _Disable = mujoco.mjtDisableBit
@@ -62,7 +65,12 @@ def check_gradient(gradient: str) -> None:
 
 @_at_full_precision
 def step(
-    model: mjx.Model, data: mjx.Data, *, gradient: Gradient = "discrete", smoothing: Smoothing | None = None
+    model: mjx.Model,
+    data: mjx.Data,
+    *,
+    gradient: Gradient = "discrete",
+    onset: Onset | None = None,
+    smoothing: Smoothing | None = None,
 ) -> mjx.Data:
     """Advance the state by one time step.
 
@@ -72,6 +80,8 @@ def step(
         gradient: "discrete", the exact derivative of the simulated map, or "event", which adds what that one does not
             see, that the time of a contact's or limit's beginning and end moves; see `dynamics.events`. The step itself
             is the same.
+        onset: lets contacts and limits begin within the step, so that the motion has no jumps and its plain derivative is
+            right; see `dynamics.onset`. None is MuJoCo's step.
         smoothing: averages every contact over noise on its distance, for the motion or for its derivative alone.
 
     Returns:
@@ -81,17 +91,19 @@ def step(
         `opt.iterations` where these, or the digits of the precision, were too few.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or the smoothing
-            has a leading axis or is to go with the gradient "event".
+        ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or onset or
+            smoothing have a leading axis or are to go with the gradient "event".
         NotImplementedError: if MJX lacks the integrator.
     """
     check_gradient(gradient)
     if smoothing is not None:
         smoothing.check(gradient)
+    if onset is not None:
+        onset.check(gradient)
     integrator = model.opt.integrator
     if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, gradient, smoothing)
-    data, blocks = _forward(model, data, smoothing)
+        return _runge_kutta(model, data, gradient, onset, smoothing)
+    data, blocks = _forward(model, data, onset, smoothing)
     moving = events.correct(model, data, blocks) if gradient == "event" else data
     if integrator == _Integrator.mjINT_EULER:
         return _advance(model, data, _euler_acceleration(model, moving), None)
@@ -101,12 +113,15 @@ def step(
 
 
 @_at_full_precision
-def forward(model: mjx.Model, data: mjx.Data, *, smoothing: Smoothing | None = None) -> mjx.Data:
+def forward(
+    model: mjx.Model, data: mjx.Data, *, onset: Onset | None = None, smoothing: Smoothing | None = None
+) -> mjx.Data:
     """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`.
 
     Args:
         model: any model of MJX's JAX implementation.
         data: the present state, controls and applied forces.
+        onset: as for `step`: accelerations and forces are then means over the coming time step.
         smoothing: as for `step`.
 
     Returns:
@@ -114,20 +129,25 @@ def forward(model: mjx.Model, data: mjx.Data, *, smoothing: Smoothing | None = N
         smoothed ones, present at any distance.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, or the smoothing has a leading axis.
+        ValueError: if `model` or `data` belong to another implementation of MJX, or onset or smoothing
+            have a leading axis.
     """
     if smoothing is not None:
         smoothing.check("discrete")
-    return _forward(model, data, smoothing)[0]
+    if onset is not None:
+        onset.check("discrete")
+    return _forward(model, data, onset, smoothing)[0]
 
 
-def _forward(model: mjx.Model, data: mjx.Data, smoothing: Smoothing | None) -> tuple[mjx.Data, list[Block]]:
+def _forward(
+    model: mjx.Model, data: mjx.Data, onset: Onset | None, smoothing: Smoothing | None
+) -> tuple[mjx.Data, list[Block]]:
     """Return the data, and the constraint rows that went into it."""
-    data, blocks = _smooth(model, data)
+    data, blocks, shares = _smooth(model, data, onset)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     if smoothing is None:
-        data = _minimum(model, data, *_system(model, data, blocks), _start(model, data))
+        data = _minimum(model, data, *_system(model, data, blocks), _start(model, data), _partial(blocks, shares))
     else:
         data = _smoothed_solve(model, data, blocks, smoothing)
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
@@ -161,6 +181,23 @@ def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowL
     """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
     layout = assembly.row_layout(model, data)
     return layout, assembly.system_of(model, data, layout, assembly.joined(blocks)) if blocks else None
+
+
+class _Partial(eqx.Module):
+    """Contacts that act for a part of the step: the rows' weights in both solves, see `dynamics.onset`."""
+
+    before: Float[Array, " rows"]
+    after: Float[Array, " rows"]
+    share: Float[Array, ""]
+    is_split: Bool[Array, ""]
+
+
+def _partial(blocks: list[Block], shares: Shares | None) -> _Partial | None:
+    if shares is None:
+        return None
+    rows = assembly.joined(blocks)
+    before, after = (onsets.weights(rows, share) for share in (shares.before, shares.after))
+    return _Partial(before, after, shares.weight, shares.is_split)
 
 
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -202,21 +239,30 @@ def _with_derivative_of_jvp(primals, tangents):
 
 
 def _minimum(
-    model: mjx.Model, data: mjx.Data, layout: RowLayout, system: System | None, start: Float[Array, " nv"]
+    model: mjx.Model,
+    data: mjx.Data,
+    layout: RowLayout,
+    system: System | None,
+    start: Float[Array, " nv"],
+    partial: _Partial | None = None,
 ) -> mjx.Data:
+    """Return data with the acceleration, and the forces of the rows, at which all are in balance."""
     if system is None or not layout.num_rows or not model.nv:
         data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
         none = jnp.zeros_like(data._impl.solver_niter)
         return data.tree_replace({"_impl.solver_niter": none})  # pyright: ignore[reportReturnType]
-    tolerance = jnp.asarray(model.opt.tolerance, data.qvel.dtype)
-    acceleration, num_iterations = implicit.solve(
-        layout,
-        int(model.opt.iterations),
-        system,
-        jax.lax.stop_gradient(start),
-        jax.lax.stop_gradient(tolerance),
-    )
+    tolerance = jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
+    iterations = int(model.opt.iterations)
+    system = system if partial is None else _weighed(system, partial.after)
+    acceleration, num_iterations = implicit.solve(layout, iterations, system, jax.lax.stop_gradient(start), tolerance)
     force = system.row_force(layout, acceleration)
+    if partial is not None:
+        earlier = _weighed(system, partial.before)
+        near = jax.lax.stop_gradient(acceleration)
+        first, more = implicit.solve_where(layout, iterations, earlier, partial.is_split, near, tolerance)
+        acceleration = first + partial.share * (acceleration - first)
+        force = (1 - partial.share) * earlier.row_force(layout, first) + partial.share * force
+        num_iterations = jnp.maximum(num_iterations, more)
     return data.tree_replace(  # pyright: ignore[reportReturnType]
         {
             "qacc": acceleration,
@@ -227,7 +273,13 @@ def _minimum(
     )
 
 
-def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
+def _weighed(system: System, weight: Float[Array, " rows"]) -> System:
+    return eqx.tree_at(lambda s: s.rows.weight, system, weight)
+
+
+def _smooth(
+    model: mjx.Model, data: mjx.Data, onset: Onset | None
+) -> tuple[mjx.Data, list[Block], Shares | None]:
     """Run the stages up to the unconstrained acceleration; tendons, cameras and collisions are MJX's."""
     data = smooth.com_pos(model, smooth.kinematics(model, data))
     data = mjx.camlight(model, data)
@@ -238,12 +290,14 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = collide(model, data)
-    blocks = assembly.gather(model, data)
+    blocks, shares = assembly.gather(model, data), None
+    if onset is not None:
+        blocks, shares = onsets.begin(model, data, blocks, onset)
     data = assembly.make_constraint(model, data, blocks)
     if model.nu:
         data = forces.transmission(model, data)
     data = forces.fwd_velocity(model, data)
-    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
+    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks, shares
 
 
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -288,7 +342,9 @@ def _advance(
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient, smoothing: Smoothing | None) -> mjx.Data:
+def _runge_kutta(
+    model: mjx.Model, start: mjx.Data, gradient: Gradient, onset: Onset | None, smoothing: Smoothing | None
+) -> mjx.Data:
     """Advance by the classical fourth-order rule.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
@@ -306,7 +362,7 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data, gradient: Gradient, smoothin
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data, blocks = _forward(model, data, smoothing)
+        data, blocks = _forward(model, data, onset, smoothing)
         rates = (data.qvel, data.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
         return (rates, sums, data.qacc), (data, blocks if gradient == "event" else None)
