@@ -1,8 +1,10 @@
-"""Contacts between geoms: MJX's pairs, slots and functions, but for two kinds of pair whose points MJX finds in another way.
+"""Contacts between geoms: MJX's pairs, slots and functions, but for three kinds of pair whose points MJX finds in another way.
 
 A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
 and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
 there is nothing to search, and a contact belongs to one diagonal for good.
+
+A ball on a box. MJX knows its distance only where they overlap; the nearest point of a box is known anywhere.
 
 A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and gives the other two the height that
 follows from the first. Standing upright there is no lowest point; it then picks a fixed one, and the heights of the other two
@@ -17,11 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
+from mjxgrad.dynamics.rotation import safe_norm
 from mjxgrad.dynamics.spatial import contract, dot, pick
 
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
-_PLANE, _HEIGHT_FIELD, _BOX, _CYLINDER = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "BOX", "CYLINDER")
+_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER")
 )
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
@@ -109,4 +112,26 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray
     return jax.lax.stop_gradient(dist - height) + height, pos, frame
 
 
-_FUNCTIONS = {(_PLANE, _BOX): _plane_box, (_PLANE, _CYLINDER): _plane_cylinder}
+def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+    """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
+    sphere, box = geoms.T
+    turn, size = pick(box, data.geom_xmat), pick(box, model.geom_size)
+    away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
+    centre = contract("pji,pj->pi", turn, away)
+    beyond = jnp.abs(centre) - size
+    is_inside = jnp.all(beyond <= 0, axis=1)
+    sign = jnp.where(centre < 0, -1.0, 1.0)
+    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
+    length = safe_norm(gap)
+    nearest = jnp.argmax(beyond, axis=1)
+    face = sign * (jnp.arange(3) == nearest[:, None])
+    outward = jnp.where(is_inside[:, None], face, gap / jnp.where(length > 0, length, 1.0)[:, None])
+    distance = jnp.where(is_inside, jnp.max(beyond, axis=1), length)
+    radius = pick(sphere, model.geom_size)[:, 0]
+    normal = contract("pij,pj->pi", turn, -outward)
+    # Half-way between both surfaces.
+    pos = pick(sphere, data.geom_xpos) + (0.5 * (distance + radius))[:, None] * normal
+    return distance - radius, pos, jax.vmap(make_frame)(normal)
+
+
+_FUNCTIONS = {(_PLANE, _BOX): _plane_box, (_PLANE, _CYLINDER): _plane_cylinder, (_SPHERE, _BOX): _sphere_box}
