@@ -27,6 +27,7 @@ def motion(
     num_times: int,
     steps_between: Int[ArrayLike, ""],
     gradient: str,
+    onset: mg.Onset | None = None,
 ) -> Float[Array, "times *outcome"]:
     """Step, and read the state at equal intervals. `mg.rollout` would compile anew for every number of steps.
 
@@ -37,13 +38,14 @@ def motion(
         num_times: how often to read.
         steps_between: steps from one reading to the next; may be traced, and the whole is then for forward mode alone.
         gradient: which derivative the steps have.
+        onset: of contacts within the step; None is MuJoCo's motion.
 
     Returns:
         The readings, the first `steps_between` steps after the start.
     """
 
     def step(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        moved = mg.step(model, data.replace(**dict(zip(_STATE, state, strict=True))), gradient=gradient)
+        moved = mg.step(model, data.replace(**dict(zip(_STATE, state, strict=True))), gradient=gradient, onset=onset)
         return tuple(getattr(moved, name) for name in _STATE)
 
     def until_next(state: tuple[Array, ...], _: None):

@@ -19,6 +19,7 @@ from experiments.planning.settings import PlanningSettings
 from experiments.policy_gradient.settings import PolicyGradientSettings
 from experiments.report import Report
 from experiments.rolling_pin.settings import RollingPinSettings
+from experiments.sawtooth.settings import SawtoothSettings
 from experiments.stability.settings import StabilitySettings
 from experiments.textbook.settings import TextbookSettings
 from experiments.work_precision.settings import WorkPrecisionSettings
@@ -60,6 +61,7 @@ EXPERIMENTS = {
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
     "policy_gradient": Experiment(PolicyGradientSettings, "experiments.policy_gradient.run:run"),
     "rolling_pin": Experiment(RollingPinSettings, "experiments.rolling_pin.run:run"),
+    "sawtooth": Experiment(SawtoothSettings, "experiments.sawtooth.run:run"),
     "stability": Experiment(StabilitySettings, "experiments.stability.run:run"),
     "textbook": Experiment(TextbookSettings, "experiments.textbook.run:run"),
     "work_precision": Experiment(WorkPrecisionSettings, "experiments.work_precision.run:run"),

@@ -3,7 +3,7 @@
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
-from mjxgrad.dynamics import forward, solve, step
+from mjxgrad.dynamics import Onset, forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -35,6 +35,7 @@ __all__ = [
     "History",
     "LeaveOut",
     "Objective",
+    "Onset",
     "Optimisation",
     "Plateau",
     "Progress",

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import Gradient, check_gradient, forward, step
+from mjxgrad.dynamics import Gradient, Onset, check_gradient, forward, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.smoothing import Smoothing, smoothing_warnings
@@ -108,6 +108,7 @@ def rollout(
     observe: Observe | None = None,
     checkpoint: bool = True,
     gradient: Gradient = "discrete",
+    onset: Onset | None = None,
     smoothing: Smoothing | None = None,
     velocity_limit: float | None = 1e4,
 ) -> Trajectory:
@@ -128,7 +129,9 @@ def rollout(
         checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
             a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
         gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same. The default is what
-            finite differences of it give; for costs of motions that hit something take "event", as tasks do.
+            finite differences of it give.
+        onset: lets contacts and limits begin within the step, see `step`; `mg.Onset()` for costs of motions that hit something,
+            as tasks take. None is MuJoCo's motion, to the bit, for which "event" is the derivative that is right in the mean.
         smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
             `SceneWarning` what of the scene it has no effect on.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
@@ -137,7 +140,7 @@ def rollout(
         The trajectory, with `horizon + 1` states.
 
     Raises:
-        ValueError: if there is no such gradient, it does not go with the smoothing, shapes do not fit the scene, the
+        ValueError: if there is no such gradient, it does not go with onset or smoothing, shapes do not fit the scene, the
             horizon is missing or contradicted, or controls or noise hold numbers that are not finite (checked where
             values are known, that is outside `jax.jit`; inside, the rollout is flagged as diverged at that step).
     """
@@ -146,6 +149,8 @@ def rollout(
         smoothing.check(gradient)
         for message in smoothing_warnings(smoothing, scene.model):
             warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
+    if onset is not None:
+        onset.check(gradient)
     nu = scene.model.nu
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
@@ -163,12 +168,12 @@ def rollout(
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
         data = data_of(scene, state, ctrl)
-        stepped = step(scene.model, data, gradient=gradient, smoothing=smoothing)
+        stepped = step(scene.model, data, gradient=gradient, onset=onset, smoothing=smoothing)
         moved = state_of(stepped)
         is_bad = ~is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
-        seen = None if observe is None else _observed(scene, observe, data, stepped, smoothing)
+        seen = None if observe is None else _observed(scene, observe, data, stepped, onset, smoothing)
         unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
         return (kept, first_bad, unsolved), (state.qpos, state.qvel, ctrl, seen)
 
@@ -184,7 +189,7 @@ def rollout(
     )
     if observe is not None:
         data = data_of(scene, final, ctrl[-1])
-        last = observe(scene.model, forward(scene.model, data, smoothing=smoothing))
+        last = observe(scene.model, forward(scene.model, data, onset=onset, smoothing=smoothing))
         seen = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, last)
     return Trajectory(
         qpos=jnp.concatenate([qpos, final.qpos[None]]),
@@ -240,11 +245,18 @@ def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
 
 
-def _observed(scene: Scene, observe: Observe, data: mjx.Data, stepped: mjx.Data, smoothing: Smoothing | None) -> PyTree:
+def _observed(
+    scene: Scene,
+    observe: Observe,
+    data: mjx.Data,
+    stepped: mjx.Data,
+    onset: Onset | None,
+    smoothing: Smoothing | None,
+) -> PyTree:
     """Call `observe` with the data of the state before the step."""
     if scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         # The step's own are of its last stage.
-        return observe(scene.model, forward(scene.model, data, smoothing=smoothing))
+        return observe(scene.model, forward(scene.model, data, onset=onset, smoothing=smoothing))
     before = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
     return observe(scene.model, stepped.replace(**before))
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import Gradient, check_gradient
+from mjxgrad.dynamics import Gradient, Onset, check_gradient
 from mjxgrad.rollout import State, Trajectory, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.smoothing import Smoothing
@@ -96,9 +96,9 @@ class SceneTask(Task):
             and controls up to t, whose sum is the cost; traceable.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
-        gradient: of each step, "discrete" or "event", see `step`. None, the default, takes "event": its bias as an estimate was
-            not to be told from zero on tasks where that of "discrete" was 130 to 630 % (`make policy_gradient`); and
-            "discrete" where there is smoothing, whose derivative has the correction in it.
+        gradient: of each step, "discrete" or "event", see `step`.
+        onset: lets contacts begin within the step, so that the cost has no jumps but real ones and its plain derivative is right
+            sample by sample; None is MuJoCo's motion. A leaf.
         smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
@@ -107,17 +107,22 @@ class SceneTask(Task):
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
-    gradient: Gradient | None = eqx.field(static=True, default=None, kw_only=True)
+    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
+    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self, gradient: Gradient) -> "SceneTask":
-        """Give the same task with another derivative of its steps.
+        """Give the same task with MuJoCo's own motion and one of its derivatives.
 
         Raises:
             ValueError: if there is no such gradient.
         """
         check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient)
+        return dataclasses.replace(self, gradient=gradient, onset=None)
+
+    def with_onset(self, onset: Onset | None) -> "SceneTask":
+        """Give the same task with contacts that begin otherwise."""
+        return dataclasses.replace(self, gradient="discrete", onset=onset)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -154,7 +159,8 @@ class SceneTask(Task):
             noise,
             horizon=self.horizon,
             observe=_activations if has_activations else None,
-            gradient=self.gradient or ("event" if self.smoothing is None else "discrete"),
+            gradient=self.gradient,
+            onset=self.onset,
             smoothing=self.smoothing,
         )
         elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)

@@ -1,5 +1,6 @@
 """One step that can be differentiated."""
 
+from mjxgrad.dynamics.onset import Onset
 from mjxgrad.dynamics.step import Gradient, check_gradient, forward, solve, step
 
-__all__ = ["Gradient", "check_gradient", "forward", "solve", "step"]
+__all__ = ["Gradient", "Onset", "check_gradient", "forward", "solve", "step"]

@@ -19,7 +19,7 @@ state and parameters, for contacts, joint and tendon limits, all cones, at the b
 1. The plain derivative is unbiased by the fundamental theorem of calculus: its mean over any interval is the difference of the
    outcome. No saltation term is needed, and no assumption on order, speed or duration of contacts.
 2. The ramp is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's: what is lost is
-   the sawtooth, which is error of the time step. φ = 1 is MuJoCo's contact to the last bit, φ = 0 is none, and bodies that rest,
+   the sawtooth, which is error of the time step. φ = 1 is MuJoCo's contact, φ = 0 is none, and bodies that rest,
    slide or stick deeper than w / 2 have φ = 1.
 
 **Several at once.** The integral needs a solve for each of its pieces. Two are taken, however many contacts are partial,
@@ -77,7 +77,7 @@ _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
 )
 # Impedance of a partial contact is no smaller than this part of its own: a weight of zero has no logarithm's derivative.
 _LEAST_SHARE = 1e-9
-# What a pyramid's slip adds to the width. With 1 a box pushed along the floor at 4 ms has derivatives of 10⁷, with 2 and 3 of 1 to 4.
+# What a pyramid's slip adds to the width. A box pushed along the floor at 4 ms has derivatives of 10⁷ with 1, of 1 to 4 with 2 and 3.
 _SLIP = 3.0
 
 
@@ -106,7 +106,9 @@ class Onset(eqx.Module):
         if isinstance(self.width, jax.Array | np.ndarray) and not isinstance(self.width, jax.core.Tracer):
             known = np.asarray(self.width)
             if not np.all((known >= 0) & np.isfinite(known)):
-                raise ValueError(f"width must be finite and not negative, got {known!s}: 0.1 is the default, 0 no floor")
+                raise ValueError(
+                    f"width must be finite and not negative, got {known!s}: 0.1 is the default, 0 no floor"
+                )
 
     def check(self, gradient: str) -> None:
         """Refuse what a single step cannot take.
@@ -142,7 +144,12 @@ class Shares(eqx.Module):
 
 
 def begin(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], onset: Onset
+    model: mjx.Model,
+    data: mjx.Data,
+    blocks: list[Block],
+    onset: Onset,
+    *,
+    without: tuple[bool, bool] = (False, False),
 ) -> tuple[list[Block], Shares | None]:
     """Return constraint rows present wherever they act for a part of the step, and for which part.
 
@@ -151,6 +158,7 @@ def begin(
         data: with contacts, positions and velocities.
         blocks: the rows of this state.
         onset: the width.
+        without: whether contacts, and limits, are left as they are, averaged over noise on their distance.
 
     Returns:
         The rows and their shares; no shares if nothing begins or ends.
@@ -159,7 +167,7 @@ def begin(
         return blocks, None
     found, rows, num_contacts = [], [], 0
     for block in blocks:
-        if not block.rows_each:
+        if not block.rows_each or without[not block.is_contact]:
             rows.append(block)
             found.append(jnp.ones_like(block.residual))
             continue
@@ -176,7 +184,11 @@ def begin(
 
 def _firsts(block: Block) -> np.ndarray:
     """Return which rows stand for a contact or limit: the first of each."""
-    return np.arange(len(block.residual)) % block.rows_each == 0 if block.rows_each else np.zeros(len(block.residual), bool)
+    return (
+        np.arange(len(block.residual)) % block.rows_each == 0
+        if block.rows_each
+        else np.zeros(len(block.residual), bool)
+    )
 
 
 def _share(
@@ -216,23 +228,22 @@ def _ramp(
     return jnp.where(has_width, share, (distance < 0).astype(distance.dtype))
 
 
-def _is_blind(model: mjx.Model, geoms: Array) -> Array:
+def _is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
     """Return of which pairs the distance is known only where they overlap."""
     is_plane, is_sphere, is_box, is_convex = (
-        _are(model, geoms, kinds)
-        for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), (_BOX, _MESH, _HEIGHT_FIELD))
+        _are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), (_BOX, _MESH, _HEIGHT_FIELD))
     )
     return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1))
 
 
-def _are(model: mjx.Model, geoms: Array, kinds: tuple[int, ...]) -> Array:
+def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
     """Return which geoms are of some kinds; known while tracing where the geoms are."""
     table = np.isin(np.asarray(model.geom_type), kinds)
     return (table if isinstance(geoms, np.ndarray) else jnp.asarray(table))[geoms]
 
 
 def _side(
-    model: mjx.Model, data: mjx.Data, contacts: slice, geoms: Array, width: Float[Array, " contacts"]
+    model: mjx.Model, data: mjx.Data, contacts: slice, geoms: Array | np.ndarray, width: Float[Array, " contacts"]
 ) -> Float[Array, " contacts"]:
     """Return ψ: 1 but where the centres of two geoms are about to pass each other along the normal."""
     can_pass = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
@@ -259,9 +270,7 @@ def _split(share: Float[Array, " rows"], is_first: np.ndarray) -> Shares:
     return Shares(share, before, after, weight, is_split)
 
 
-def weights(
-    block: Block, share: Float[Array, " rows"]
-) -> Float[Array, " rows"]:
+def weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
     """Return D of rows that act with a part of their impedance; zero for those without."""
     least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
     impedance = least * block.impedance.present

@@ -143,13 +143,19 @@ def _forward(
     model: mjx.Model, data: mjx.Data, onset: Onset | None, smoothing: Smoothing | None
 ) -> tuple[mjx.Data, list[Block]]:
     """Return the data, and the constraint rows that went into it."""
-    data, blocks, shares = _smooth(model, data, onset)
+    data, blocks = _smooth(model, data)
+    rows, shares = blocks, None
+    if onset is not None:
+        is_soft = smoothing is not None and smoothing.mode == "forward"
+        averaged = (is_soft, is_soft and smoothing.limit_length is not None)
+        rows, shares = onsets.begin(model, data, blocks, onset, without=averaged)
+    data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     if smoothing is None:
-        data = _minimum(model, data, *_system(model, data, blocks), _start(model, data), _partial(blocks, shares))
+        data = _minimum(model, data, *_system(model, data, rows), _start(model, data), _partial(rows, shares))
     else:
-        data = _smoothed_solve(model, data, blocks, smoothing)
+        data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
@@ -205,19 +211,36 @@ def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return data.qacc_smooth if cold else data.qacc_warmstart
 
 
-def _smoothed_solve(model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing) -> mjx.Data:
-    """Solve with rows under noise; in backward mode without it, but for the derivative."""
-    given = jax.lax.stop_gradient(blocks)
+def _smoothed_solve(
+    model: mjx.Model,
+    data: mjx.Data,
+    blocks: list[Block],
+    begun: list[Block],
+    shares: Shares | None,
+    smoothing: Smoothing,
+) -> mjx.Data:
+    """Solve with rows under noise; in backward mode without it, but for the derivative.
+
+    Args:
+        model: with the solver's options.
+        data: with all smooth forces.
+        blocks: the rows as MuJoCo has them.
+        begun: as they act for a part of the step, and
+        shares: for which.
+        smoothing: the noise.
+    """
+    is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
-    blocks, uncertain, layout = noise.smoothed(model, data, blocks, smoothing, layout)
+    blocks, uncertain, layout = noise.smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
+    partial = _partial(blocks if is_forward else begun, shares)
     if uncertain is None or not model.nv:
-        return _minimum(model, data, *_system(model, data, blocks), _start(model, data))
+        return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)
     soft = assembly.make_constraint(model, data, blocks)
     system = assembly.system_of(model, data, layout, assembly.joined(blocks), uncertain)
-    if smoothing.mode == "forward":
-        return _minimum(model, soft, layout, system, _start(model, data))
-    fixed_model, fixed_data = jax.lax.stop_gradient((model, data))
-    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data))
+    if is_forward:
+        return _minimum(model, soft, layout, system, _start(model, data), partial)
+    fixed_model, fixed_data, given, partial = jax.lax.stop_gradient((model, data, begun, partial))
+    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), partial)
     soft = _minimum(model, soft, layout, system, hard.qacc)
 
     def forces_of(data: mjx.Data) -> dict[str, Array]:
@@ -277,10 +300,8 @@ def _weighed(system: System, weight: Float[Array, " rows"]) -> System:
     return eqx.tree_at(lambda s: s.rows.weight, system, weight)
 
 
-def _smooth(
-    model: mjx.Model, data: mjx.Data, onset: Onset | None
-) -> tuple[mjx.Data, list[Block], Shares | None]:
-    """Run the stages up to the unconstrained acceleration; tendons, cameras and collisions are MJX's."""
+def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
+    """Run the stages up to the unconstrained acceleration and gather the rows; tendons and cameras are MJX's."""
     data = smooth.com_pos(model, smooth.kinematics(model, data))
     data = mjx.camlight(model, data)
     if model.ntendon:
@@ -290,14 +311,11 @@ def _smooth(
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = collide(model, data)
-    blocks, shares = assembly.gather(model, data), None
-    if onset is not None:
-        blocks, shares = onsets.begin(model, data, blocks, onset)
-    data = assembly.make_constraint(model, data, blocks)
+    blocks = assembly.gather(model, data)
     if model.nu:
         data = forces.transmission(model, data)
     data = forces.fwd_velocity(model, data)
-    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks, shares
+    return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import Gradient, check_gradient
+from mjxgrad.dynamics import Gradient, Onset, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
@@ -37,6 +37,7 @@ class BallWall(eqx.Module):
         horizon: number of steps; long enough for the ball to land and stop.
         gradient: of each step, "discrete" or "event"; see `mjxgrad.step`. The scene's contacts set in without a jump, so
             the two differ only after a change of its impedance.
+        onset: of contacts within the step; None is MuJoCo's motion.
     """
 
     scene: Scene
@@ -44,15 +45,16 @@ class BallWall(eqx.Module):
     target: Float[Array, ""]
     horizon: int = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True, default="discrete")
+    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
 
     def with_gradient(self, gradient: Gradient) -> "BallWall":
-        """Give the same throw with another derivative of its steps.
+        """Give the same throw with MuJoCo's own motion and one of its derivatives.
 
         Raises:
             ValueError: if there is no such gradient.
         """
         check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient)
+        return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_softness(self, softness: Softness) -> "BallWall":
         """Give the same throw with other contact softness."""
@@ -72,7 +74,11 @@ class BallWall(eqx.Module):
         qvel = jnp.concatenate([velocity, jnp.zeros(3)]) if is_free else velocity[jnp.array([0, 2])]
         dtype = self.scene.data.qvel.dtype
         return rollout(
-            self.scene, initial_state(self.scene, qvel=qvel.astype(dtype)), horizon=self.horizon, gradient=self.gradient
+            self.scene,
+            initial_state(self.scene, qvel=qvel.astype(dtype)),
+            horizon=self.horizon,
+            gradient=self.gradient,
+            onset=self.onset,
         )
 
     def end(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:

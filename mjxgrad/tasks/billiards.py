@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import Gradient, check_gradient
+from mjxgrad.dynamics import Gradient, Onset, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
@@ -38,6 +38,7 @@ class Billiards(eqx.Module):
         num_pieces: the force is constant over as many pieces of the time.
         horizon: number of steps, a multiple of `num_pieces`.
         gradient: "discrete" or "event", as for `rollout`.
+        onset: of contacts within the step; None is MuJoCo's motion.
         smoothing: as for `rollout`.
     """
 
@@ -47,6 +48,7 @@ class Billiards(eqx.Module):
     num_pieces: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True, default="discrete")
+    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
     smoothing: Smoothing | None = None
 
     def start(self, force: float = 1.0) -> Float[Array, " dim"]:
@@ -60,7 +62,9 @@ class Billiards(eqx.Module):
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
         """Play once."""
         start = initial_state(self.scene)
-        return rollout(self.scene, start, self.controls(params), gradient=self.gradient, smoothing=self.smoothing)
+        return rollout(
+            self.scene, start, self.controls(params), gradient=self.gradient, onset=self.onset, smoothing=self.smoothing
+        )
 
     def cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
         """Give the squared distance to the target plus the price of the effort, in m²; NaN if the rollout diverged."""
@@ -87,7 +91,7 @@ class Billiards(eqx.Module):
             ValueError: if there is no such gradient.
         """
         check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient)
+        return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_smoothing(self, smoothing: Smoothing | None) -> "Billiards":
         """Give the same stroke with its contact averaged over noise on the distance; see `rollout`."""

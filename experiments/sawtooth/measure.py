@@ -1,0 +1,170 @@
+"""From settings to numbers."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+import mjxgrad as mg
+from experiments.landing.cases import case
+from experiments.motion import Read, at_time_step, motion
+from experiments.sawtooth.settings import SawtoothSettings
+from experiments.workspace import Workspace
+from mjxgrad._mjx import mjx
+from mjxgrad.diagnostics import SlopeComparison
+from mjxgrad.diagnostics.slope import compare_to_slope, phases
+
+DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
+ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
+# The trend that an outcome may have over the interval; what it leaves is the sawtooth.
+_DEGREE = 5
+
+
+@dataclass(frozen=True)
+class Course:
+    """One motion at one time step.
+
+    Attributes:
+        name: of the case.
+        title: of the case.
+        labels: of what was read.
+        timestep: in s.
+        times: of the readings, in s.
+        arms: what each arm's derivatives are beside the slope of its own outcome.
+        reference: outcome of MuJoCo's motion at a much shorter step; None without it.
+    """
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    timestep: float
+    times: Float[np.ndarray, " times"]
+    arms: dict[str, SlopeComparison]
+    reference: Float[np.ndarray, "phases times labels"] | None
+
+    def sawtooth(self, arm: str) -> Float[np.ndarray, "times labels"]:
+        """Give the standard deviation of the outcome about its trend over the starts."""
+        return self.residual(arm).std(axis=0)
+
+    def residual(self, arm: str) -> Float[np.ndarray, "phases times labels"]:
+        """Give the outcome less its trend over the starts."""
+        found = self.arms[arm]
+        place = np.linspace(-1, 1, len(found.parameters))
+        basis = np.polynomial.legendre.legvander(place, _DEGREE)
+        flat = found.outcomes.reshape(len(place), -1)
+        return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(found.outcomes.shape)
+
+    @property
+    def has_impact(self) -> Bool[np.ndarray, "times labels"]:
+        """Where MuJoCo's outcome has teeth."""
+        size = np.abs(self.arms[DISCRETE].outcomes).max(axis=0) + np.finfo(float).tiny
+        return self.sawtooth(DISCRETE) > 1e-7 * size
+
+    @property
+    def shift(self) -> Float[np.ndarray, "times labels"]:
+        """By how much the mean outcome differs from MuJoCo's."""
+        return np.abs((self.arms[CONTINUOUS].outcomes - self.arms[DISCRETE].outcomes).mean(axis=0))
+
+    def spread(self, arm: str) -> Float[np.ndarray, "times labels"]:
+        """Give the standard deviation of single derivatives about their trend, over the slope."""
+        found = self.arms[arm]
+        place = np.linspace(-1, 1, len(found.parameters))
+        basis = np.polynomial.legendre.legvander(place, _DEGREE)
+        flat = found.derivatives[0].reshape(len(place), -1)
+        rest = flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]
+        return rest.std(axis=0).reshape(found.slope.shape) / np.abs(self.arms[CONTINUOUS].slope)
+
+    def error(self, arm: str) -> Float[np.ndarray, "times labels"] | None:
+        """Give the mean distance to the converged motion."""
+        return None if self.reference is None else np.abs(self.arms[arm].outcomes - self.reference).mean(axis=0)
+
+
+class _Simulate(eqx.Module):
+    """From the parameter to the readings; time steps differ in arrays alone, so one compilation serves them all."""
+
+    model: mjx.Model
+    start: mjx.Data
+    steps_between: Int[Array, ""]
+    onset: mg.Onset | None
+    read: Read = eqx.field(static=True)
+    moved: int = eqx.field(static=True)
+    num_times: int = eqx.field(static=True)
+    gradient: str = eqx.field(static=True)
+
+    def __call__(self, parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+        start = self.start.replace(qpos=self.start.qpos.at[self.moved].add(parameter))
+        return motion(
+            self.model,
+            start,
+            self.read,
+            num_times=self.num_times,
+            steps_between=self.steps_between,
+            gradient=self.gradient,
+            onset=self.onset,
+        )
+
+
+@eqx.filter_jit
+def _sample(simulate: _Simulate, parameters: Float[Array, " phases"]) -> tuple[Array, Array]:
+    def one(parameter: Float[Array, ""]) -> tuple[Array, Array]:
+        return jax.jvp(simulate, (parameter,), (jnp.ones_like(parameter),))
+
+    return jax.vmap(one)(parameters)
+
+
+def measure(settings: SawtoothSettings, workspace: Workspace) -> list[Course]:
+    """Sample outcomes and derivatives of every motion at every time step.
+
+    Args:
+        settings: of the run.
+        workspace: for the clock.
+
+    Returns:
+        The courses, motion by motion.
+    """
+    courses = []
+    with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
+        for number, name in enumerate(settings.cases):
+            own = float(case(name).model.opt.timestep)
+            courses += [_course(name, h, settings) for h in sorted({own, *settings.timesteps}, reverse=True)]
+            advance_to(number + 1)
+    return courses
+
+
+def _course(name: str, timestep: float, settings: SawtoothSettings) -> Course:
+    one = case(name)
+    scene = mg.load_scene(one.model)
+    qpos, qvel = scene.data.qpos, scene.data.qvel
+    for index, value in one.qpos.items():
+        qpos = qpos.at[index].set(value)
+    for index, value in one.qvel.items():
+        qvel = qvel.at[index].set(value)
+    start = scene.data.replace(qpos=qpos, qvel=qvel)
+    # Neither evenly spaced nor of one length: teeth must not fall in step with the starts.
+    parameters = phases(one.interval, settings.num_phases)
+    steps = max(1, round(one.duration / timestep / settings.num_times))
+
+    def sampled(gradient: str, onset: mg.Onset | None, refinement: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        simulate = _Simulate(
+            at_time_step(scene.model, timestep / refinement),
+            start,
+            jnp.int32(steps * refinement),
+            onset,
+            one.read,
+            one.moved,
+            settings.num_times,
+            gradient,
+        )
+        values, slopes = _sample(simulate, jnp.asarray(parameters))
+        return np.asarray(values), np.asarray(slopes)
+
+    arms = {}
+    for arm, (gradient, onset) in ARMS.items():
+        outcomes, derivatives = sampled(gradient, onset)
+        arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
+    reference = sampled("discrete", None, settings.reference)[0] if settings.reference else None
+    times = timestep * steps * np.arange(1, settings.num_times + 1)
+    return Course(name, one.title, one.labels, timestep, times, arms, reference)

@@ -1,0 +1,23 @@
+"""What an experiment on the sawtooth can be told; imports nothing heavy."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from experiments.config import Positive, RunSettings
+from experiments.landing.settings import CaseName
+
+
+class SawtoothSettings(RunSettings):
+    """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
+
+    cases: Annotated[tuple[CaseName, ...], Field(min_length=1)]
+    """Which motions, each with its own contact, limits and integrator."""
+    timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)
+    """In s, besides the motion's own."""
+    num_phases: Annotated[int, Field(ge=64)] = 192
+    """Starts over the interval."""
+    num_times: Annotated[int, Field(ge=2)] = 5
+    """At which outcomes are read, evenly over the motion."""
+    reference: Annotated[int, Field(ge=0, le=64)] = 0
+    """By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out."""
