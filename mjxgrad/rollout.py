@@ -55,6 +55,8 @@ class Trajectory(eqx.Module):
             quite that of the model, and the derivative, which takes the solve for finished, not quite its own. Zero, unless
             `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
             hardly have such a limit). Only `rollout` counts it.
+        growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
+            velocities and positions alike; NaN unless asked for.
     """
 
     qpos: Float[Array, "states nq"]
@@ -65,6 +67,16 @@ class Trajectory(eqx.Module):
     diverged: Bool[Array, ""]
     first_bad_step: Int[Array, ""]
     unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    growth: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan))
+
+    @property
+    def explodes(self) -> Bool[Array, ""]:
+        """Whether the derivative has grown beyond belief: a thousandfold, or out of all numbers. False if it was not measured."""
+        return (self.growth > LARGEST_GROWTH) | jnp.isinf(self.growth)
+
+
+LARGEST_GROWTH = 1e3
+"""Of a change of the start. Half a second of free motion makes half a metre of a metre per second, a bounce less of it."""
 
 
 class DivergedError(FloatingPointError):
@@ -111,6 +123,7 @@ def rollout(
     onset: Onset | None = None,
     smoothing: Smoothing | None = None,
     velocity_limit: float | None = 1e4,
+    measure_growth: bool = False,
 ) -> Trajectory:
     """Step a scene many times.
 
@@ -135,6 +148,8 @@ def rollout(
         smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
             `SceneWarning` what of the scene it has no effect on.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
+        measure_growth: carry one tangent along and tell by `growth` and `explodes` whether derivatives of this rollout can be
+            believed: contacts that chatter may multiply them at every switch. It takes as long as a derivative in forward mode.
 
     Returns:
         The trajectory, with `horizon + 1` states.
@@ -163,26 +178,39 @@ def rollout(
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
 
-    def advance(carry: tuple[State, Int[Array, ""], Int[Array, ""]], inputs: tuple[Array, Array, Array]):
-        state, first_bad, unsolved = carry
+    def advance(carry: tuple, inputs: tuple[Array, Array, Array]):
+        state, first_bad, unsolved, tangent, growth = carry
         index, row, disturbance = inputs
         ctrl = (row if policy is None else policy(params, state)) + disturbance
         data = data_of(scene, state, ctrl)
-        stepped = step(scene.model, data, gradient=gradient, onset=onset, smoothing=smoothing)
+
+        def take(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
+            here = data.replace(qpos=qpos, qvel=qvel)
+            stepped = step(scene.model, here, gradient=gradient, onset=onset, smoothing=smoothing)
+            return (stepped.qpos, stepped.qvel), stepped
+
+        if measure_growth:
+            _, tangent, stepped = jax.jvp(take, (state.qpos, state.qvel), tangent, has_aux=True)
+            tangent = jax.lax.stop_gradient(tangent)
+            growth = jnp.maximum(growth, _length(tangent))  # a NaN stays one
+        else:
+            stepped = take(state.qpos, state.qvel)[1]
         moved = state_of(stepped)
         is_bad = ~is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         seen = None if observe is None else _observed(scene, observe, data, stepped, onset, smoothing)
         unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
-        return (kept, first_bad, unsolved), (state.qpos, state.qvel, ctrl, seen)
+        return (kept, first_bad, unsolved, tangent, growth), (state.qpos, state.qvel, ctrl, seen)
 
     if checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
-    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32))
-    (final, first_bad, unsolved), (qpos, qvel, ctrl, seen) = jax.lax.scan(
+    tangent = _direction(state) if measure_growth else None
+    none = jnp.ones((), state.qvel.dtype) if measure_growth else jnp.asarray(jnp.nan)
+    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32), tangent, none)
+    (final, first_bad, unsolved, _, growth), (qpos, qvel, ctrl, seen) = jax.lax.scan(
         advance,
         start,
         (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
@@ -200,7 +228,20 @@ def rollout(
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
         unsolved=unsolved,
+        growth=jnp.where(jnp.isnan(growth), jnp.inf, growth) if measure_growth else growth,
     )
+
+
+def _direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """Return a change of the start of length one, the same for every rollout of a scene."""
+    random = np.random.default_rng(0)
+    parts = (random.normal(size=state.qpos.shape), random.normal(size=state.qvel.shape))
+    size = np.sqrt(sum((part**2).sum() for part in parts))
+    return tuple(jnp.asarray(part / size, state.qvel.dtype) for part in parts)  # pyright: ignore[reportReturnType]
+
+
+def _length(tangent: tuple[Array, Array]) -> Float[Array, ""]:
+    return jnp.sqrt(sum(jnp.sum(part**2) for part in tangent))
 
 
 def check_trajectory(trajectory: Trajectory) -> None:

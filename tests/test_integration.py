@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.integration import adaptive_rollout, phase_average, shifted_rollout, substepped_rollout
+from mjxgrad.integration import adaptive_rollout, substepped_rollout
 
 pytest.importorskip("diffrax")
 
@@ -100,52 +100,6 @@ def test_steps_that_run_out_are_flagged(ball):
 
 
 @pytest.mark.slow
-def test_a_shift_by_a_whole_step_is_none(ball):
-    whole = eqx.filter_jit(mg.rollout)(ball, thrown(ball, 0.05), horizon=HORIZON)
-    shifted = eqx.filter_jit(shifted_rollout)(ball, thrown(ball, 0.05), phase=jnp.array(1.0), horizon=HORIZON)
-    assert np.allclose(shifted.qpos[:-1], whole.qpos, atol=1e-12)
-    assert np.allclose(shifted.qpos[-1], whole.qpos[-1], atol=1e-12)
-
-
-def test_shifted_controls_act_over_the_intervals_that_they_were_given_for():
-    scene = mg.load_scene(DRIVEN)
-    controls = jnp.array([[4.0], [-2.0], [6.0]])
-    end = eqx.filter_jit(lambda phase: shifted_rollout(scene, mg.initial_state(scene), controls, phase=phase))
-    found = end(jnp.array(0.3))
-    # A mass of 2 kg: velocities are sums of force times time over 2. After 0.03 s, 0.13 s, 0.23 s and 0.3 s.
-    assert np.allclose(found.qvel[1:, 0], [0.06, (0.4 - 0.06) / 2, (0.4 - 0.2 + 0.18) / 2, (0.4 - 0.2 + 0.6) / 2])
-
-
-@pytest.mark.slow
-def test_the_mean_over_phases_removes_the_sawtooth(ball):
-    heights = RADIUS + jnp.linspace(0, STEP, 17)[:-1]  # one whole tooth at 1 m/s
-
-    def outcome(height, phase):
-        return shifted_rollout(ball, thrown(ball, height), phase=phase, horizon=HORIZON).qpos[-1, 0]
-
-    single = jax.jit(jax.vmap(lambda z: outcome(z, 1.0)))(heights)
-    mean = jax.jit(jax.vmap(phase_average(outcome, 8)))(heights)
-
-    def deviation(values):
-        line = np.polyval(np.polyfit(heights, values, 1), heights)
-        slope = np.polyfit(heights, values, 1)[0]
-        return np.abs(values - line).max(), slope
-
-    tooth, _ = deviation(np.asarray(single))
-    rest, slope = deviation(np.asarray(mean))
-    assert rest < tooth / 4
-    assert slope == pytest.approx(-RESTITUTION, abs=0.06)
-
-
-def test_phases_moved_by_a_key_average_to_the_same_grid_shifted(key):
-    phases = []
-    phase_average(lambda phase: phases.append(phase) or phase, 4, key)
-    mean = phase_average(lambda phase: phase, 4, key)()
-    assert 0.375 <= float(mean) <= 0.625  # (0 + 1 + 2 + 3)/16 and as much later
-    assert float(phase_average(lambda phase: phase, 4)()) == pytest.approx(0.5)
-
-
-@pytest.mark.slow
 def test_short_steps_at_events_bring_the_bounce_closer_and_flight_is_untouched(ball):
     heights = RADIUS + jnp.linspace(0, STEP, 9)[:-1]
 
@@ -168,10 +122,6 @@ def test_what_has_no_meaning_is_refused(ball):
     state = thrown(ball, 0.05)
     with pytest.raises(ValueError, match="num_substeps must be at least 2"):
         substepped_rollout(ball, state, num_substeps=1, horizon=2)
-    with pytest.raises(ValueError, match="num_phases must be at least 1"):
-        phase_average(lambda phase: phase, 0)
-    with pytest.raises(ValueError, match="horizon must be at least 1"):
-        shifted_rollout(ball, state, phase=0.5)
     with pytest.raises(ValueError, match="tolerance"):
         adaptive_rollout(ball, state, [0.1], tolerance=0.0)
     with pytest.raises(ValueError, match="times must increase"):

@@ -104,7 +104,7 @@ def test_messages_name_the_pair_and_what_would_resolve_it(fall):
     assert "0.5 steps of 2 needed" in sentence
     # 2 · 2 m/s · 2 ms.
     assert "width of at least 0.008 m" in sentence
-    assert "gradient='event'" in sentence
+    assert "onset=mg.Onset()" in sentence
     _, _, short = fall(PHASES, _softness(0.5))
     # 2 mm / (2 · 2 m/s).
     assert "time step of at most 0.0005 s" in short.messages()[0]

@@ -12,7 +12,7 @@ from experiments.theme import FIRST, MUTED, ZEROTH, power, save, subplots
 _LOOKS = {
     "discrete": (FIRST, "o"),
     "event": (ZEROTH, "s"),
-    "phases": ("#009e73", "D"),
+    "continuous": ("#009e73", "D"),
     "substeps": ("#cc79a7", "^"),
     "adaptive": ("#e69f00", "v"),
     "quotient": ("#56b4e9", "P"),
@@ -101,7 +101,7 @@ def bias(outcome: Outcome):
     figure, axes = subplots(1, len(outcome.courses), height=4.0, sharey=True)
     for axis, course in zip(axes[0], outcome.courses, strict=True):
         axis.axhline(0, color=MUTED, lw=0.8)
-        for method in ("discrete", "event", "phases", "substeps"):
+        for method in ("discrete", "event", "continuous", "substeps"):
             points = _finite(course, method)
             colour, marker = _LOOKS[method]
             steps = [point.setting for point in points]

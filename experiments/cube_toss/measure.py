@@ -64,8 +64,8 @@ def measure(settings: CubeTossSettings, workspace: Workspace) -> Outcome:
 
 
 def _jobs(settings: CubeTossSettings) -> list[tuple[str, float]]:
-    fixed = [(name, h) for name in ("discrete", "event") for h in settings.timesteps]
-    refined = [(name, h) for name in ("phases", "substeps") for h in settings.refined_timesteps]
+    fixed = [(name, h) for name in ("discrete", "event", "continuous") for h in settings.timesteps]
+    refined = [("substeps", h) for h in settings.refined_timesteps]
     adaptive = [(name, tol) for name in ("adaptive", "quotient") for tol in settings.tolerances]
     return fixed + refined + adaptive
 
@@ -99,22 +99,21 @@ def _point(
 
 def _programs(settings: CubeTossSettings) -> dict[str, Program]:
     """One program per method, whatever the contact and the time step; each takes the throws one after the other."""
-    centred = (jnp.arange(settings.num_phases) + 0.5) / settings.num_phases
 
-    def fixed(gradient: str, phases: Array):
+    def fixed(gradient: str, onset: mg.Onset | None = None):
         def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-            return mg.step(model, data, gradient=gradient)  # pyright: ignore[reportArgumentType]
+            return mg.step(model, data, gradient=gradient, onset=onset)  # pyright: ignore[reportArgumentType]
 
-        return _marching(step, phases)
+        return _marching(step)
 
     def short(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         return substepped_step(model, data, num_substeps=settings.num_substeps, gradient="event")
 
     return {
-        "discrete": fixed("discrete", jnp.ones(1)),
-        "event": fixed("event", jnp.ones(1)),
-        "phases": fixed("event", centred),
-        "substeps": _marching(short, jnp.ones(1)),
+        "discrete": fixed("discrete"),
+        "event": fixed("event"),
+        "continuous": fixed("discrete", mg.Onset()),
+        "substeps": _marching(short),
         "adaptive": _one_by_one(_adaptive_derivative),
         "quotient": _one_by_one(_adaptive_quotient),
         "reference": _one_by_one(_adaptive_quotient),
@@ -129,32 +128,26 @@ def _one_by_one(derivative: Callable) -> Program:
     return program
 
 
-def _marching(step: Callable[[mjx.Model, mjx.Data], mjx.Data], phases: Array) -> Program:
-    """Forward mode through steps whose length and number are traced; the mean over phases (1 is no shift)."""
+def _marching(step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Program:
+    """Forward mode through steps whose length and number are traced."""
 
     def derivative(task: CubeToss, speed: Array, timestep: Array):
-        def at(phase: Array) -> Array:
-            end = functools.partial(_end, task, timestep=timestep, phase=phase, step=step)
-            return jax.jvp(end, (speed,), (jnp.ones_like(speed),))[1]
-
-        return jnp.mean(jax.vmap(at)(phases)), DURATION / timestep, jnp.zeros((), bool)
+        end = functools.partial(_end, task, timestep=timestep, step=step)
+        return jax.jvp(end, (speed,), (jnp.ones_like(speed),))[1], DURATION / timestep, jnp.zeros((), bool)
 
     return _one_by_one(derivative)
 
 
-def _end(task: CubeToss, speed: Array, timestep: Array, phase: Array, step: Callable) -> Array:
+def _end(task: CubeToss, speed: Array, timestep: Array, step: Callable) -> Array:
     scene = task.scene
     start = data_of(scene, task.start(speed), scene.data.ctrl)
-    whole = jnp.round(DURATION / timestep).astype(int)
+    count = jnp.round(DURATION / timestep).astype(int)
+    model = scene.model.tree_replace({"opt.timestep": timestep})
 
-    def advance(i: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        duration = timestep * jnp.where(i == 0, phase, jnp.where(i == whole, 1 - phase, 1.0))
-        model = scene.model.tree_replace({"opt.timestep": duration})
+    def advance(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         moved = step(model, start.replace(**dict(zip(_STATE, state, strict=True))))
         return tuple(getattr(moved, name) for name in _STATE)
 
-    # A whole grid has no last, short step.
-    count = jnp.where(phase == 1, whole, whole + 1)
     final = jax.lax.fori_loop(0, count, advance, tuple(getattr(start, name) for name in _STATE))
     return task.outcome(final[0])
 

@@ -10,7 +10,7 @@ from experiments.cube_toss.settings import CubeTossSettings
 METHODS = {
     "discrete": "discrete",
     "event": "event",
-    "phases": "event, mean over phases",
+    "continuous": "contact that begins within the step",
     "substeps": "event, short steps at events",
     "adaptive": "adaptive, differentiated",
     "quotient": "adaptive, difference quotient",

@@ -13,13 +13,11 @@ class CubeTossSettings(RunSettings):
     contacts: Annotated[tuple[Literal["published", "default"], ...], Field(min_length=1)] = ("published", "default")
     """Of the cube with the floor: as DiffMJX published it, whose force begins continuously, or MuJoCo's default."""
     timesteps: Annotated[tuple[Positive, ...], Field(min_length=2)]
-    """For plain and event-corrected derivatives, in s; each must divide a second."""
+    """For discrete and event gradients and contact that begins within the step, in s; each must divide a second."""
     refined_timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    """For averages over the phase and for short steps at events, in s."""
+    """For short steps at events, in s."""
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
     """Of the adaptive integration."""
-    num_phases: Annotated[int, Field(ge=2)] = 8
-    """Over which an average is taken."""
     num_substeps: Annotated[int, Field(ge=2)] = 8
     """In a step that holds an event."""
     num_throws: Annotated[int, Field(ge=3)] = 4

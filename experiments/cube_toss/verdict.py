@@ -110,9 +110,9 @@ def _event(course: Course) -> str | None:
 
 
 def _choice(course: Course) -> str | None:
-    """Compare averaging and short steps with a smaller step of the same price."""
+    """Compare the onset and short steps with an event gradient of the same price."""
     sentences = []
-    for method in ("phases", "substeps"):
+    for method in ("continuous", "substeps"):
         for point in course.of(method):
             same = [p for p in course.of("event") if p.seconds <= point.seconds]
             if not same:
@@ -127,7 +127,7 @@ def _choice(course: Course) -> str | None:
     names = ", ".join(f"{METHODS[p.method]} at {p.setting:g} s" for p in won)
     tail = f" ({names})" if won else ""
     return (
-        f"{_CONTACTS[course.contact]} averaging over phases or short steps at events beat an event-corrected derivative that "
+        f"{_CONTACTS[course.contact]} contact that begins within the step or short steps at events beat an event gradient that "
         f"takes no longer in {len(won)} of {total} settings{tail}."
     )
 

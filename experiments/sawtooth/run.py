@@ -62,6 +62,12 @@ def _excess(course: Course, arm: str) -> np.ndarray:
     )
 
 
+def _closer(course: Course) -> np.ndarray | None:
+    """Give the error beside the converged motion over that of MuJoCo's step; None without a reference."""
+    own, theirs = course.error(CONTINUOUS), course.error(DISCRETE)
+    return None if own is None or theirs is None else own / theirs
+
+
 def _verdict(courses: list[Course]) -> str:
     ratio, spread = _pooled(courses, _ratio), _pooled(courses, lambda c: c.spread(CONTINUOUS))
     if not ratio.size:
@@ -84,7 +90,7 @@ def _findings(courses: list[Course]) -> list[str]:
     moved = _pooled(courses, lambda c: c.shift / c.sawtooth(DISCRETE))
     sentences.append(f"The mean outcome shifts by {np.median(moved):.2f} of MuJoCo's sawtooth in the median.")
     if all(c.reference is not None for c in courses):
-        closer = _pooled(courses, lambda c: c.error(CONTINUOUS) / c.error(DISCRETE))
+        closer = _pooled(courses, _closer)
         sentences.append(
             f"Beside MuJoCo's motion at a step many times shorter its error is {np.median(closer):.2f} of MuJoCo's own in the "
             f"median, and larger at {np.mean(closer > 1):.0%} of the readings."
@@ -102,9 +108,8 @@ def _table(courses: list[Course]) -> Table:
         row += [f"{np.median(c.spread(arm)[pick]):.2g}" for arm in ARMS]
         row += [f"{int((_off(c, arm)[pick] <= 2).sum())} of {int(pick.sum())}" for arm in ARMS]
         row.append(f"{np.median((c.shift / c.sawtooth(DISCRETE))[pick]):.2f}")
-        error = "–"
-        if c.reference is not None:
-            error = f"{np.median((c.error(CONTINUOUS) / c.error(DISCRETE))[pick]):.2f}"
+        closer = _closer(c)
+        error = "–" if closer is None else f"{np.median(closer[pick]):.2f}"
         rows.append([*row, error])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
     columns += [f"spread, {arm}" for arm in ARMS] + [f"within 2 errors, {arm}" for arm in ARMS]

@@ -27,7 +27,7 @@ MuJoCo's default at 2 ms; ζ of 0.3 and 1):
 From `STEPS_NEEDED` on, where both halves of the rise (MuJoCo's two parabolas) are met, it falls no further.
 
 So a first-order estimate from fewer samples than 1/n is biased as if $d_0$ were large, and nothing in the samples says
-so; then `gradient="event"`, shorter steps or a wider rise are called for.
+so; then `onset=mg.Onset()`, shorter steps or a wider rise are called for.
 """
 
 import equinox as eqx
@@ -112,7 +112,7 @@ class OnsetResolution(eqx.Module):
             steps, jump = float(np.min(self.worst[..., i])), float(np.max(self.jump[..., i]))
             sentences.append(
                 f"{count} onset{'s' if count > 1 else ''} of {pair}, at up to {speed:.3g} m/s, "
-                f"{'are' if count > 1 else 'is'} not resolved: {_reason(steps, jump, width)}; take gradient='event', "
+                f"{'are' if count > 1 else 'is'} not resolved: {_reason(steps, jump, width)}; take onset=mg.Onset(), "
                 f"or an impedance from 0 (at most {LARGEST_JUMP:g}) over a width of at least "
                 f"{STEPS_NEEDED * speed * step:.2g} m"
                 + (

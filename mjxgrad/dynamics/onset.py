@@ -27,8 +27,8 @@ state and parameters, for contacts, joint and tendon limits, all cones, at the b
     a = (1 - Φ) a(p₋) + Φ a(p₊),        p₋ = max(0, (φ - Φ)/(1 - Φ)),        p₊ = min(1, φ/Φ),
 
 Φ the mean of the partial φ with weights φ(1 - φ), so that a contact drops out of it as it begins or completes. Where one
-contact is partial, or all are alike, p is 0 or 1 and this is the integral; else a contact with 0 < p < 1 acts with the impedance p d.
-It is continuous throughout, and the mean share is φ.
+contact is partial, or all are alike, p is 0 or 1 and this is the integral; else a contact with 0 < p < 1 acts with the
+impedance p d. It is continuous throughout, and the mean share is φ.
 
 **Slow contacts.** The derivative by r is 1 / w, so where contacts graze or chatter w has a floor, w ≥ √(h²u² + w₀²):
 
@@ -45,10 +45,10 @@ On the floor r is taken ahead, r + h v (1 - h²v²/w²): that damps what else wo
 wall). Both sides push then for their share of the step, which is one push of share ψ = clip(2 m / w, 0, 1), m the distance of
 the centres along the normal; φ is multiplied by it. For geoms with a centre of symmetry.
 
-**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not, a change of the nearest face by a right
-angle. A contact of fewer than about three steps is smooth and still not resolved. Of boxes and meshes against others than planes
-(and of boxes against others than spheres, too) MJX knows the distance only where they overlap: there the ramp lies at 0 > r > -w,
-continuous, and half a step late.
+**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not, a change of the nearest face by a
+right angle. A contact of fewer than about three steps is smooth and still not resolved. But from planes, and of boxes from
+balls, MJX knows the distance of boxes and meshes only where they overlap: there the ramp lies at 0 > r > -w, continuous and half
+a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
@@ -77,7 +77,7 @@ _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
 )
 # Impedance of a partial contact is no smaller than this part of its own: a weight of zero has no logarithm's derivative.
 _LEAST_SHARE = 1e-9
-# What a pyramid's slip adds to the width. A box pushed along the floor at 4 ms has derivatives of 10⁷ with 1, of 1 to 4 with 2 and 3.
+# What a pyramid's slip adds to the width. Derivatives of a box pushed along the floor at 4 ms are 10⁷ with 1, 1 to 4 with 2 or 3.
 _SLIP = 3.0
 
 
@@ -239,7 +239,7 @@ def _is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray
 def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
     """Return which geoms are of some kinds; known while tracing where the geoms are."""
     table = np.isin(np.asarray(model.geom_type), kinds)
-    return (table if isinstance(geoms, np.ndarray) else jnp.asarray(table))[geoms]
+    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
 
 
 def _side(

@@ -146,8 +146,9 @@ def _forward(
     data, blocks = _smooth(model, data)
     rows, shares = blocks, None
     if onset is not None:
-        is_soft = smoothing is not None and smoothing.mode == "forward"
-        averaged = (is_soft, is_soft and smoothing.limit_length is not None)
+        averaged = (False, False)
+        if smoothing is not None and smoothing.mode == "forward":
+            averaged = (True, smoothing.limit_length is not None)
         rows, shares = onsets.begin(model, data, blocks, onset, without=averaged)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:

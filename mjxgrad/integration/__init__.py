@@ -1,9 +1,5 @@
-"""Other ways to step a scene than at equal intervals: what the event correction leaves over, and references.
+"""Other ways to step a scene than at equal intervals, against the discretisation error of the motion.
 
-The event-corrected derivative (`gradient="event"`) is right on average over the phase, the place within a time step at which
-a contact begins. What remains is its spread over phases, and the discretisation error of the motion itself.
-
-- `phase_average`: the mean over phases of the step; N times the price of one rollout.
 - `substepped_rollout`: fine steps only where a contact begins or ends. For single rollouts: under `jax.vmap` all members pay
   for the fine steps all the time.
 - `adaptive_rollout`: diffrax with error control. For the motion of a single throw at an accuracy of 1e-6 it is the cheapest.
@@ -13,14 +9,11 @@ a contact begins. What remains is its spread over phases, and the discretisation
 """
 
 from mjxgrad.integration.adaptive import AdaptiveTrajectory, adaptive_rollout
-from mjxgrad.integration.phase import phase_average, shifted_rollout
 from mjxgrad.integration.substeps import substepped_rollout, substepped_step
 
 __all__ = [
     "AdaptiveTrajectory",
     "adaptive_rollout",
-    "phase_average",
-    "shifted_rollout",
     "substepped_rollout",
     "substepped_step",
 ]

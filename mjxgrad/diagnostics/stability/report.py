@@ -173,7 +173,7 @@ class StabilityReport:
             return None
         return (
             f"at {speed:g} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            "gradient='event', which tasks do by default, or an impedance from 0 over a width of at least "
+            "onset=mg.Onset(), as tasks do by default, or an impedance from 0 over a width of at least "
             f"{STEPS_NEEDED * speed * self.timestep:.2g}"
         )
 
