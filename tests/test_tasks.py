@@ -31,7 +31,7 @@ CART = """
 @pytest.fixture(scope="session")
 def ends():
     """Where the ball ends, by stiffness; one compilation for both."""
-    task = ball_wall()
+    task = ball_wall().with_gradient("discrete")  # MuJoCo's motion
     throw = jax.jit(jax.vmap(lambda softness, angle: task.with_softness(softness).end(angle), in_axes=(None, 0)))
     return {k: np.asarray(throw(wall_softness(k), jnp.asarray(ANGLES)[:, None])) for k in (SOFT, STIFF)}
 

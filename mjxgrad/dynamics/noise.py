@@ -128,4 +128,5 @@ def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
     is_convex = np.isin(model.geom_type, [int(kind) for kind in convex])
     if not is_convex.any() or not len(contact.dist):
         return jnp.ones(len(contact.dist), bool)
+    # Of a ball on a box it is known, and of no interest beyond a metre.
     return ~(jnp.any(jnp.asarray(is_convex)[contact.geom], axis=1) & (contact.dist >= 1))

@@ -233,7 +233,7 @@ def _is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray
     is_plane, is_sphere, is_box, is_convex = (
         _are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), (_BOX, _MESH, _HEIGHT_FIELD))
     )
-    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1))
+    return jnp.asarray(is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1)))
 
 
 def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:

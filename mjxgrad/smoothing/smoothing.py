@@ -139,9 +139,10 @@ def has_limits(model: mjx.Model) -> bool:
 
 def _is_blind(model: mjx.Model, geom1: int, geom2: int) -> bool:
     kinds = {int(model.geom_type[geom1]), int(model.geom_type[geom2])}
-    return bool(kinds & _CONVEX) and int(mujoco.mjtGeom.mjGEOM_PLANE) not in kinds
+    return bool(kinds & _CONVEX) and int(mujoco.mjtGeom.mjGEOM_PLANE) not in kinds and kinds != _BALL_ON_BOX
 
 
+_BALL_ON_BOX = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)}
 _CONVEX = {int(kind) for kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)}
 
 

@@ -183,17 +183,25 @@ def test_lengths_are_swept_in_one_program():
     np.testing.assert_allclose(sweep(mg.Smoothing(lengths)), each, rtol=1e-10)
 
 
-BOX = """<mujoco><worldbody><body pos="0 0 .105"><joint type="slide" axis="0 0 1"/><geom name="ball" size=".1" condim="1"/></body>
+BOX = """<mujoco><worldbody><body pos="0 0 .105"><joint type="slide" axis="0 0 1"/><geom name="pin" type="capsule" size=".1 .05" euler="90 0 0" condim="1"/></body>
   <geom name="box" type="box" size=".1 .1 .1" pos="0 0 -.1" condim="1"/></worldbody></mujoco>"""
 
 
-def test_a_ball_over_a_box_has_no_force_at_a_distance_and_the_warning_says_so():
+def test_a_capsule_over_a_box_has_no_force_at_a_distance_and_the_warning_says_so():
     """MJX says 1 m of 5 mm, within reach of the log barrier; the fall stays a fall."""
     model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX))
     smoothing = mg.Smoothing(5e-3, "log_barrier")
     moved = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), smoothing=smoothing)
     np.testing.assert_allclose(moved.qacc, [-9.81], atol=1e-12)
-    assert "ball – box" in smoothing_warnings(smoothing, model)[0]
+    assert "pin – box" in smoothing_warnings(smoothing, model)[0]
+
+
+def test_a_ball_over_a_box_has_force_at_a_distance_and_no_warning():
+    """The nearest point of a box is known from anywhere."""
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX.replace('type="capsule" size=".1 .05"', 'size=".1"')))
+    smoothing = mg.Smoothing(5e-3, "log_barrier")
+    assert not smoothing_warnings(smoothing, model)
+    assert mg.forward(model, mjx.make_data(model), smoothing=smoothing).qacc[0] > -9.81 + 1
 
 
 def test_a_scene_without_contact_or_limits_is_named():
