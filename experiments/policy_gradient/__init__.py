@@ -1,1 +1,1 @@
-"""First-order control and policy gradients, discrete and event, against an unbiased reference."""
+"""First-order control and policy gradients, MuJoCo's step and continuous onset, against an unbiased reference."""

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, EVENT, GRADIENTS, Cell, Course, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Course, Outcome
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
-_COLOURS = {DISCRETE: FIRST, EVENT: ZEROTH}
-_MARKERS = {DISCRETE: "o", EVENT: "s"}
+_COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
+_MARKERS = {DISCRETE: "o", ONSET: "s"}
 _SMALLEST = 1e-3
 _OBSERVED = ("thigh", "leg", "foot", "thigh's speed", "leg's speed", "foot's speed", "offset")
 _MOTORS = ("thigh", "leg", "foot")
@@ -42,7 +42,7 @@ def summary(cells: list[Cell]):
     """Three panels with one row per point: bias of the first order, α, error of one α-order estimate."""
     figure, axes = subplots(1, 3, height=1.4 + 0.27 * len(cells), sharey=True)
     rows = np.arange(len(cells))
-    for gradient, shift in ((DISCRETE, -0.14), (EVENT, 0.14)):
+    for gradient, shift in ((DISCRETE, -0.14), (ONSET, 0.14)):
         look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ls": "", "ms": 5}
         bias, low, high = np.maximum(np.array([cell.bias(gradient) for cell in cells]).T, _SMALLEST)
         spread = np.abs(np.stack([bias - low, high - bias]))
@@ -81,7 +81,7 @@ def throw(cells: list[Cell]):
         left.errorbar(
             angle, reference[:, 0], 2 * reference[:, 1], color=REFERENCE, lw=2.2, capsize=3, label="unbiased reference"
         )
-        for gradient, shift in ((DISCRETE, -0.006), (EVENT, 0.006)):
+        for gradient, shift in ((DISCRETE, -0.006), (ONSET, 0.006)):
             look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ms": 5, "lw": 1, "ls": (0, (4, 2))}
             first = np.array([cell.first_mean(gradient) for cell in shown])[:, :, 0]
             left.errorbar(
@@ -114,7 +114,7 @@ def push(cells: list[Cell]):
             step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
         )
         for gradient in GRADIENTS:
-            style = {"ls": (0, (4, 2))} if gradient == EVENT else {"lw": 2.4}
+            style = {"ls": (0, (4, 2))} if gradient == ONSET else {"lw": 2.4}
             axis.plot(
                 step, cell.first_mean(gradient)[0], color=_COLOURS[gradient], label=f"{gradient} gradient", **style
             )
@@ -160,7 +160,7 @@ def descent(courses: list[Course]):
         for course in courses:
             if (course.name, course.estimator) != kind:
                 continue
-            style = {"ls": (0, (4, 2))} if course.gradient == EVENT else {}
+            style = {"ls": (0, (4, 2))} if course.gradient == ONSET else {}
             colour, steps = _COLOURS[course.gradient], np.arange(course.costs.shape[1])
             for axis, values in ((above, course.costs), (below, course.alphas)):
                 axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)

@@ -18,7 +18,7 @@ from experiments.policy_gradient.statistics import (
     squared_norm,
 )
 
-DISCRETE, EVENT = GRADIENTS = ("discrete", "event")
+DISCRETE, ONSET = GRADIENTS = ("discrete", "onset")
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Cell:
         """Root-mean-square error of one estimate over the gradient's norm.
 
         Args:
-            gradient: "discrete" or "event".
+            gradient: "discrete" or "onset".
             kind: "first", "unbiased" or "mixed".
         """
         estimates, (reference, noise) = getattr(self.estimates[gradient], kind), self.reference_mean()
@@ -131,7 +131,7 @@ class Course:
         name: of the task.
         title: of the task.
         estimator: "first" or "alpha".
-        gradient: "discrete" or "event".
+        gradient: "discrete" or "onset".
         costs: mean costs under noise, before each step and at the end.
         alphas: weights of the first order, likewise.
         seconds: of all seeds, with compilation if there was any.

@@ -1,15 +1,15 @@
-"""The tasks, each as it is with either gradient, and the points at which both are compared."""
+"""The tasks, with and without contact that begins within the step, and the points at which both are compared."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import mjxgrad as mg
+from experiments.policy_gradient.outcome import ONSET
 from experiments.policy_gradient.settings import PolicyGradientSettings
-from mjxgrad.dynamics import Gradient
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 DEFAULT_CONTACT = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.9, 0.95), width=0.001)
@@ -60,7 +60,7 @@ class Problem:
         name: in the settings.
         title: for headings.
         scene: that it moves in.
-        objective: of a gradient ("discrete" or "event") and a standard deviation of the noise.
+        objective: of a gradient ("discrete" or "onset") and a standard deviation of the noise.
         stddev: of the noise at the points.
         points: where gradients are compared.
         num_samples: rollouts of one estimate.
@@ -94,6 +94,11 @@ def problem(name: str, settings: PolicyGradientSettings) -> Problem:
     return _push(name) if name.startswith("push") else _throw(name, settings)
 
 
+def _moved_by(task: Any, arm: str) -> Any:
+    """Give a task with contact that begins within the step, or with MuJoCo's motion and its derivative."""
+    return task.with_onset(mg.Onset()) if arm == ONSET else task.with_onset(None)
+
+
 # Throws between about 35 and 74 degrees clear the wall.
 _JUMPS = (0.62, 1.29)
 
@@ -114,7 +119,7 @@ def _throw(name: str, settings: PolicyGradientSettings) -> Problem:
         name=name,
         title="Throw, default contact" if is_default else "Throw, gentle contact",
         scene=task.scene,
-        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
         stddev=settings.angle_stddev,
         points=points,
         num_samples=50,
@@ -130,7 +135,7 @@ def _push(name: str) -> Problem:
         name=name,
         title=f"Push, {stiffness:g} N/m",
         scene=task.scene,
-        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
         stddev=task.settings.stddev,
         points=[Point("start", task.initial_params())],
         num_samples=16,
@@ -145,7 +150,7 @@ def _hopper(settings: PolicyGradientSettings) -> Problem:
         name="hopper",
         title="Hopper",
         scene=task.scene,
-        objective=lambda gradient, stddev: task.with_gradient(cast(Gradient, gradient)).objective(stddev),
+        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
         stddev=0.1,
         points=[Point("start", start)],
         num_samples=32,

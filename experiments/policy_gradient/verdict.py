@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.policy_gradient.outcome import DISCRETE, EVENT, GRADIENTS, Cell, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
 from experiments.report import Table, quantity
 from mjxgrad.estimators import Reason
 
@@ -23,24 +23,24 @@ def verdict(outcome: Outcome) -> str:
     repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_better(cell)]
     sentences = []
     if repaired:
-        discrete, event = ([cell.bias(gradient)[0] for cell in repaired] for gradient in GRADIENTS)
+        discrete, onset = ([cell.bias(gradient)[0] for cell in repaired] for gradient in GRADIENTS)
         sentences.append(
             f"The discrete first-order gradient is biased at {len(repaired)} of {len(smooth)} points without a jump of the cost, "
-            f"by {_range(discrete)} of the gradient's norm, where the event gradient leaves {_range(event)}."
+            f"by {_range(discrete)} of the gradient's norm, where contact that begins within the step leaves {_range(onset)}."
         )
-    worse = [cell for cell in smooth if _is_biased(cell, EVENT) and cell.bias(EVENT)[1] > cell.bias(DISCRETE)[2]]
+    worse = [cell for cell in smooth if _is_biased(cell, ONSET) and cell.bias(ONSET)[1] > cell.bias(DISCRETE)[2]]
     sentences.append(
-        f"The event gradient is worse in {_join([cell.label for cell in worse])}."
+        f"Contact that begins within the step is worse in {_join([cell.label for cell in worse])}."
         if worse
-        else "Nowhere is the event gradient the worse of both beyond chance."
+        else "Nowhere is contact that begins within the step the worse of both beyond chance."
     )
     jumps = [cell for cell in outcome.cells if cell.hits_and_misses]
-    missed = [cell for cell in jumps if _is_biased(cell, EVENT)]
+    missed = [cell for cell in jumps if _is_biased(cell, ONSET)]
     if missed:
-        alphas = [cell.alpha(EVENT)[0] for cell in missed]
+        alphas = [cell.alpha(ONSET)[0] for cell in missed]
         sentences.append(
             f"Hit or miss it does not see: at {len(missed)} of {len(jumps)} points where the noise covers a jump it is biased by "
-            f"{_range([cell.bias(EVENT)[0] for cell in missed])}, and α-order gives it a weight of {_span(alphas)}."
+            f"{_range([cell.bias(ONSET)[0] for cell in missed])}, and α-order gives it a weight of {_span(alphas)}."
         )
     return " ".join(sentences)
 
@@ -56,18 +56,18 @@ def findings(outcome: Outcome) -> list[str]:
     """
     sentences = []
     for cell in outcome.cells:
-        (before, _), (after, _) = cell.alpha(DISCRETE), cell.alpha(EVENT)
-        errors = cell.error(DISCRETE, "mixed"), cell.error(EVENT, "mixed")
+        (before, _), (after, _) = cell.alpha(DISCRETE), cell.alpha(ONSET)
+        errors = cell.error(DISCRETE, "mixed"), cell.error(ONSET, "mixed")
         if max(errors) > 1.5 * min(errors):
             sentences.append(
-                f"{cell.label}: α goes from {before:.2f} (discrete) to {after:.2f} (event), the error of one "
+                f"{cell.label}: α goes from {before:.2f} (discrete) to {after:.2f} (onset), the error of one "
                 f"α-order estimate from {errors[0]:.0%} to {errors[1]:.0%} of the gradient."
             )
     gentle = [cell for cell in outcome.cells if not cell.has_jump_of_force]
     if gentle:
         cell = max(gentle, key=_change)
         sentences.append(
-            f"Where contact sets in gently the event gradient changes the first-order mean by at most {_change(cell):.1%} of the "
+            f"Where contact sets in gently it changes the first-order mean by at most {_change(cell):.1%} of the "
             f"gradient ({cell.label})."
         )
     for name, estimator in dict.fromkeys((course.name, course.estimator) for course in outcome.courses):
@@ -141,12 +141,12 @@ def _is_biased(cell: Cell, gradient: str) -> bool:
 
 
 def _is_better(cell: Cell) -> bool:
-    return cell.bias(EVENT)[2] < cell.bias(DISCRETE)[1]
+    return cell.bias(ONSET)[2] < cell.bias(DISCRETE)[1]
 
 
 def _change(cell: Cell) -> float:
     """How far apart both first-order means are, over the norm of the gradient; from the same rollouts."""
-    return float(np.linalg.norm(cell.first_mean(EVENT)[0] - cell.first_mean(DISCRETE)[0])) / cell.norm
+    return float(np.linalg.norm(cell.first_mean(ONSET)[0] - cell.first_mean(DISCRETE)[0])) / cell.norm
 
 
 def _bias(cell: Cell, gradient: str) -> str:

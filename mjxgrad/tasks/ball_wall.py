@@ -56,6 +56,10 @@ class BallWall(eqx.Module):
         check_gradient(gradient)
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
+    def with_onset(self, onset: Onset | None) -> "BallWall":
+        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
+        return dataclasses.replace(self, gradient="discrete", onset=onset)
+
     def with_softness(self, softness: Softness) -> "BallWall":
         """Give the same throw with other contact softness."""
         return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))

@@ -84,6 +84,10 @@ class Billiards(eqx.Module):
         """Give the same stroke with other contact softness."""
         return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
 
+    def with_onset(self, onset: Onset | None) -> "Billiards":
+        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
+        return dataclasses.replace(self, gradient="discrete", onset=onset)
+
     def with_gradient(self, gradient: Gradient) -> "Billiards":
         """Give the same stroke with another derivative; see `rollout`.
 

@@ -37,7 +37,7 @@ def around(mean, spread=0.01, count=16):
     return np.asarray(mean) + noise - noise.mean(axis=0)
 
 
-def cell(discrete, event, *, name="hopper", point="start", hits_and_misses=False):
+def cell(discrete, onset, *, name="hopper", point="start", hits_and_misses=False):
     """A task of gradient (3, 4), of norm 5, and first-order means that differ from it by what is given."""
     truth = np.array([3.0, 4.0])
 
@@ -45,7 +45,7 @@ def cell(discrete, event, *, name="hopper", point="start", hits_and_misses=False
         first, unbiased = around(truth + error, 1e-4), around(truth, 0.5)
         return Estimates(first, unbiased, np.full(16, alpha), np.full(16, reason))
 
-    both = {"discrete": estimates(discrete, 0.0, INCONSISTENT), "event": estimates(event, 0.8, TRUSTED)}
+    both = {"discrete": estimates(discrete, 0.0, INCONSISTENT), "onset": estimates(onset, 0.8, TRUSTED)}
     return Cell(name, "Task", point, hits_and_misses, True, both, around(truth))
 
 
@@ -102,7 +102,7 @@ def test_a_bias_is_measured_by_the_norm_of_the_gradient():
     assert bias == pytest.approx(0.6, abs=2e-3)
     assert low < bias < high
     assert high - low < 0.02
-    assert cell([3.0, 0.0], [0.0, 0.0]).bias("event")[1] == 0
+    assert cell([3.0, 0.0], [0.0, 0.0]).bias("onset")[1] == 0
 
 
 def test_a_gradient_lost_in_its_noise_judges_nothing():
@@ -114,15 +114,15 @@ def test_a_gradient_lost_in_its_noise_judges_nothing():
     assert len(tables(outcome(lost))[0].rows) == 2
 
 
-def test_the_verdict_says_where_the_event_gradient_repairs():
+def test_the_verdict_says_where_the_onset_repairs():
     text = verdict(outcome(cell([3.0, 0.0], [0.0, 0.0]), cell([0.0, 0.0], [0.0, 0.0])))
     assert "biased at 1 of 2 points without a jump of the cost, by 60 % of the gradient's norm" in text
-    assert "Nowhere is the event gradient the worse" in text
+    assert "Nowhere is contact that begins within the step the worse" in text
 
 
-def test_the_verdict_says_where_the_event_gradient_does_harm():
+def test_the_verdict_says_where_the_onset_does_harm():
     text = verdict(outcome(cell([0.0, 0.0], [3.0, 0.0], point="0.5 rad")))
-    assert "The event gradient is worse in Task, 0.5 rad." in text
+    assert "Contact that begins within the step is worse in Task, 0.5 rad." in text
 
 
 def test_a_jump_is_no_repair_and_no_harm_but_missed():
@@ -138,8 +138,8 @@ def test_findings_and_tables_tell_what_alpha_order_makes_of_both():
     """A weight of 0 leaves all of the unbiased part's error, one of 0.8 a fifth; the first order has almost none."""
     one = outcome(cell([3.0, 0.0], [0.0, 0.0]))
     (sentence,) = findings(one)
-    assert "α goes from 0.00 (discrete) to 0.80 (event)" in sentence
-    assert one.cells[0].error("discrete", "mixed") == pytest.approx(5 * one.cells[0].error("event", "mixed"), rel=0.01)
+    assert "α goes from 0.00 (discrete) to 0.80 (onset)" in sentence
+    assert one.cells[0].error("discrete", "mixed") == pytest.approx(5 * one.cells[0].error("onset", "mixed"), rel=0.01)
     (table,) = tables(one)
     assert table.emphasised == {(0, 3)}
     assert [row[6] for row in table.rows] == ["contradictory 100%", "trusted 100%"]
@@ -154,10 +154,10 @@ def test_every_task_gets_its_figure(tmp_path):
                 rng.normal(size=(8, dim)), rng.normal(size=(8, dim)), rng.uniform(size=8), np.full(8, TRUSTED)
             )
 
-        both = {"discrete": estimates(), "event": estimates()}
+        both = {"discrete": estimates(), "onset": estimates()}
         return Cell(name, "Task", point, False, False, both, 1 + rng.normal(size=(8, dim)))
 
-    course = Course("hopper", "Task", "alpha", "event", rng.normal(size=(2, 3)), np.full((2, 3), 0.5), 1.0)
+    course = Course("hopper", "Task", "alpha", "onset", rng.normal(size=(2, 3)), np.full((2, 3), 0.5), 1.0)
     throws = [named("ball_wall", 1, f"{angle} rad") for angle in (0.4, 0.5)]
     one = outcome(*throws, named("push_soft", 5), named("push_stiff", 5), named("hopper", 21), courses=[course])
     figures = draw(one, tmp_path, captions(one))
@@ -183,4 +183,4 @@ def test_a_throw_under_default_contact_is_compared_from_file_to_report(tmp_path)
     assert main(command) == 0
     sentence = json.loads((tmp_path / "policy_gradient" / "summary.json").read_text())["verdict"]
     assert "The discrete first-order gradient is biased at 1 of 1 points" in sentence
-    assert "Nowhere is the event gradient the worse" in sentence
+    assert "Nowhere is contact that begins within the step the worse" in sentence

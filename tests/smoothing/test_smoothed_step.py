@@ -183,7 +183,9 @@ def test_lengths_are_swept_in_one_program():
     np.testing.assert_allclose(sweep(mg.Smoothing(lengths)), each, rtol=1e-10)
 
 
-BOX = """<mujoco><worldbody><body pos="0 0 .105"><joint type="slide" axis="0 0 1"/><geom name="pin" type="capsule" size=".1 .05" euler="90 0 0" condim="1"/></body>
+BOX = """<mujoco><worldbody>
+  <body pos="0 0 .105"><joint type="slide" axis="0 0 1"/>
+    <geom name="pin" type="capsule" size=".1 .05" euler="90 0 0" condim="1"/></body>
   <geom name="box" type="box" size=".1 .1 .1" pos="0 0 -.1" condim="1"/></worldbody></mujoco>"""
 
 
