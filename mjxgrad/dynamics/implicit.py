@@ -70,6 +70,10 @@ class System(eqx.Module):
         pull = self.pull(self.row_force(layout, acceleration))
         return self.inertia.apply(acceleration) - self.force - pull
 
+    def weighed(self, weight: Float[Array, "rows *batch"]) -> "System":
+        """Return the same with other weights of the rows."""
+        return eqx.tree_at(lambda s: s.rows.weight, self, weight)
+
     def problem(self) -> Problem:
         """Return the same with entries; arrays may carry the batch as trailing axes here."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
@@ -110,40 +114,56 @@ def _solve_jvp(layout, max_iterations, primals, tangents):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def solve_where(
+def solve_both(
     layout: RowLayout,
     max_iterations: int,
     system: System,
-    is_needed: Bool[Array, ""],
+    weights: Float[Array, "2 rows"],
+    differ: Bool[Array, ""],
     start: Float[Array, " nv"],
     tolerance: Float[Array, ""],
-) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
-    """Solve where it is needed; elsewhere the start is returned, whose derivative must not count, for it is zero.
+) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
+    """Solve with two sets of weights of the rows, the second time only where they differ.
+
+    Where they do not, the second solution is the first one, and its derivative must not count, for it is zero.
 
     Returns:
-        As `solve` does.
+        Both accelerations, and the larger number of iterations, as `solve` has it.
     """
 
-    def run(system, is_needed, start, tolerance):
-        def minimise(system, start, tolerance):
-            return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)
+    def first(system, weight, start, tolerance):
+        return newton.minimise(layout, system.weighed(weight).problem(), start, tolerance, max_iterations)
 
-        none = jnp.zeros(is_needed.shape, jnp.int32)
-        return linear.on_few(minimise, is_needed, (start, none), system, start, tolerance)
+    def second(system, weight, differ, start, tolerance):
+        none = jnp.zeros(differ.shape, jnp.int32)
+        return linear.on_few(first, differ, (start, none), system, weight, start, tolerance)
 
-    return linear.batch_last(run)(system, is_needed, start, tolerance)
+    found, count = linear.batch_last(first)(system, weights[0], start, tolerance)
+    other, more = linear.batch_last(second)(system, weights[1], differ, found, tolerance)
+    return jnp.stack([found, other]), jnp.maximum(count, more)
 
 
-@solve_where.defjvp
-def _solve_where_jvp(layout, max_iterations, primals, tangents):
-    system, is_needed, start, tolerance = primals
-    acceleration, num_iterations = solve_where(layout, max_iterations, system, is_needed, start, tolerance)
-    acceleration = checkpoint_name(acceleration, CHECKPOINT_NAME)
-    _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
-    bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
-    no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)
-    moved = -respond(layout, system, bend, change, is_needed)
-    return (acceleration, num_iterations), (moved, no_change)
+@solve_both.defjvp
+def _solve_both_jvp(layout, max_iterations, primals, tangents):
+    system, weights, differ, start, tolerance = primals
+    both, count = solve_both(layout, max_iterations, system, weights, differ, start, tolerance)
+    both = checkpoint_name(both, CHECKPOINT_NAME)
+
+    def residual(system: System, weights: Array) -> Array:
+        return jax.vmap(lambda weight, a: system.weighed(weight).gradient(layout, a))(weights, both)
+
+    def bend_of(weight: Array, acceleration: Array) -> Bend:
+        rows = system.weighed(weight).rows
+        return constraint.bend(layout, rows, system.rates(acceleration) - rows.reference)
+
+    _, change = jax.jvp(residual, (system, weights), (tangents[0], tangents[1]))
+    bends = jax.vmap(bend_of)(weights, both)
+    moved = [
+        -respond(layout, system, jax.tree.map(lambda x, k=k: x[k], bends), change[k], needed)
+        for k, needed in enumerate((None, differ))
+    ]
+    no_change = np.zeros(count.shape, jax.dtypes.float0)
+    return (both, count), (jnp.stack(moved), no_change)
 
 
 def respond(

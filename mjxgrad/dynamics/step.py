@@ -191,10 +191,9 @@ def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowL
 
 
 class _Partial(eqx.Module):
-    """Contacts that act for a part of the step: the rows' weights in both solves, see `dynamics.onset`."""
+    """Contacts that act for a part of the step: the rows' weights with and without those that begin, see `dynamics.onset`."""
 
-    before: Float[Array, " rows"]
-    after: Float[Array, " rows"]
+    weights: Float[Array, "2 rows"]
     share: Float[Array, ""]
     is_split: Bool[Array, ""]
 
@@ -203,8 +202,8 @@ def _partial(blocks: list[Block], shares: Shares | None) -> _Partial | None:
     if shares is None:
         return None
     rows = assembly.joined(blocks)
-    before, after = (onsets.weights(rows, share) for share in (shares.before, shares.after))
-    return _Partial(before, after, shares.weight, shares.is_split)
+    weights = jax.vmap(lambda share: onsets.weights(rows, share))(jnp.stack([shares.after, shares.before]))
+    return _Partial(weights, shares.weight, shares.is_split)
 
 
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -277,16 +276,17 @@ def _minimum(
         return data.tree_replace({"_impl.solver_niter": none})  # pyright: ignore[reportReturnType]
     tolerance = jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
     iterations = int(model.opt.iterations)
-    system = system if partial is None else _weighed(system, partial.after)
-    acceleration, num_iterations = implicit.solve(layout, iterations, system, jax.lax.stop_gradient(start), tolerance)
-    force = system.row_force(layout, acceleration)
-    if partial is not None:
-        earlier = _weighed(system, partial.before)
-        near = jax.lax.stop_gradient(acceleration)
-        first, more = implicit.solve_where(layout, iterations, earlier, partial.is_split, near, tolerance)
-        acceleration = first + partial.share * (acceleration - first)
-        force = (1 - partial.share) * earlier.row_force(layout, first) + partial.share * force
-        num_iterations = jnp.maximum(num_iterations, more)
+    start = jax.lax.stop_gradient(start)
+    if partial is None:
+        acceleration, num_iterations = implicit.solve(layout, iterations, system, start, tolerance)
+        force = system.row_force(layout, acceleration)
+    else:
+        both, num_iterations = implicit.solve_both(
+            layout, iterations, system, partial.weights, partial.is_split, start, tolerance
+        )
+        forces = jax.vmap(lambda weight, a: system.weighed(weight).row_force(layout, a))(partial.weights, both)
+        # In this order they are the whole contact's to the last bit where the two do not differ.
+        acceleration, force = (x[1] + partial.share * (x[0] - x[1]) for x in (both, forces))
     return data.tree_replace(  # pyright: ignore[reportReturnType]
         {
             "qacc": acceleration,
@@ -295,10 +295,6 @@ def _minimum(
             "_impl.solver_niter": num_iterations.astype(data._impl.solver_niter.dtype),
         }
     )
-
-
-def _weighed(system: System, weight: Float[Array, " rows"]) -> System:
-    return eqx.tree_at(lambda s: s.rows.weight, system, weight)
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
