@@ -57,7 +57,7 @@ bench: .venv/.installed  ## measure speed and memory against mjx.step
 throughput: .venv/.installed  ## measure a sweep over softness in one program against ten, and its memory
 	@$(BIN)/python -m experiments.throughput $(ARGS)
 
-costs: .venv/.installed  ## measure what the event gradient and smoothing cost
+costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
 	@$(BIN)/python -m experiments.costs $(ARGS)
 
 lint: .venv/.installed  ## ruff and pyright

@@ -1,4 +1,4 @@
-"""What the event gradient and smoothing cost: ratios to the discrete gradient and the plain step, in one process.
+"""What continuous onset, the event gradient and smoothing cost: ratios to the discrete gradient and the plain step, in one process.
 
     python -m experiments.costs [--batch 256] [--repeats 7]
 
@@ -55,12 +55,15 @@ def _measure(name: str, path: Path, start: tuple[int, float], batch: int, repeat
     smooth, behind = mg.Smoothing(1e-3), mg.Smoothing(1e-3, mode="backward")
     cases = {
         "rollout": (cost, {}),
+        "rollout, onset": (cost, {"onset": mg.Onset()}),
         "rollout, smoothed": (cost, {"smoothing": smooth}),
         "value_and_grad": (reverse, {}),
+        "value_and_grad, onset": (reverse, {"onset": mg.Onset()}),
         "value_and_grad, event": (reverse, {"gradient": "event"}),
         "value_and_grad, smoothed": (reverse, {"smoothing": smooth}),
         "value_and_grad, smoothed backward": (reverse, {"smoothing": behind}),
         "jvp": (forward, {}),
+        "jvp, onset": (forward, {"onset": mg.Onset()}),
         "jvp, event": (forward, {"gradient": "event"}),
     }
     programs = {case: jax.jit(jax.vmap(functools.partial(f, **settings))) for case, (f, settings) in cases.items()}
