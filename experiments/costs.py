@@ -1,6 +1,6 @@
 """What continuous onset, the event gradient and smoothing cost: ratios to the discrete gradient and the plain step, in one process.
 
-    python -m experiments.costs [--batch 256] [--repeats 7]
+    python -m experiments.costs [--batch 256] [--repeats 7] [--only onset]
 
 Every case is compiled first; then all take turns, so that a change of the machine's load meets all alike.
 """
@@ -31,16 +31,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--only", default="", help="word that cases must hold, besides the plain ones")
     arguments = parser.parse_args()
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, batch {arguments.batch}, {_NUM_STEPS} steps")
     for name, (path, start) in _SCENES.items():
-        _measure(name, path, start, arguments.batch, arguments.repeats)
+        _measure(name, path, start, arguments)
 
 
-def _measure(name: str, path: Path, start: tuple[int, float], batch: int, repeats: int) -> None:
+def _measure(name: str, path: Path, start: tuple[int, float], arguments: argparse.Namespace) -> None:
     scene = mg.load_scene(path)
     qpos = scene.data.qpos.at[start[0]].add(start[1])
-    qvel = 0.3 * jax.random.normal(jax.random.key(0), (batch, scene.model.nv))
+    qvel = 0.3 * jax.random.normal(jax.random.key(0), (arguments.batch, scene.model.nv))
 
     def cost(qvel, **settings):
         state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
@@ -66,9 +67,10 @@ def _measure(name: str, path: Path, start: tuple[int, float], batch: int, repeat
         "jvp, onset": (forward, {"onset": mg.Onset()}),
         "jvp, event": (forward, {"gradient": "event"}),
     }
+    cases = {case: how for case, how in cases.items() if "," not in case or arguments.only in case}
     programs = {case: jax.jit(jax.vmap(functools.partial(f, **settings))) for case, (f, settings) in cases.items()}
     seconds = {case: [] for case in programs}
-    for turn in range(repeats + 1):
+    for turn in range(arguments.repeats + 1):
         for case, program in programs.items():
             began = time.perf_counter()
             jax.block_until_ready(program(qvel))
