@@ -1,4 +1,4 @@
-"""What continuous onset, the event gradient and smoothing cost: ratios to the discrete gradient and the plain step, in one process.
+"""What continuous onset, the event gradient and smoothing cost: ratios to the plain step and its gradient, in one process.
 
     python -m experiments.costs [--batch 256] [--repeats 7] [--only onset]
 

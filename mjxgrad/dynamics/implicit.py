@@ -138,6 +138,9 @@ def solve_both(
         none = jnp.zeros(differ.shape, jnp.int32)
         return linear.on_few(first, differ, (start, none), system, weight, start, tolerance)
 
+    if not _takes_few():
+        both, counts = jax.vmap(lambda weight: linear.batch_last(first)(system, weight, start, tolerance))(weights)
+        return both, jnp.max(counts)
     found, count = linear.batch_last(first)(system, weights[0], start, tolerance)
     other, more = linear.batch_last(second)(system, weights[1], differ, found, tolerance)
     return jnp.stack([found, other]), jnp.maximum(count, more)
@@ -158,12 +161,21 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
 
     _, change = jax.jvp(residual, (system, weights), (tangents[0], tangents[1]))
     bends = jax.vmap(bend_of)(weights, both)
-    moved = [
-        -respond(layout, system, jax.tree.map(lambda x, k=k: x[k], bends), change[k], needed)
-        for k, needed in enumerate((None, differ))
-    ]
+    if _takes_few():
+        kinds = enumerate((None, differ))
+        parts = [
+            respond(layout, system, jax.tree.map(lambda x, k=k: x[k], bends), change[k], needed) for k, needed in kinds
+        ]
+        moved = -jnp.stack(parts)
+    else:
+        moved = -jax.vmap(lambda bend, force: respond(layout, system, bend, force))(bends, change)
     no_change = np.zeros(count.shape, jax.dtypes.float0)
-    return (both, count), (jnp.stack(moved), no_change)
+    return (both, count), (moved, no_change)
+
+
+def _takes_few() -> bool:
+    """Whether it pays to solve again for those few of a batch that need it: a GPU is done sooner with all of them at once."""
+    return jax.default_backend() == "cpu"
 
 
 def respond(
