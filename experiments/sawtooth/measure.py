@@ -51,17 +51,20 @@ class Course:
 
     def residual(self, arm: str) -> Float[np.ndarray, "phases times labels"]:
         """Give the outcome less its trend over the starts."""
-        found = self.arms[arm]
-        place = np.linspace(-1, 1, len(found.parameters))
+        return self._without_trend(self.arms[arm].outcomes)
+
+    def _without_trend(self, values: Float[np.ndarray, "phases *rest"]) -> Float[np.ndarray, "phases *rest"]:
+        start = self.arms[DISCRETE].parameters
+        place = (2 * start - start[0] - start[-1]) / (start[-1] - start[0])
         basis = np.polynomial.legendre.legvander(place, _DEGREE)
-        flat = found.outcomes.reshape(len(place), -1)
-        return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(found.outcomes.shape)
+        flat = values.reshape(len(place), -1)
+        return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(values.shape)
 
     @property
     def has_impact(self) -> Bool[np.ndarray, "times labels"]:
         """Where MuJoCo's outcome has teeth."""
         size = np.abs(self.arms[DISCRETE].outcomes).max(axis=0) + np.finfo(float).tiny
-        return self.sawtooth(DISCRETE) > 1e-7 * size
+        return self.sawtooth(DISCRETE) > 1e-6 * size
 
     @property
     def shift(self) -> Float[np.ndarray, "times labels"]:
@@ -70,12 +73,8 @@ class Course:
 
     def spread(self, arm: str) -> Float[np.ndarray, "times labels"]:
         """Give the standard deviation of single derivatives about their trend, over the slope."""
-        found = self.arms[arm]
-        place = np.linspace(-1, 1, len(found.parameters))
-        basis = np.polynomial.legendre.legvander(place, _DEGREE)
-        flat = found.derivatives[0].reshape(len(place), -1)
-        rest = flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]
-        return rest.std(axis=0).reshape(found.slope.shape) / np.abs(self.arms[CONTINUOUS].slope)
+        rest = self._without_trend(self.arms[arm].derivatives[0])
+        return rest.std(axis=0) / np.abs(self.arms[CONTINUOUS].slope)
 
     def error(self, arm: str) -> Float[np.ndarray, "times labels"] | None:
         """Give the mean distance to the converged motion."""

@@ -34,7 +34,8 @@ impedance p d. It is continuous throughout, and the mean share is φ.
 
 - u = max(g h, g / 2(B + √K)) holds for grazing: below it free motion, or the weight on the contact, moves the bodies faster than
   they approach. The edges n ± μ t of a pyramid that slides push with B μ |v_t| as soon as they touch, often many times the
-  weight; the body then rides on the ramp itself, and u grows by three times what this push gains in a step.
+  weight; the body then rides on the ramp itself, and u grows by three times what this push gains in a step, unless the
+  approach is much faster than 2 g h: an impact.
 - w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a thing pushed along the floor) each
   switch multiplies the tangent by about h Δa / w, and w₀ bounds it at every time step. A larger one is a smoother motion, farther
   from MuJoCo's: the ball of `tests/dynamics/test_onset.py` is pushed a fortieth slower with twice the width.
@@ -204,7 +205,10 @@ def _share(
     creep = gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
     if block.is_pyramid:
         slip = jnp.max(jnp.abs(rates - rate[:, None]), axis=1)
-        creep = creep + _SLIP * h * damping * slip
+        # Not of impacts, whose approach is many times what the weight gains in a step.
+        few, approach = (2 * h * gravity) ** 4, rate**4
+        rides = few / jnp.where(few + approach > 0, few + approach, 1.0)
+        creep = creep + _SLIP * h * damping * slip * rides
     floor = onset.width.astype(rate.dtype) * block.solimp[::each, 2]
     travel, least = h * jnp.abs(rate), safe_sqrt((h * creep) ** 2 + floor**2)
     width = jnp.where(travel > least, travel, least)
