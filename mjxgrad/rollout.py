@@ -70,7 +70,7 @@ class Trajectory(eqx.Module):
     growth: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan))
 
     @property
-    def explodes(self) -> Bool[Array, ""]:
+    def explodes(self) -> Bool[Array, "*batch"]:
         """Whether the derivative has grown beyond belief: a thousandfold, or out of all numbers. False if it was not measured."""
         return (self.growth > LARGEST_GROWTH) | jnp.isinf(self.growth)
 
