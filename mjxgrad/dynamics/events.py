@@ -43,7 +43,7 @@ what is read of a step (`qacc`, forces, sensors), whose derivative stays the dis
 **Limits.** The jump is carried on by the tangent of the phase at hand, so contact should last some steps: on a
 bounce the mean is right to a few per cent from about six steps on, and wrong below (`make bounce`). The spread over phases
 remains, contacts that begin in the same step have no order, and where contacts chatter each multiplies the tangent. Where
-MuJoCo's motion is not needed to the bit take `mjxgrad.Onset`, which has none of these limits. A real discontinuity, hit or
+MuJoCo's motion is not needed to the bit take `mjxgrad.Onset`, which is right sample by sample. A real discontinuity, hit or
 miss, has no derivative: that needs zeroth order.
 
 References:

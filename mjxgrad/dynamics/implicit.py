@@ -123,7 +123,7 @@ def solve_both(
     start: Float[Array, " nv"],
     tolerance: Float[Array, ""],
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
-    """Solve with two sets of weights of the rows, the second time only where they differ.
+    """Solve with two sets of weights of the rows, on CPUs the second time only where they differ.
 
     Where they do not, the second solution is the first one, and its derivative must not count, for it is zero.
 

@@ -11,7 +11,7 @@ has the saltation term. Here the step keeps its length, and takes the mean of th
 step; a(·) is MuJoCo's own acceleration with these contacts and no others, all taken at the present state. A contact that
 begins alone acts with (1 - φ) a₋ + φ a₊, so its impulse is linear in φ in all directions, friction included, and whatever else
 the bodies touch. (The same share put on the impedance is not: rows resist by the inertia behind them, which is another along the
-normal than across it. On gymnasium's ant at 10 ms that shifts the mean by 6 mm, thirty times the error of MuJoCo's step.)
+normal than across it. On gymnasium's ant at 10 ms that shifts the mean by 6 mm, ten times the error of MuJoCo's step.)
 
 **Consequences.** The solve is strictly convex and its weights are continuous in φ, so the whole step is a continuous function of
 state and parameters, for contacts, joint and tendon limits, all cones, at the beginning and at release. Hence:
@@ -37,8 +37,8 @@ impedance p d. It is continuous throughout, and the mean share is φ.
   weight; the body then rides on the ramp itself, and u grows by three times what this push gains in a step, unless the
   approach is much faster than 2 g h: an impact.
 - w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a thing pushed along the floor) each
-  switch multiplies the tangent by about h Δa / w, and w₀ bounds it at every time step. A larger one is a smoother motion, farther
-  from MuJoCo's: the ball of `tests/dynamics/test_onset.py` is pushed a fortieth slower with twice the width.
+  switch multiplies the tangent by about h Δa / w, and w₀ bounds it at every time step. A larger one is a smoother motion,
+  farther from MuJoCo's.
 
 On the floor r is taken ahead, r + h v (1 - h²v²/w²): that damps what else would swing on the ramp.
 
@@ -47,9 +47,9 @@ wall). Both sides push then for their share of the step, which is one push of sh
 the centres along the normal; φ is multiplied by it. For geoms with a centre of symmetry.
 
 **What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not, a change of the nearest face by a
-right angle. A contact of fewer than about three steps is smooth and still not resolved. But from planes, and of boxes from
-balls, MJX knows the distance of boxes and meshes only where they overlap: there the ramp lies at 0 > r > -w, continuous and half
-a step late.
+right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still multiplies tangents, within
+what the width allows. The distance of boxes and meshes is known only where they overlap, except from planes, and of boxes from balls:
+there the ramp lies at 0 > r > -w, continuous and half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
@@ -130,14 +130,12 @@ class Shares(eqx.Module):
     """For which part of the step each row acts; see the module.
 
     Attributes:
-        mean: φ of each row; 1 for rows that never begin or end.
-        before: p₋ of each row.
-        after: p₊ of each row.
-        weight: Φ, of the second solve.
+        before: p₋ of each row; 1 for rows that never begin or end.
+        after: p₊ of each row, likewise.
+        weight: Φ, the weight of the solve with p₊.
         is_split: whether the two solves differ.
     """
 
-    mean: Float[Array, " rows"]
     before: Float[Array, " rows"]
     after: Float[Array, " rows"]
     weight: Float[Array, ""]
@@ -264,14 +262,14 @@ def _split(share: Float[Array, " rows"], is_first: np.ndarray) -> Shares:
     counts = jnp.where(is_partial & is_first, share * (1 - share), 0.0)
     total = jnp.sum(counts)
     is_split = total > 0
-    # Without partial contacts the second solve is all there is.
+    # Without partial contacts the solve with p₊ is all there is.
     weight = jnp.where(is_split, jnp.sum(counts * share) / jnp.where(is_split, total, 1.0), 1.0)
     rest = jnp.where(is_split, 1 - weight, 1.0)
     early, late = share - weight, share / weight
     before = jnp.where(early > 0, early / rest, 0.0)
     before = jnp.where((share == 1) | ~is_split, share, before)
     after = jnp.where(late < 1, late, 1.0)
-    return Shares(share, before, after, weight, is_split)
+    return Shares(before, after, weight, is_split)
 
 
 def weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
