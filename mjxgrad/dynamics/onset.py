@@ -47,9 +47,9 @@ wall). Both sides push then for their share of the step, which is one push of sh
 the centres along the normal; φ is multiplied by it. For geoms with a centre of symmetry.
 
 **What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not, a change of the nearest face by a
-right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still multiplies tangents, within
-what the width allows. The distance of boxes and meshes is known only where they overlap, except from planes, and of boxes from balls:
-there the ramp lies at 0 > r > -w, continuous and half a step late.
+right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still multiplies tangents,
+within what the width allows. The distance of boxes and meshes is known only where they overlap, except from planes, and of boxes
+from balls: there the ramp lies at 0 > r > -w, continuous and half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
