@@ -12,7 +12,6 @@ from experiments.bounce.settings import BounceSettings
 from experiments.config import RunSettings
 from experiments.cube_toss.settings import CubeTossSettings
 from experiments.kernels.settings import KernelsSettings
-from experiments.landing.settings import LandingSettings
 from experiments.long_horizon.settings import LongHorizonSettings
 from experiments.optimisation.settings import OptimisationSettings
 from experiments.planning.settings import PlanningSettings
@@ -56,7 +55,6 @@ EXPERIMENTS = {
     "bias_variance": Experiment(BiasVarianceSettings, "experiments.bias_variance.run:run"),
     "bounce": Experiment(BounceSettings, "experiments.bounce.run:run"),
     "kernels": Experiment(KernelsSettings, "experiments.kernels.run:run"),
-    "landing": Experiment(LandingSettings, "experiments.landing.run:run"),
     "long_horizon": Experiment(LongHorizonSettings, "experiments.long_horizon.run:run"),
     "planning": Experiment(PlanningSettings, "experiments.planning.run:run"),
     "policy_gradient": Experiment(PolicyGradientSettings, "experiments.policy_gradient.run:run"),

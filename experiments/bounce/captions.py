@@ -21,13 +21,12 @@ def captions(outcome: Outcome) -> dict[str, str]:
             "ball flies in one step; far shorter ones give the discrete gradient. The axis is linear between −0.1 and 0.1."
         ),
         "error": (
-            "Error of the event gradient as a share of the larger of the slope and the discrete gradient's own error, one "
+            "Error of the derivative with contact that begins within the step, as a share of the slope, one "
             "square per contact. A dot: beyond the tolerance, but not beyond two standard errors of the means. Crossed squares "
             "are not judged: the step is unstable there, or the slope is not known well enough."
         ),
         "steps": (
-            "The same errors, of both gradients, against the number of time steps that the contact lasts: one dot per contact "
-            f"and time step. Dotted, {settings.tolerance:.0%}. By definition the discrete gradient lies at 100% where its "
-            "error exceeds the slope. Errors below 10⁻⁴ are drawn there."
+            "The same errors, of all three, against the number of time steps that the contact lasts: one dot per contact "
+            f"and time step. Dotted, {settings.tolerance:.0%}. Errors larger than the slope lie at 100%, those below 10⁻⁴ there."
         ),
     }

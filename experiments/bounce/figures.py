@@ -7,12 +7,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FuncFormatter
 
-from experiments.bounce.outcome import DISCRETE, EVENT, Outcome
+from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Outcome
 from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, subplots
 
-_WIDE = "#009e73"
+_CONTINUOUS = "#009e73"
+_LOOKS = ((DISCRETE, FIRST, "o"), (EVENT, ZEROTH, "s"), (CONTINUOUS, _CONTINUOUS, "D"))
 
 
 def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
@@ -48,11 +49,12 @@ def derivative(outcome: Outcome):
     h = 1e3 * outcome.timesteps
     for axis, j in zip(axes[0], shown, strict=True):
         axis.axhline(outcome.cells[j].truth, color=REFERENCE, lw=1, ls=(0, (2, 2)), label="truth")
-        axis.plot(h, outcome.slope[:, j], color=REFERENCE, lw=2.6, label="slope of the simulated height")
+        axis.plot(h, outcome.slope()[:, j], color=REFERENCE, lw=2.6, label="slope of the simulated height")
         looks = (
-            (outcome.mean(DISCRETE), outcome.spread(DISCRETE), FIRST, "o", "discrete gradient", 0.96),
-            (outcome.mean(EVENT), outcome.spread(EVENT), ZEROTH, "s", "event gradient", 1.0),
-            (outcome.wide, outcome.wide_spread, _WIDE, "^", "difference over one step's flight", 1.04),
+            (outcome.mean(DISCRETE), outcome.spread(DISCRETE), FIRST, "o", "discrete gradient", 0.94),
+            (outcome.mean(EVENT), outcome.spread(EVENT), ZEROTH, "s", "event gradient", 0.98),
+            (outcome.mean(CONTINUOUS), outcome.spread(CONTINUOUS), _CONTINUOUS, "D", "continuous onset", 1.02),
+            (outcome.wide, outcome.wide_spread, MUTED, "^", "difference over one step's flight", 1.06),
         )
         for mean, spread, colour, marker, label, shift in looks:
             axis.errorbar(
@@ -67,7 +69,7 @@ def derivative(outcome: Outcome):
     axes[0, 0].set_ylabel("derivative")
     figure.suptitle(f"Time constant {1e3 * constant:g} ms, impedance {impedance.label}", fontsize=10)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8.5)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
 
 
@@ -77,9 +79,10 @@ def error(outcome: Outcome):
     rows, columns = len(settings.impedances), len(settings.timesteps)
     figure, axes = subplots(rows, columns, height=0.9 + 1.35 * rows, sharex=True, sharey=True)
     shape = (len(settings.damping_ratios), len(settings.time_constants), rows)
-    errors = outcome.error(EVENT).reshape(-1, *shape)
+    errors = outcome.error(CONTINUOUS).reshape(-1, *shape)
     judged = outcome.can_judge.reshape(-1, *shape)
-    unsure = (outcome.can_judge & ~outcome.holds & ~outcome.fails).reshape(-1, *shape)
+    unsure = outcome.can_judge & ~outcome.holds(CONTINUOUS) & ~outcome.fails(CONTINUOUS)
+    unsure = unsure.reshape(-1, *shape)
     look = ScalarMappable(LogNorm(1e-3, 1), "RdYlBu_r")
     for i, j in np.ndindex(rows, columns):
         axis = axes[i, j]
@@ -108,17 +111,17 @@ def error(outcome: Outcome):
 
 
 def steps(outcome: Outcome):
-    """Errors of both gradients against how many steps a contact lasts; contacts that set in with a jump apart."""
+    """Errors of all derivatives against how many steps a contact lasts; contacts that set in with a jump apart."""
     figure, axes = subplots(1, 2, height=3.6, sharey=True, sharex=True)
     has_jump = np.array([cell.impedance.first > 0 for cell in outcome.cells])
     titles = ("Contact sets in with a jump of force", "Contact sets in gently")
     for axis, chosen, title in zip(axes[0], (has_jump, ~has_jump), titles, strict=True):
         judged = outcome.can_judge & chosen
-        for name, colour, marker in ((DISCRETE, FIRST, "o"), (EVENT, ZEROTH, "s")):
+        for name, colour, marker in _LOOKS:
             errors = np.maximum(outcome.error(name)[judged], 1e-4)
             axis.plot(
                 outcome.steps_in_contact[judged], errors, marker, color=colour, ms=3.5, mec="none", alpha=0.6,
-                label=f"{name} gradient",
+                label=name,
             )  # fmt: skip
         axis.axhline(outcome.settings.tolerance, color=MUTED, lw=1, ls=(0, (2, 3)))
         axis.set_xscale("log")
@@ -128,5 +131,5 @@ def steps(outcome: Outcome):
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g}%"))
     axes[0, 0].set_ylabel("error")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8.5)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from experiments.bounce.outcome import DISCRETE, EVENT, Cell, Outcome
+import mjxgrad as mg
+from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Cell, Outcome
 from experiments.bounce.settings import BounceSettings, ImpedanceSettings
 from experiments.motion import at_time_step, motion
 from experiments.workspace import Workspace
@@ -17,6 +18,7 @@ from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.scene import Scene
 from mjxgrad.tasks.textbook import Bounce, bounce_scene, integrated_restitution
 
+_ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
 _TINY = 1e-7  # m; the ball flies 500 times as far in the shortest of time steps
 
 
@@ -30,7 +32,7 @@ class _Contacts(eqx.Module):
     num_steps: Int[Array, ""]
     speed: Float[Array, ""]
 
-    def height(self, start: Float[Array, ""], cell: Int[Array, ""], gradient: str) -> Float[Array, ""]:
+    def height(self, start: Float[Array, ""], cell: Int[Array, ""], arm: str) -> Float[Array, ""]:
         """Bounce once, from a start height to the height at the end."""
         model = at_time_step(self.scene.model, self.timestep)
         model = model.replace(
@@ -38,7 +40,10 @@ class _Contacts(eqx.Module):
             geom_solimp=jnp.broadcast_to(self.solimp[cell], model.geom_solimp.shape),
         )
         data = self.scene.data.replace(qpos=start[None], qvel=-self.speed[None])
-        return motion(model, data, _height, num_times=1, steps_between=self.num_steps, gradient=gradient)[0]
+        gradient, onset = _ARMS[arm]
+        return motion(model, data, _height, num_times=1, steps_between=self.num_steps, gradient=gradient, onset=onset)[
+            0
+        ]
 
 
 def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
@@ -55,19 +60,20 @@ def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
     with workspace.stage("quadrature", "steps", 1):
         cells = [_cell(settings, *point) for point in grid]
     scene = bounce_scene()
-    found, differences = [], []
+    found, differences = {arm: [] for arm in _ARMS}, []
     starts = jnp.asarray(phases(settings.heights, settings.num_phases))
     with workspace.stage("rollouts", "time steps", len(settings.timesteps)) as advance_to:
         for timestep in settings.timesteps:
             contacts = _contacts(scene, cells, settings, timestep)
-            sampled = {name: _values_and_derivatives(contacts, starts, name) for name in (DISCRETE, EVENT)}
-            derivatives = [derivative for _, derivative in sampled.values()]
-            found.append(compare_to_slope(starts, sampled[DISCRETE][0], derivatives, tuple(sampled)))
+            for arm, each in found.items():
+                heights, derivatives = _values_and_derivatives(contacts, starts, arm)
+                each.append(compare_to_slope(starts, heights, [derivatives], (arm,)))
             widths = (_TINY, settings.speed * timestep)
             quotients = [_differences(contacts, starts, width) for width in widths]
             # Their means need the weights of the derivatives' to be compared with them.
-            differences.append(compare_to_slope(starts, sampled[DISCRETE][0], quotients, ("tiny", "wide")))
-            advance_to(len(found))
+            heights = found[DISCRETE][-1].outcomes
+            differences.append(compare_to_slope(starts, heights, quotients, ("tiny", "wide")))
+            advance_to(len(differences))
     return Outcome(
         settings=settings,
         cells=cells,
@@ -104,10 +110,10 @@ def _height(qpos: Float[Array, " 1"], qvel: Float[Array, " 1"]) -> Float[Array, 
 
 @eqx.filter_jit
 def _values_and_derivatives(
-    contacts: _Contacts, starts: Float[Array, " phases"], gradient: str
+    contacts: _Contacts, starts: Float[Array, " phases"], arm: str
 ) -> tuple[Float[Array, "phases cells"], Float[Array, "phases cells"]]:
     def one(start: Float[Array, ""], cell: Int[Array, ""]) -> tuple[Array, Array]:
-        return jax.jvp(lambda x: contacts.height(x, cell, gradient), (start,), (jnp.ones_like(start),))
+        return jax.jvp(lambda x: contacts.height(x, cell, arm), (start,), (jnp.ones_like(start),))
 
     return _over_grid(one, starts, contacts)
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from experiments.bounce.settings import BounceSettings, ImpedanceSettings
 from mjxgrad.diagnostics import SlopeComparison
 
-DISCRETE, EVENT = "discrete", "event"
+DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Outcome:
     Attributes:
         settings: of the run.
         cells: the contacts.
-        found: derivatives beside the slope, one comparison per time step, by cell.
+        found: by arm its derivative beside the slope of its own height, one comparison per time step, by cell.
         tiny: mean over the phases of central differences far shorter than a time step, by time step and cell.
         wide: the same with differences as long as the ball flies in one step.
         wide_spread: standard deviation of these over the phases.
@@ -48,7 +48,7 @@ class Outcome:
 
     settings: BounceSettings
     cells: list[Cell]
-    found: list[SlopeComparison]
+    found: dict[str, list[SlopeComparison]]
     tiny: Float[np.ndarray, "timesteps cells"]
     wide: Float[np.ndarray, "timesteps cells"]
     wide_spread: Float[np.ndarray, "timesteps cells"]
@@ -58,39 +58,21 @@ class Outcome:
         """In s."""
         return np.array(self.settings.timesteps)
 
-    @property
-    def slope(self) -> Float[np.ndarray, "timesteps cells"]:
-        """Of the simulated height."""
-        return np.array([one.slope for one in self.found])
+    def slope(self, arm: str = DISCRETE) -> Float[np.ndarray, "timesteps cells"]:
+        """Give the slope of the simulated height, MuJoCo's unless said."""
+        return np.array([one.slope for one in self.found[arm]])
 
-    def mean(self, gradient: str) -> Float[np.ndarray, "timesteps cells"]:
-        """Give the mean of a derivative over the phases.
+    def mean(self, arm: str) -> Float[np.ndarray, "timesteps cells"]:
+        """Give the mean of a derivative over the phases."""
+        return np.array([one.mean[0] for one in self.found[arm]])
 
-        Args:
-            gradient: its name.
-        """
-        return np.array([one.mean[one.gradients.index(gradient)] for one in self.found])
+    def spread(self, arm: str) -> Float[np.ndarray, "timesteps cells"]:
+        """Give the standard deviation of a derivative over the phases."""
+        return np.array([one.spread[0] for one in self.found[arm]])
 
-    def spread(self, gradient: str) -> Float[np.ndarray, "timesteps cells"]:
-        """Give the standard deviation of a derivative over the phases.
-
-        Args:
-            gradient: its name.
-        """
-        return np.array([one.spread[one.gradients.index(gradient)] for one in self.found])
-
-    def error(self, gradient: str) -> Float[np.ndarray, "timesteps cells"]:
-        """Give the error of a derivative as a share of the larger of the slope and the discrete one's own error.
-
-        Args:
-            gradient: its name.
-        """
-        return np.array([one.relative_error[one.gradients.index(gradient)] for one in self.found])
-
-    @property
-    def share_of_slope(self) -> Float[np.ndarray, "timesteps cells"]:
-        """Give the error of the event gradient as a share of the slope alone."""
-        return np.abs(self.mean(EVENT) - self.slope) / np.abs(self.slope)
+    def error(self, arm: str) -> Float[np.ndarray, "timesteps cells"]:
+        """Give the error of a derivative as a share of the slope of its own height; 1 where it is larger."""
+        return np.array([one.relative_error[0] for one in self.found[arm]])
 
     @property
     def is_stable(self) -> Bool[np.ndarray, "timesteps cells"]:
@@ -101,23 +83,20 @@ class Outcome:
 
     @property
     def can_judge(self) -> Bool[np.ndarray, "timesteps cells"]:
-        """Where the slope is known well enough, and the step is stable."""
+        """Where the slopes of all arms are known well enough, and the step is stable."""
         tolerance = self.settings.tolerance
-        return np.array([one.is_resolved(tolerance) for one in self.found]) & self.is_stable
+        known = [[one.slope_error <= tolerance * np.abs(one.slope) for one in each] for each in self.found.values()]
+        return np.array(known).all(axis=0) & self.is_stable
 
-    @property
-    def holds(self) -> Bool[np.ndarray, "timesteps cells"]:
-        """Where the event gradient is within the tolerance."""
-        return self.can_judge & self._said("is_close")
+    def holds(self, arm: str) -> Bool[np.ndarray, "timesteps cells"]:
+        """Say where a derivative is within the tolerance."""
+        close = np.array([one.is_close(self.settings.tolerance)[0] for one in self.found[arm]])
+        return self.can_judge & close
 
-    @property
-    def fails(self) -> Bool[np.ndarray, "timesteps cells"]:
-        """Where it is beyond the tolerance by more than two standard errors; elsewhere more phases would be needed."""
-        return self.can_judge & self._said("is_off")
-
-    def _said(self, question: str) -> Bool[np.ndarray, "timesteps cells"]:
-        answers = [getattr(one, question)(self.settings.tolerance) for one in self.found]
-        return np.array([answer[one.gradients.index(EVENT)] for answer, one in zip(answers, self.found, strict=True)])
+    def fails(self, arm: str) -> Bool[np.ndarray, "timesteps cells"]:
+        """Say where it is beyond the tolerance by more than two standard errors; else more phases would be needed to tell."""
+        off = np.array([one.is_off(self.settings.tolerance)[0] for one in self.found[arm]])
+        return self.can_judge & off
 
     @property
     def steps_in_contact(self) -> Float[np.ndarray, "timesteps cells"]:
@@ -126,21 +105,24 @@ class Outcome:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per contact and time step, for metrics.csv."""
-        columns = {
-            "slope": self.slope,
-            "slope_error": np.array([one.slope_error for one in self.found]),
-            **{name: self.mean(name) for name in (DISCRETE, EVENT)},
-            **{f"{name}_spread": self.spread(name) for name in (DISCRETE, EVENT)},
-            **{f"{name}_relative_error": self.error(name) for name in (DISCRETE, EVENT)},
-            "event_share_of_slope": self.share_of_slope,
+        columns = {}
+        for arm in self.found:
+            columns |= {
+                arm: self.mean(arm),
+                f"{arm} slope": self.slope(arm),
+                f"{arm} slope error": np.array([one.slope_error for one in self.found[arm]]),
+                f"{arm} spread": self.spread(arm),
+                f"{arm} error": self.error(arm),
+                f"{arm} holds": self.holds(arm),
+                f"{arm} fails": self.fails(arm),
+            }
+        columns |= {
             "finite_difference_tiny": self.tiny,
             "finite_difference_wide": self.wide,
             "finite_difference_wide_spread": self.wide_spread,
             "steps_in_contact": self.steps_in_contact,
             "is_stable": self.is_stable,
             "can_judge": self.can_judge,
-            "holds": self.holds,
-            "fails": self.fails,
         }
         return [
             {

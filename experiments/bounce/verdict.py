@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from experiments.bounce.outcome import DISCRETE, EVENT, Outcome
+from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Outcome
 from experiments.report import Table
 
 # Steps in contact by which the outcome is told apart.
@@ -13,7 +13,7 @@ _STEPS = (0, 3, 6, 10, 20, np.inf)
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say how often the event gradient is the restitution, and how far off the discrete one is.
+    """Say how often each derivative is the slope.
 
     Args:
         outcome: the numbers.
@@ -23,23 +23,16 @@ def verdict(outcome: Outcome) -> str:
     """
     settings = outcome.settings
     fine = outcome.timesteps <= settings.fine_timestep
-    judged, holds = outcome.can_judge[fine], outcome.holds[fine]
+    judged = outcome.can_judge[fine]
     if not judged.any():
         return "At no contact is the slope known well enough: take more phases."
-    has_jump = np.array([cell.impedance.first > 0 for cell in outcome.cells])
-    ratio = np.abs(outcome.mean(DISCRETE) / outcome.slope)[outcome.can_judge & has_jump]
+    within = [f"{outcome.holds(arm)[fine].sum()} ({arm})" for arm in (CONTINUOUS, EVENT, DISCRETE)]
     sentences = [
-        f"Up to {1e3 * settings.fine_timestep:g} ms the event gradient is within {settings.tolerance:.0%} at {holds.sum()} of "
-        f"{judged.sum()} contacts and time steps, and farther off beyond chance at {outcome.fails[fine].sum()}."
+        f"Up to {1e3 * settings.fine_timestep:g} ms the mean derivative is within {settings.tolerance:.0%} of the slope at "
+        f"{', '.join(within[:-1])} and {within[-1]} of {judged.sum()} contacts and time steps."
     ]
     if (coarse := _coarse(outcome)) is not None:
         sentences.append(coarse)
-    if ratio.size:
-        low, high = np.quantile(ratio, [0.5, 1.0])
-        sentences.append(
-            f"Where contact sets in with a jump of force the discrete gradient is {low:.3g} times the slope in the median "
-            f"and up to {high:.3g} times."
-        )
     return " ".join(sentences)
 
 
@@ -54,13 +47,13 @@ def findings(outcome: Outcome) -> list[str]:
     """
     return [
         sentence
-        for sentence in (_failures(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))
+        for sentence in (_failures(outcome), _jump(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))
         if sentence is not None
     ]
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate where the event gradient holds: by how many steps the contact lasts, and contact by contact."""
+    """Tabulate where the derivatives hold: by how many steps the contact lasts, and contact by contact."""
     return [_by_steps(outcome), _by_contact(outcome)]
 
 
@@ -70,22 +63,36 @@ def _coarse(outcome: Outcome) -> str | None:
     if not at.size:
         return None
     judged = outcome.can_judge[at[0]]
-    close = (outcome.share_of_slope[at[0]] <= settings.coarse_tolerance) & judged
+    close = [(outcome.error(arm)[at[0]] <= settings.coarse_tolerance) & judged for arm in (CONTINUOUS, EVENT)]
     return (
-        f"At {1e3 * settings.coarse_timestep:g} ms it is within {settings.coarse_tolerance:.0%} of the slope at {close.sum()} of "
-        f"{judged.sum()}."
+        f"At {1e3 * settings.coarse_timestep:g} ms it is within {settings.coarse_tolerance:.0%} at {close[0].sum()} and "
+        f"{close[1].sum()} (event) of {judged.sum()}."
     )
 
 
 def _failures(outcome: Outcome) -> str | None:
     """Say what the failures have in common: few steps in contact."""
-    fails, judged, is_long = outcome.fails, outcome.can_judge, outcome.steps_in_contact >= _MANY_STEPS
-    if not fails.any():
+    judged, is_long = outcome.can_judge, outcome.steps_in_contact >= _MANY_STEPS
+    if not judged.any():
+        return None
+    parts = []
+    for arm in (CONTINUOUS, EVENT):
+        fails = outcome.fails(arm)
+        parts.append(f"{(fails & ~is_long).sum()} and {(fails & is_long).sum()} ({arm})")
+    return (
+        f"Beyond {outcome.settings.tolerance:.0%}, and beyond chance, of {(judged & ~is_long).sum()} contacts of fewer than "
+        f"{_MANY_STEPS} time steps and {(judged & is_long).sum()} longer ones: {', '.join(parts)}."
+    )
+
+
+def _jump(outcome: Outcome) -> str | None:
+    has_jump = np.array([cell.impedance.first > 0 for cell in outcome.cells])
+    ratio = np.abs(outcome.mean(DISCRETE) / outcome.slope())[outcome.can_judge & has_jump]
+    if not ratio.size:
         return None
     return (
-        f"Beyond {outcome.settings.tolerance:.0%}, and beyond chance, it is at {(fails & ~is_long).sum()} of "
-        f"{(judged & ~is_long).sum()} contacts that last fewer than {_MANY_STEPS} time steps and at {(fails & is_long).sum()} of "
-        f"{(judged & is_long).sum()} that last longer."
+        f"Where contact sets in with a jump of force the discrete gradient is {np.median(ratio):.3g} times the slope in the "
+        f"median and up to {ratio.max():.3g} times."
     )
 
 
@@ -93,7 +100,7 @@ def _gentle(outcome: Outcome) -> str | None:
     gentle = outcome.can_judge & np.array([cell.impedance.first == 0 for cell in outcome.cells])
     if not gentle.any():
         return None
-    change = np.abs(outcome.mean(EVENT) - outcome.mean(DISCRETE))[gentle] / np.abs(outcome.slope)[gentle]
+    change = np.abs(outcome.mean(EVENT) - outcome.mean(DISCRETE))[gentle] / np.abs(outcome.slope())[gentle]
     return (
         f"Where contact sets in gently there is nothing to correct, and both gradients differ by {np.median(change):.1%} of the "
         f"slope in the median and {change.max():.1%} at most."
@@ -101,7 +108,8 @@ def _gentle(outcome: Outcome) -> str | None:
 
 
 def _wide(outcome: Outcome) -> str:
-    error = np.abs(outcome.wide - outcome.slope)[outcome.can_judge] / np.abs(outcome.slope)[outcome.can_judge]
+    slope = outcome.slope()[outcome.can_judge]
+    error = np.abs(outcome.wide[outcome.can_judge] - slope) / np.abs(slope)
     return (
         f"Finite differences over one step's flight, two rollouts per parameter, are off by {np.median(error):.1%} of the slope "
         f"in the median and {error.max():.0%} at most; far shorter ones give the discrete gradient."
@@ -116,10 +124,10 @@ def _closed_form(outcome: Outcome) -> str | None:
     truth = np.array([cell.truth for cell in outcome.cells])
     apart = np.abs(truth - closed)[has_closed].max()
     finest = outcome.can_judge[0]
-    off = np.abs(outcome.slope[0] - truth)[finest] / np.abs(truth)[finest]
+    off = [np.abs(outcome.slope(arm)[0] - truth)[finest] / np.abs(truth)[finest] for arm in (DISCRETE, CONTINUOUS)]
     return (
         f"Quadrature and closed form agree to {apart:.0e} where there is one. At {1e3 * outcome.timesteps[0]:g} ms the slope of "
-        f"the simulated height is within {off.max():.1%} of the truth."
+        f"the simulated height is within {off[0].max():.1%} of the truth, with an onset within {off[1].max():.1%}."
     )
 
 
@@ -129,36 +137,29 @@ def _by_steps(outcome: Outcome) -> Table:
         inside = outcome.can_judge & (count >= low) & (count < high)
         if not inside.any():
             continue
-        errors = [outcome.error(name)[inside] for name in (EVENT, DISCRETE)]
-        spread = (outcome.spread(EVENT) / np.abs(outcome.slope))[inside]
         name = f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} and more"
-        rows.append(
-            [
-                name,
-                f"{inside.sum()}",
-                f"{outcome.holds[inside].sum()}",
-                f"{outcome.fails[inside].sum()}",
-                f"{np.median(errors[0]):.1%}, {errors[0].max():.0%}",
-                f"{np.median(errors[1]):.0%}",
-                f"{np.median(spread):.2g}",
-            ]
-        )
+        row = [name, f"{inside.sum()}"]
+        for arm in (CONTINUOUS, EVENT, DISCRETE):
+            errors = outcome.error(arm)[inside]
+            spread = (outcome.spread(arm) / np.abs(outcome.slope(arm)))[inside]
+            row += [f"{outcome.holds(arm)[inside].sum()}", f"{np.median(errors):.1%}", f"{np.median(spread):.2g}"]
+        rows.append(row)
     percent = f"{outcome.settings.tolerance:.0%}"
+    heads = [
+        f"{what}, {arm}" for arm in (CONTINUOUS, EVENT, DISCRETE) for what in (f"within {percent}", "error", "spread")
+    ]
     return Table(
-        (
-            "steps in contact", "judged", f"within {percent}", "beyond it and chance", "error of event: median, largest",
-            "error of discrete: median", "spread of event over slope",
-        ),
+        ("steps in contact", "judged", *heads),
         rows,
-        "Contacts and time steps by how long the contact lasts. Errors as a share of the larger of the slope and the discrete "
-        "gradient's own error.",
-    )  # fmt: skip
+        "Contacts and time steps by how long the contact lasts. Error of the mean derivative as a share of the slope of its own "
+        "height, at most 100%, and standard deviation of single derivatives over the slope: medians.",
+    )
 
 
 def _by_contact(outcome: Outcome) -> Table:
-    errors, rows, emphasised = outcome.error(EVENT), [], set()
+    errors, fails, rows, emphasised = outcome.error(CONTINUOUS), outcome.fails(CONTINUOUS), [], set()
     for j, cell in enumerate(outcome.cells):
-        for i in np.flatnonzero(outcome.fails[:, j]):
+        for i in np.flatnonzero(fails[:, j]):
             emphasised.add((j, 4 + int(i)))
         rows.append(
             [
@@ -173,7 +174,7 @@ def _by_contact(outcome: Outcome) -> Table:
     return Table(
         ("damping ratio", "time constant, ms", "impedance", "truth", *heads),
         rows,
-        "Error of the event gradient, contact by contact, by time step. Bold where it is beyond the tolerance by more than two "
-        "standard errors; — where the step is unstable or the slope not known well enough.",
+        "Error with contact that begins within the step, contact by contact, by time step. Bold where it is beyond the "
+        "tolerance by more than two standard errors; — where the step is unstable or the slope not known well enough.",
         frozenset(emphasised),
     )

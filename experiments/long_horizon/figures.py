@@ -11,8 +11,8 @@ from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, subplots
 from experiments.theme import ZEROTH as BLUE
 
-_EVENT = "#009e73"
-COLOURS = {"first order, discrete": FIRST, "first order, event": _EVENT, ZEROTH: BLUE}
+_EVENT, _ONSET = "#cc79a7", "#009e73"
+COLOURS = {"first order, discrete": FIRST, "first order, event": _EVENT, "first order, onset": _ONSET, ZEROTH: BLUE}
 
 
 def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:

@@ -1,6 +1,7 @@
 """Two motions under a policy whose few parameters are noisy: smooth and chaotic, and with contact."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,6 +14,12 @@ from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.hopper import hopper
 
 _START_ANGLES = (2.4, 0.5)  # rad from hanging: high enough that the elbow turns over
+# By the name of a derivative, how the steps are taken.
+_HOW: dict[str, dict[str, Any]] = {
+    "discrete": {"gradient": "discrete"},
+    "event": {"gradient": "event"},
+    "onset": {"onset": mg.Onset()},
+}
 
 
 class Problem(eqx.Module):
@@ -27,7 +34,7 @@ class Problem(eqx.Module):
         params: the policy's, without noise.
         stddev: of the noise on each of them.
         title: for figures and tables.
-        gradients: of the steps that differ.
+        gradients: of the steps that differ; "onset" is the derivative of a motion whose contacts begin within the step.
         steps_per_time: steps of a segment.
     """
 
@@ -52,7 +59,7 @@ class Problem(eqx.Module):
 
         def step(state: State, _: None) -> tuple[State, None]:
             data = data_of(self.scene, state, self.control(params, state))
-            return state_of(mg.step(self.scene.model, data, gradient=gradient)), None  # pyright: ignore[reportArgumentType]
+            return state_of(mg.step(self.scene.model, data, **_HOW[gradient])), None
 
         return jax.lax.scan(step, state, length=self.steps_per_time)[0]
 
@@ -152,7 +159,7 @@ def _hopper(num_times: int) -> Problem:
         params=jnp.zeros(3),
         stddev=0.05,
         title="hopper",
-        gradients=("discrete", "event"),
+        gradients=("discrete", "event", "onset"),
         steps_per_time=288 // num_times,
     )
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
-from experiments.landing.cases import case
 from experiments.motion import Read, at_time_step, motion
+from experiments.sawtooth.cases import case
 from experiments.sawtooth.settings import SawtoothSettings
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx

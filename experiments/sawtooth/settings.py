@@ -1,11 +1,27 @@
 """What an experiment on the sawtooth can be told; imports nothing heavy."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from experiments.config import Positive, RunSettings
-from experiments.landing.settings import CaseName
+
+CaseName = Literal[
+    "hopper",
+    "walker2d",
+    "half_cheetah",
+    "ant",
+    "ball_frictionless",
+    "ball",
+    "ball_elliptic",
+    "ball_torsion",
+    "ball_rolling",
+    "ball_inclined",
+    "ball_inclined_rolling",
+    "two_balls",
+    "two_balls_elliptic",
+    "arm",
+]
 
 
 class SawtoothSettings(RunSettings):

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+import mjxgrad as mg
 from experiments.parallel import in_threads, processes
 from experiments.stability.grid import Points, points
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
@@ -116,8 +117,9 @@ def _run_all(
     def run(case: _Case) -> _Runs:
         scene, grid, reference, _ = case
         arrays = (reference.fields, reference.qpos, reference.qvel)
-        program = Program(scene, settings.num_steps, "discrete", size.chunk)
-        has_event = size.event is None or scene.name in size.event
+        onset = mg.Onset() if settings.onset else None
+        program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
+        has_event = not settings.onset and (size.event is None or scene.name in size.event)
         event = Program(scene, settings.num_steps, "event", size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
         is_judge = precision == "float64"

@@ -72,12 +72,16 @@ class Program:
         num_steps: of the rollout.
         gradient: "discrete" or "event".
         chunk: points at once.
+        onset: of contacts within the step; None is MuJoCo's motion.
     """
 
-    def __init__(self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int):
+    def __init__(
+        self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int, onset: mg.Onset | None = None
+    ):
         self._scene = mg.load_scene(scene.model())
         self._weights = jnp.array(scene.outcome)
         self._gradient: Gradient = gradient
+        self._onset = onset
         self._num_steps, self._chunk = num_steps, chunk
         both = jax.value_and_grad(self._outcome, argnums=(0, 1, 2), has_aux=True)
         self._both = jax.jit(jax.vmap(both))
@@ -132,7 +136,9 @@ class Program:
     ) -> tuple[Array, Trajectory]:
         scene = _with_fields(self._scene, fields)
         state = mg.initial_state(scene, qpos, qvel)
-        trajectory = mg.rollout(scene, state, horizon=self._num_steps, observe=observe, gradient=self._gradient)
+        trajectory = mg.rollout(
+            scene, state, horizon=self._num_steps, observe=observe, gradient=self._gradient, onset=self._onset
+        )
         return trajectory.qpos[-1] @ self._weights, trajectory
 
     def _chunks(self, arrays) -> Iterator[tuple[int, Any]]:

@@ -60,6 +60,8 @@ class StabilitySettings(RunSettings):
     """How fine the grid is, and how many scenes and gradients are looked at."""
     num_steps: Annotated[int, Field(ge=20, le=1000)] = 100
     """Of every rollout, whatever its time step."""
+    onset: bool = False
+    """Whether contacts begin within the step, in place of MuJoCo's motion with both its derivatives."""
     precisions: Annotated[tuple[Literal["float32", "float64"], ...], Field(min_length=1, max_length=2)] = (
         "float64",
         "float32",

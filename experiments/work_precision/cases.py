@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from experiments.landing.cases import case as landing_case
+from experiments.sawtooth.cases import case as landing_case
 from mjxgrad.tasks.files import scene_path
 
 
@@ -212,7 +212,7 @@ def _arm() -> Case:
 
 
 def _landing(name: str, title: str, duration: float, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
-    """One of gymnasium's bodies landing, as in the experiment on impacts, but thrown down so that it lands sooner."""
+    """One of gymnasium's bodies landing, as in the experiment on the sawtooth, but thrown down so that it lands sooner."""
     given = landing_case(name)
     return Case(
         title,

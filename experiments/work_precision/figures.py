@@ -12,15 +12,16 @@ from matplotlib.ticker import FuncFormatter
 from experiments.report import Figure
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
 from experiments.work_precision.front import pareto_front
-from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Estimate, Outcome, Point
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Estimate, Outcome, Point
 
-_COLOURS = {MG: ZEROTH, MJX: FIRST, C: "#009e73"}
+_COLOURS = {MG: ZEROTH, ONSET: "#cc79a7", MJX: FIRST, C: "#009e73"}
 _MARKERS = {"Euler": "o", "implicitfast": "s", "RK4": "^"}
 _ESTIMATORS = {
     "zeroth order": ZEROTH,
     "first order, discrete": FIRST,
-    "first order, event": "#009e73",
-    "α-order, event": DEFAULT,
+    "first order, event": "#cc79a7",
+    "first order, onset": "#009e73",
+    "α-order, onset": DEFAULT,
 }
 # Errors of smooth motions in double precision fall to rounding; nobody chooses by what lies below this.
 _SMALLEST = 1e-9

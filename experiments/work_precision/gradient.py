@@ -35,7 +35,8 @@ ESTIMATORS: dict[str, tuple[str, str | None]] = {
     "zeroth order": ("zeroth_order", None),
     "first order, discrete": ("first_order", "discrete"),
     "first order, event": ("first_order", "event"),
-    "α-order, event": ("alpha_order", "event"),
+    "first order, onset": ("first_order", "onset"),
+    "α-order, onset": ("alpha_order", "onset"),
 }
 
 
@@ -82,14 +83,14 @@ class Records:
 
     Attributes:
         noise: on the parameters, in their units.
-        costs: of the rollouts.
+        costs: of the rollouts, by the name of the derivative or None.
         gradients: by the name of the derivative.
         seconds: of one rollout, of each repetition, by the name of the derivative or None.
         compile_seconds: likewise.
     """
 
     noise: Float[np.ndarray, "rollouts dim"]
-    costs: Float[np.ndarray, " rollouts"]
+    costs: dict[str | None, Float[np.ndarray, " rollouts"]]
     gradients: dict[str, Float[np.ndarray, "rollouts dim"]]
     seconds: dict[str | None, tuple[float, ...]]
     compile_seconds: dict[str | None, float]
@@ -113,7 +114,7 @@ def measured(
     noise = quasi_random(sizes.num_rollouts, len(case.moved), settings.seed) * case.stddev
     reference = _reference(case, simulate, noise, settings)
     ways = [(own / refinement, 1.0) for refinement in sizes.gradient_refinements]
-    if any(variant.derivative == "event" for variant in programs):  # there is a contact to soften
+    if any(variant.onset for variant in programs):  # there is a contact to soften
         ways += [(own, softening) for softening in sizes.softenings]
     estimates = []
     for timestep, softening in ways:
@@ -220,15 +221,16 @@ def _record(
     sizes = settings.sizes
     batch = simulate.variant.batch
     first = case.start[1] + np.resize(noise, (batch, noise.shape[1])) @ case.directions
-    derivatives = {v.derivative: p for v, p in programs.items() if v.derivative is not None}
-    seconds, gradients, costs = {}, {}, np.zeros(0)
+    derivatives = {"onset" if v.onset else v.derivative: p for v, p in programs.items() if v.derivative is not None}
+    seconds, gradients, costs = {}, {}, {}
     for name, program in {None: simulate, **derivatives}.items():
         _, taken = timed(lambda p=program: p.run(first, knobs), repeats=sizes.repeats, seconds=sizes.seconds)
         seconds[name] = tuple(one / batch for one in taken)
         if name is None:
-            costs = _costs(case, simulate, noise, knobs)
-        else:
-            gradients[name] = _in_chunks(case, lambda qvel, p=program: p.run(qvel, knobs)[1], noise, batch)
+            costs[name] = _costs(case, simulate, noise, knobs)
+            continue
+        both = _in_chunks(case, lambda qvel, p=program: np.column_stack(p.run(qvel, knobs)), noise, batch)
+        costs[name], gradients[name] = both[:, 0], both[:, 1:]
     compiling = {name: p.trace_seconds + p.compile_seconds for name, p in {None: simulate, **derivatives}.items()}
     return Records(noise, costs, gradients, seconds, compiling)
 
@@ -246,7 +248,7 @@ def _estimates(
         gradients = np.zeros_like(records.noise) if derivative is None else records.gradients[derivative]
         dim = records.noise.shape[1]
         objective = Recorded(
-            costs=jnp.asarray(records.costs),
+            costs=jnp.asarray(records.costs[derivative]),
             gradients=jnp.asarray(gradients),
             noise=jnp.asarray(records.noise),
             stddev=jnp.full(dim, case.stddev),
@@ -284,7 +286,7 @@ def _expectation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give what an estimator has in the mean, and the standard error of that, from all rollouts where it is linear in them."""
     if function == "zeroth_order":
-        return smoothed_gradient(records.costs, records.noise, stddev)
+        return smoothed_gradient(records.costs[None], records.noise, stddev)
     if function == "first_order":
         parts = gradients.reshape(_SCRAMBLES, -1, gradients.shape[1]).mean(axis=1)
         return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)

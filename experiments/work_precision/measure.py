@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import mjxgrad as mg
 from experiments.work_precision import gradient, simulation
@@ -52,8 +53,11 @@ def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> li
     """
     batch, everything = settings.sizes.batch, settings.sizes.has_all_variants
     own = own_cone(one)
-    found = [Variant("mg", cone=own, batch=batch, derivative="event")] if has_contacts(one) else []
-    found += [Variant("mg", cone=own, batch=batch, derivative="discrete")]
+    found = [Variant("mg", cone=own, batch=batch, derivative="discrete")]
+    if has_contacts(one):
+        onset = Variant("mg", cone=own, batch=batch, onset=True)
+        found = [replace(onset, derivative="discrete"), *found, onset]
+        found += [Variant("mg", cone=own, batch=batch, derivative="event")] if everything else []
     libraries: tuple[Library, ...] = ("mjx", "mg")
     for library in libraries:
         found += [Variant(library, cone=own, batch=batch)] if library == "mg" or has_asides else []

@@ -10,7 +10,7 @@ from experiments.work_precision.front import pareto_front
 from experiments.work_precision.settings import WorkPrecisionSettings
 
 C = "C MuJoCo"
-MG, MJX = "mg.step", "mjx.step"
+MG, MJX, ONSET = "mg.step", "mjx.step", "mg.step, onset"
 # Of the solver, enough to converge.
 NUM_ITERATIONS = 100
 
@@ -20,7 +20,7 @@ class Point:
     """One way of simulating a scene.
 
     Attributes:
-        library: `mg.step`, `mjx.step` or C MuJoCo.
+        library: `mg.step`, with an onset or without, `mjx.step` or C MuJoCo.
         integrator: its name.
         cone: of friction.
         precision: of the numbers.

@@ -56,6 +56,7 @@ class Variant:
         precision: of every array.
         batch: starts simulated together.
         derivative: along the uncertain velocities; None for the motion alone.
+        onset: whether contacts begin within the step.
         iterations: of the solver, at most.
     """
 
@@ -65,6 +66,7 @@ class Variant:
     precision: Precision = "float64"
     batch: int = 1
     derivative: Literal["discrete", "event"] | None = None
+    onset: bool = False
     iterations: int = NUM_ITERATIONS
 
 
@@ -245,7 +247,8 @@ def _lowered(case: Case, variant: Variant) -> tuple[mjx.Model, jax.stages.Lowere
 def _step(variant: Variant) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
     if variant.library == "mjx":
         return mjx.step
-    return functools.partial(mg.step, gradient=variant.derivative or "discrete")
+    onset = mg.Onset() if variant.onset else None
+    return functools.partial(mg.step, gradient=variant.derivative or "discrete", onset=onset)
 
 
 def _simulate(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from experiments.work_precision.cases import Case
 from experiments.work_precision.native import differences, simulate
-from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Point, Reference, relative_errors, rms
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Point, Reference, relative_errors, rms
 from experiments.work_precision.programs import (
     CONES,
     FEW_ITERATIONS,
@@ -151,14 +151,14 @@ def _of_program(
 ) -> list[Point]:
     case, variant, sizes = program.case, program.variant, settings.sizes
     is_own = variant.integrator == "Euler" and variant.cone == own_cone(case)
-    is_main = is_own and variant.batch > 1 and variant.iterations == NUM_ITERATIONS
+    is_main = is_own and not variant.onset and variant.batch > 1 and variant.iterations == NUM_ITERATIONS
     points = []
     for knobs in _knobs(case, settings, with_tolerances=is_main, is_single=variant.precision == "float32"):
         ends, seconds = timed(lambda at=knobs: program.run(qvel, at), repeats=sizes.repeats, seconds=sizes.seconds)
         errors = truth.errors(case, ends)
         points.append(
             Point(
-                library=_NAMES[variant.library],
+                library=ONSET if variant.onset else _NAMES[variant.library],
                 integrator=variant.integrator,
                 cone=variant.cone,
                 precision=variant.precision,

@@ -5,7 +5,7 @@ import numpy as np
 from experiments.parallel import num_compilers
 from experiments.report import Table, quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
-from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, C, Course, Outcome, Point
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Outcome, Point
 
 
 def verdict(outcome: Outcome) -> str:
@@ -49,6 +49,14 @@ def findings(outcome: Outcome) -> list[str]:
         Sentences.
     """
     sentences = [_recommendation(course, outcome) for course in outcome.courses]
+    onset = _onset_against_step(outcome)
+    if onset:
+        sentences.append(
+            "With contact that begins within the step the error of the motion, at the same integrator and time step, is "
+            f"{', '.join(f'{ratio:.2g} ({title})' for title, ratio in onset)} times the step's in the median, and larger by more "
+            f"than a tenth at {sum(_worse(course) for course in outcome.courses)} of "
+            f"{sum(len(_onset_ratios(course)) for course in outcome.courses)} time steps."
+        )
     loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]
     if loose:
         sentences.append(
@@ -73,6 +81,33 @@ def findings(outcome: Outcome) -> list[str]:
         "compiled them)."
     )
     return sentences
+
+
+def _onset_against_step(outcome: Outcome) -> list[tuple[str, float]]:
+    ratios = [(course.title, _onset_ratios(course)) for course in outcome.courses]
+    return [(title, float(np.median(found))) for title, found in ratios if found]
+
+
+def _onset_ratios(course: Course) -> list[float]:
+    """Give the error of the motion with an onset over that without, step by step, where the reference can tell."""
+    tight = {
+        (p.library, p.timestep): p.error
+        for p in course.in_batch()
+        if p.integrator == "Euler"
+        and p.precision == "float64"
+        and p.iterations == NUM_ITERATIONS
+        and p.tolerance <= 1e-7
+    }
+    plain = {timestep: error for (library, timestep), error in tight.items() if library == MG}
+    found = {timestep: error for (library, timestep), error in tight.items() if library == ONSET}
+    floor = course.floor(MG)
+    return [
+        found[h] / plain[h] for h in found if np.isfinite(found[h]) and np.isfinite(plain[h]) and plain[h] > 3 * floor
+    ]
+
+
+def _worse(course: Course) -> int:
+    return sum(ratio > 1.1 for ratio in _onset_ratios(course))
 
 
 def summary(outcome: Outcome) -> Table:

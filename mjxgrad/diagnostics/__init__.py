@@ -5,8 +5,6 @@ from mjxgrad.diagnostics.budget import Rollouts, Seconds
 from mjxgrad.diagnostics.comparison import Comparison, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
-from mjxgrad.diagnostics.jitter import JitterComparison, derivative_under_jitter
-from mjxgrad.diagnostics.judgement import AgainstSlope
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, unused
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
@@ -32,13 +30,11 @@ from mjxgrad.diagnostics.statistics import (
 from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
 
 __all__ = [
-    "AgainstSlope",
     "BiasVariance",
     "Comparison",
     "Crossover",
     "EmpiricalBias",
     "Growth",
-    "JitterComparison",
     "Jumps",
     "Landscape",
     "Missed",
@@ -64,7 +60,6 @@ __all__ = [
     "compare_to_slope",
     "crossover",
     "derivative_against_slope",
-    "derivative_under_jitter",
     "empirical_bias",
     "first_order_samples",
     "growth",

@@ -24,8 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from mjxgrad.diagnostics.judgement import ROUNDINGS, AgainstSlope
-
 Simulate = Callable[[Float[Array, ""], str], Float[Array, "*outcome"]]
 
 # Fewest phases from which four local slopes and eight blocks for the error bar can be had, with four points each.
@@ -35,9 +33,10 @@ _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
 # Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
 _IRREGULAR = 0.5
+_ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
 
 
-class SlopeComparison(AgainstSlope):
+class SlopeComparison(eqx.Module):
     """Derivatives beside the slope; units are those of the outcome over those of the parameter.
 
     Where fewer than 32 phases are finite, numbers are NaN.
@@ -95,6 +94,56 @@ class SlopeComparison(AgainstSlope):
     def is_regular(self) -> Bool[np.ndarray, "*outcome"]:
         """Where `irregularity` is at most a half; elsewhere the interval spans too few teeth, or the motion is chaotic."""
         return np.asarray(self.irregularity <= _IRREGULAR)
+
+    @property
+    def error(self) -> Float[np.ndarray, "gradients *outcome"]:
+        """Mean of each derivative less the slope."""
+        return self.mean - self.slope
+
+    @property
+    def scale(self) -> Float[np.ndarray, "*outcome"]:
+        """What errors are measured by: the larger of the slope and the error of the first derivative named."""
+        # Where both are nothing but rounding, no error is to look large beside it.
+        return np.asarray(np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution))
+
+    @property
+    def relative_error(self) -> Float[np.ndarray, "gradients *outcome"]:
+        """Size of `error` beyond rounding, over `scale`."""
+        size = np.abs(self.error)
+        return np.where(size > self.resolution, size, 0 * size) / self.scale
+
+    def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
+        """Say where the mean of a derivative is the slope to within `tolerance` times `scale`.
+
+        Args:
+            tolerance: as a share of `scale`.
+
+        Returns:
+            One truth value per derivative and outcome; False where numbers are not finite.
+        """
+        return self.relative_error <= tolerance
+
+    def is_off(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
+        """Say where it is not, beyond two standard errors. What is neither close nor off needs more rollouts.
+
+        Args:
+            tolerance: as a share of `scale`.
+
+        Returns:
+            One truth value per derivative and outcome; False where numbers are not finite.
+        """
+        return np.abs(self.error) - 2 * self.standard_error > np.maximum(tolerance * self.scale, self.resolution)
+
+    def is_resolved(self, tolerance: float = 0.05) -> Bool[np.ndarray, "*outcome"]:
+        """Say where the slope is known well enough to judge by: its standard error is below `tolerance` times `scale`.
+
+        Args:
+            tolerance: as a share of `scale`.
+
+        Returns:
+            One truth value per outcome; False where numbers are not finite.
+        """
+        return np.asarray(self.slope_error <= np.maximum(tolerance * self.scale, self.resolution))
 
 
 def derivative_against_slope(
@@ -208,7 +257,7 @@ def compare_to_slope(
         local_slopes=local_slopes * 2 / width,
         num_teeth=num_teeth,
         num_finite=num_finite.astype(int),
-        resolution=np.asarray(ROUNDINGS * epsilon * size / width),
+        resolution=np.asarray(_ROUNDINGS * epsilon * size / width),
     )
 
 

@@ -75,7 +75,7 @@ def test_an_estimate_needs_its_variance_over_what_bias_leaves_of_the_target():
 
 
 def test_the_cheapest_gradient_is_the_one_whose_rollouts_take_least_time_together():
-    few_dear = estimate("first order, event", 0.0, 0.01 / 100, 4.0)  # 4 samples suffice: 0.16 s
+    few_dear = estimate("first order, onset", 0.0, 0.01 / 100, 4.0)  # 4 samples suffice: 0.16 s
     many_cheap = estimate("zeroth order", 0.0, 4.0 / 100, 1.0)  # 1600 samples: 16 s
     biased = estimate("first order, discrete", 0.2, 0.0, 0.1)
     choice = cheapest([many_cheap, few_dear, biased], 0.05)
@@ -85,7 +85,7 @@ def test_the_cheapest_gradient_is_the_one_whose_rollouts_take_least_time_togethe
 
 
 def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendation():
-    lost = replace(estimate("first order, event", np.inf, np.inf, 1.0), error=np.inf)
+    lost = replace(estimate("first order, onset", np.inf, np.inf, 1.0), error=np.inf)
     references = tuple(Reference(name, "pyramidal", "RK4", 1e-5, 1e-4, 2e-4, 0.0) for name in ("mg.step", "C MuJoCo"))
     known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01, 1e-4)
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))

@@ -7,8 +7,7 @@ from pathlib import Path
 import gymnasium
 import jax.numpy as jnp
 import mujoco
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from experiments.motion import Read
 
@@ -46,29 +45,12 @@ def case(name: str) -> Case:
     """Build a motion.
 
     Args:
-        name: one of `experiments.landing.settings.CASES`.
+        name: see `experiments.sawtooth.settings.CaseName`.
 
     Returns:
         The motion.
     """
     return _BUILDERS[name]()
-
-
-def jittered_positions(one: Case) -> Bool[np.ndarray, " nq"]:
-    """Say which positions jitter may change: those of hinges and slides of other bodies than the moved one.
-
-    Args:
-        one: the motion.
-
-    Returns:
-        One truth value per position.
-    """
-    model = one.model
-    moved = np.flatnonzero(model.jnt_qposadr <= one.moved)[-1]
-    # A free joint's position holds a quaternion, which noise would leave denormalised.
-    is_scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
-    chosen = model.jnt_qposadr[is_scalar & (model.jnt_bodyid != model.jnt_bodyid[moved])]
-    return np.isin(np.arange(model.nq), chosen)
 
 
 def _planar(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 3"]:

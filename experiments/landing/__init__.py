@@ -1,1 +1,0 @@
-"""Derivatives of motions with several impacts against the slope of the simulated motion."""
