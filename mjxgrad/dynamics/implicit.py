@@ -17,6 +17,7 @@ The acceleration is named "acceleration" for `jax.checkpoint`: a rollout that re
 spares itself the iterations.
 """
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -36,6 +37,24 @@ from mjxgrad.dynamics.sparse import SparseRows
 CHECKPOINT_NAME = "acceleration"
 
 
+class Variant(eqx.Module):
+    """In what a second solve of the same state may differ. For two solves arrays have a leading axis of two.
+
+    Attributes:
+        weight: of the rows.
+        reference: a_ref of the rows; None for that of the system.
+        is_mirrored: whose contact pushes from the other side, as -J; None for nobody.
+    """
+
+    weight: Float[Array, "*two rows"]
+    reference: Float[Array, "*two rows"] | None = None
+    is_mirrored: Bool[Array, "*two rows"] | None = None
+
+    def __getitem__(self, number: int) -> "Variant":
+        """Return that of one solve."""
+        return jax.tree.map(lambda x: x[number], self)
+
+
 class System(eqx.Module):
     """What determines the acceleration of one state, as its derivative wants it.
 
@@ -45,6 +64,7 @@ class System(eqx.Module):
         map: J, also of rows that are inactive.
         is_active: which rows are not.
         rows: parameters of the rows' laws.
+        is_mirrored: rows whose sign is reversed; None for none.
     """
 
     inertia: Inertia
@@ -52,14 +72,18 @@ class System(eqx.Module):
     map: RowMap
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
+    is_mirrored: Bool[Array, "rows *batch"] | None = None
 
     def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
-        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
+        return self._turned(jnp.where(self.is_active, self.map.rates(velocity), 0.0))
 
     def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
         """Return Jᵀ f."""
-        return self.map.pull(jnp.where(self.is_active, force, 0.0))
+        return self.map.pull(self._turned(jnp.where(self.is_active, force, 0.0)))
+
+    def _turned(self, x: Float[Array, " rows"]) -> Float[Array, " rows"]:
+        return x if self.is_mirrored is None else jnp.where(self.is_mirrored, -x, x)
 
     def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return the constraint forces at an acceleration."""
@@ -70,13 +94,15 @@ class System(eqx.Module):
         pull = self.pull(self.row_force(layout, acceleration))
         return self.inertia.apply(acceleration) - self.force - pull
 
-    def weighed(self, weight: Float[Array, "rows *batch"]) -> "System":
-        """Return the same with other weights of the rows."""
-        return eqx.tree_at(lambda s: s.rows.weight, self, weight)
+    def varied(self, variant: Variant) -> "System":
+        """Return the same with what is different in one solve."""
+        reference = self.rows.reference if variant.reference is None else variant.reference
+        rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
+        return dataclasses.replace(self, rows=rows, is_mirrored=variant.is_mirrored)
 
     def problem(self) -> Problem:
         """Return the same with entries; arrays may carry the batch as trailing axes here."""
-        jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
+        jacobian = SparseRows.of(self.map, self.is_active, len(self.force), self.is_mirrored)
         return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
 
 
@@ -118,12 +144,12 @@ def solve_both(
     layout: RowLayout,
     max_iterations: int,
     system: System,
-    weights: Float[Array, "2 rows"],
+    variants: Variant,
     differ: Bool[Array, ""],
     start: Float[Array, " nv"],
     tolerance: Float[Array, ""],
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
-    """Solve with two sets of weights of the rows, on CPUs the second time only where they differ.
+    """Solve in two variants, on CPUs the second time only where they differ.
 
     Where they do not, the second solution is the first one, and its derivative must not count, for it is zero.
 
@@ -131,44 +157,41 @@ def solve_both(
         Both accelerations, and the larger number of iterations, as `solve` has it.
     """
 
-    def first(system, weight, start, tolerance):
-        return newton.minimise(layout, system.weighed(weight).problem(), start, tolerance, max_iterations)
+    def first(system, variant, start, tolerance):
+        return newton.minimise(layout, system.varied(variant).problem(), start, tolerance, max_iterations)
 
-    def second(system, weight, differ, start, tolerance):
+    def second(system, variant, differ, start, tolerance):
         none = jnp.zeros(differ.shape, jnp.int32)
-        return linear.on_few(first, differ, (start, none), system, weight, start, tolerance)
+        return linear.on_few(first, differ, (start, none), system, variant, start, tolerance)
 
     if not _takes_few():
-        both, counts = jax.vmap(lambda weight: linear.batch_last(first)(system, weight, start, tolerance))(weights)
+        both, counts = jax.vmap(lambda variant: linear.batch_last(first)(system, variant, start, tolerance))(variants)
         return both, jnp.max(counts)
-    found, count = linear.batch_last(first)(system, weights[0], start, tolerance)
-    other, more = linear.batch_last(second)(system, weights[1], differ, found, tolerance)
+    found, count = linear.batch_last(first)(system, variants[0], start, tolerance)
+    other, more = linear.batch_last(second)(system, variants[1], differ, found, tolerance)
     return jnp.stack([found, other]), jnp.maximum(count, more)
 
 
 @solve_both.defjvp
 def _solve_both_jvp(layout, max_iterations, primals, tangents):
-    system, weights, differ, start, tolerance = primals
-    both, count = solve_both(layout, max_iterations, system, weights, differ, start, tolerance)
+    system, variants, differ, start, tolerance = primals
+    both, count = solve_both(layout, max_iterations, system, variants, differ, start, tolerance)
     both = checkpoint_name(both, CHECKPOINT_NAME)
 
-    def residual(system: System, weights: Array) -> Array:
-        return jax.vmap(lambda weight, a: system.weighed(weight).gradient(layout, a))(weights, both)
+    def residual(system: System, variants: Variant) -> Array:
+        return jax.vmap(lambda variant, a: system.varied(variant).gradient(layout, a))(variants, both)
 
-    def bend_of(weight: Array, acceleration: Array) -> Bend:
-        rows = system.weighed(weight).rows
-        return constraint.bend(layout, rows, system.rates(acceleration) - rows.reference)
+    def response(variant: Variant, acceleration: Array, force: Array, is_needed: Array | None = None) -> Array:
+        varied = system.varied(variant)
+        bend = constraint.bend(layout, varied.rows, varied.rates(acceleration) - varied.rows.reference)
+        return respond(layout, varied, bend, force, is_needed)
 
-    _, change = jax.jvp(residual, (system, weights), (tangents[0], tangents[1]))
-    bends = jax.vmap(bend_of)(weights, both)
+    _, change = jax.jvp(residual, (system, variants), (tangents[0], tangents[1]))
     if _takes_few():
-        kinds = enumerate((None, differ))
-        parts = [
-            respond(layout, system, jax.tree.map(lambda x, k=k: x[k], bends), change[k], needed) for k, needed in kinds
-        ]
-        moved = -jnp.stack(parts)
+        moved = [response(variants[k], both[k], change[k], needed) for k, needed in enumerate((None, differ))]
+        moved = -jnp.stack(moved)
     else:
-        moved = -jax.vmap(lambda bend, force: respond(layout, system, bend, force))(bends, change)
+        moved = -jax.vmap(response)(variants, both, change)
     no_change = np.zeros(count.shape, jax.dtypes.float0)
     return (both, count), (moved, no_change)
 

@@ -43,8 +43,9 @@ impedance p d. It is continuous throughout, and the mean share is φ.
 On the floor r is taken ahead, r + h v (1 - h²v²/w²): that damps what else would swing on the ramp.
 
 **Change of sides.** The normal of two bodies flips where their centres pass each other along it (a ball driven through a thin
-wall). Both sides push then for their share of the step, which is one push of share ψ = clip(2 m / w, 0, 1), m the distance of
-the centres along the normal; φ is multiplied by it. For geoms with a centre of symmetry.
+wall). Both sides push then for their share of the step: the present one for ψ = 1/2 + m / w, at most 1, m the distance of the
+centres along the normal, and the mirrored contact, of the same depth and the opposite velocity, for the rest. For geoms with a
+centre of symmetry.
 
 **What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not, a change of the nearest face by a
 right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still multiplies tangents,
@@ -72,6 +73,7 @@ from mjxgrad.dynamics import assembly
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.impedance import Impedance
+from mjxgrad.dynamics.implicit import Variant
 
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
@@ -134,11 +136,27 @@ class Shares(eqx.Module):
         after: p₊ of each row, likewise.
         weight: Φ, the weight of the solve with p₊.
         is_split: whether the two solves differ.
+        is_mirrored: rows that push from the other side in the solve with p₋; None if none ever does.
     """
 
     before: Float[Array, " rows"]
     after: Float[Array, " rows"]
     weight: Float[Array, ""]
+    is_split: Bool[Array, ""]
+    is_mirrored: Bool[Array, " rows"] | None
+
+
+class Partial(eqx.Module):
+    """Contacts that act for a part of the step, as two solves take them.
+
+    Attributes:
+        variants: of the rows, with p₊ and with p₋.
+        share: Φ, the weight of the former.
+        is_split: whether they differ.
+    """
+
+    variants: Variant
+    share: Float[Array, ""]
     is_split: Bool[Array, ""]
 
 
@@ -164,21 +182,55 @@ def begin(
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
-    found, rows, num_contacts = [], [], 0
+    found, sides, rows, num_contacts = [], [], [], 0
     for block in blocks:
         if not block.rows_each or without[not block.is_contact]:
             rows.append(block)
             found.append(jnp.ones_like(block.residual))
+            sides.append(None)
             continue
         each, count = block.rows_each, len(block.residual) // block.rows_each
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
-        share = jnp.repeat(_share(model, data, block, onset, geoms), each, total_repeat_length=each * count)
+        share, side = (
+            None if x is None else jnp.repeat(x, each, total_repeat_length=each * count)
+            for x in _share(model, data, block, onset, geoms)
+        )
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
         found.append(share)
-    return rows, _split(jnp.concatenate(found), np.concatenate([_firsts(block) for block in blocks]))
+        sides.append(side)
+    side = None
+    if any(one is not None for one in sides):
+        side = jnp.concatenate(
+            [jnp.ones_like(share) if one is None else one for share, one in zip(found, sides, strict=True)]
+        )
+    return rows, _split(jnp.concatenate(found), side, np.concatenate([_firsts(block) for block in blocks]))
+
+
+def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> Partial | None:
+    """Return in what the solves of a step differ.
+
+    Args:
+        model: gives the laws of the rows.
+        data: with velocities.
+        blocks: rows from `begin`, or these under noise.
+        shares: from `begin`; None for rows of which none begins or ends.
+    """
+    if shares is None:
+        return None
+    rows = assembly.joined(blocks)
+    weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
+    if shares.is_mirrored is None:
+        return Partial(Variant(weight), shares.weight, shares.is_split)
+    reference, _ = assembly.law(model, data.qvel, rows)
+    _, damping = assembly.stiffness_damping(model, rows)
+    # The rate of a row is that of the other side reversed, its distance the same.
+    moves = jnp.where(shares.is_mirrored & rows.is_active, 2 * damping * rows.map.rates(data.qvel), 0.0)
+    is_mirrored = jnp.stack([jnp.zeros_like(shares.is_mirrored), shares.is_mirrored])
+    variants = Variant(weight, jnp.stack([reference, reference + moves]), is_mirrored)
+    return Partial(variants, shares.weight, shares.is_split)
 
 
 def _firsts(block: Block) -> np.ndarray:
@@ -192,8 +244,8 @@ def _firsts(block: Block) -> np.ndarray:
 
 def _share(
     model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None
-) -> Float[Array, " contacts"]:
-    """Return φ of each contact or limit of a block."""
+) -> tuple[Float[Array, " contacts"], Float[Array, " contacts"] | None]:
+    """Return φ of each contact or limit of a block, and ψ; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
     rate = jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
@@ -213,11 +265,11 @@ def _share(
     slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
     distance = block.residual[::each] + h * rate * slow
     if contacts is None:
-        return _ramp(distance, width, 0.5)
+        return _ramp(distance, width, 0.5), None
     slots = slot_geoms(model)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
     share = _ramp(distance, width, jnp.where(_is_blind(model, geoms), 0.0, 0.5))
-    return share * _side(model, data, contacts, geoms, width)
+    return share, _side(model, data, contacts, geoms, width)
 
 
 def _ramp(
@@ -246,18 +298,20 @@ def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) ->
 
 def _side(
     model: mjx.Model, data: mjx.Data, contacts: slice, geoms: Array | np.ndarray, width: Float[Array, " contacts"]
-) -> Float[Array, " contacts"]:
-    """Return ψ: 1 but where the centres of two geoms are about to pass each other along the normal."""
+) -> Float[Array, " contacts"] | None:
+    """Return ψ: 1 but where the centres of two geoms pass each other along the normal in this step; None if none can."""
     can_pass = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
     if isinstance(can_pass, np.ndarray) and not can_pass.any():
-        return jnp.ones_like(width)
+        return None
     normal = data._impl.contact.frame[contacts, 0]
     apart = jnp.sum(normal * (data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]), axis=1)
-    share = 2 * apart / jnp.where(width > 0, width, 1.0)
-    return jnp.where(can_pass & (width > 0) & (share < 1), jnp.where(share > 0, share, 0.0), 1.0)
+    share = 0.5 + apart / jnp.where(width > 0, width, 1.0)
+    return jnp.where(can_pass & (width > 0) & (share < 1), jnp.where(share > 0.5, share, 0.5), 1.0)
 
 
-def _split(share: Float[Array, " rows"], is_first: np.ndarray) -> Shares:
+def _split(whole: Float[Array, " rows"], side: Float[Array, " rows"] | None, is_first: np.ndarray) -> Shares:
+    """Return the shares in two solves, from φ and ψ."""
+    share = whole if side is None else whole * side
     is_partial = (share > 0) & (share < 1)
     counts = jnp.where(is_partial & is_first, share * (1 - share), 0.0)
     total = jnp.sum(counts)
@@ -269,10 +323,15 @@ def _split(share: Float[Array, " rows"], is_first: np.ndarray) -> Shares:
     before = jnp.where(early > 0, early / rest, 0.0)
     before = jnp.where((share == 1) | ~is_split, share, before)
     after = jnp.where(late < 1, late, 1.0)
-    return Shares(before, after, weight, is_split)
+    if side is None:
+        return Shares(before, after, weight, is_split, None)
+    # Where it does not push from this side it does from the other; of both the larger share is left, less the smaller.
+    passes = (side < 1) & is_split
+    before, after = (jnp.where(passes, p - (1 - p) * whole, p) for p in (before, after))
+    return Shares(jnp.abs(before), jnp.where(after > 0, after, 0.0), weight, is_split, before < 0)
 
 
-def weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
+def _weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
     """Return D of rows that act with a part of their impedance; zero for those without."""
     least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
     impedance = least * block.impedance.present

@@ -13,11 +13,10 @@ import functools
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, events, factor, forces, implicit, noise, smooth
@@ -30,7 +29,7 @@ from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.known import is_known_to_be
-from mjxgrad.dynamics.onset import Onset, Shares
+from mjxgrad.dynamics.onset import Onset, Partial, Shares
 from mjxgrad.smoothing import Smoothing
 
 _Disable = mujoco.mjtDisableBit
@@ -154,7 +153,9 @@ def _forward(
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     if smoothing is None:
-        data = _minimum(model, data, *_system(model, data, rows), _start(model, data), _partial(rows, shares))
+        data = _minimum(
+            model, data, *_system(model, data, rows), _start(model, data), onsets.partial(model, data, rows, shares)
+        )
     else:
         data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
@@ -190,22 +191,6 @@ def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowL
     return layout, assembly.system_of(model, data, layout, assembly.joined(blocks)) if blocks else None
 
 
-class _Partial(eqx.Module):
-    """Contacts that act for a part of the step: the rows' weights with and without those that begin, see `dynamics.onset`."""
-
-    weights: Float[Array, "2 rows"]
-    share: Float[Array, ""]
-    is_split: Bool[Array, ""]
-
-
-def _partial(blocks: list[Block], shares: Shares | None) -> _Partial | None:
-    if shares is None:
-        return None
-    rows = assembly.joined(blocks)
-    weights = jax.vmap(lambda share: onsets.weights(rows, share))(jnp.stack([shares.after, shares.before]))
-    return _Partial(weights, shares.weight, shares.is_split)
-
-
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
     return data.qacc_smooth if cold else data.qacc_warmstart
@@ -232,7 +217,7 @@ def _smoothed_solve(
     is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
     blocks, uncertain, layout = noise.smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
-    partial = _partial(blocks if is_forward else begun, shares)
+    partial = onsets.partial(model, data, blocks if is_forward else begun, shares)
     if uncertain is None or not model.nv:
         return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)
     soft = assembly.make_constraint(model, data, blocks)
@@ -267,7 +252,7 @@ def _minimum(
     layout: RowLayout,
     system: System | None,
     start: Float[Array, " nv"],
-    partial: _Partial | None = None,
+    partial: Partial | None = None,
 ) -> mjx.Data:
     """Return data with the acceleration, and the forces of the rows, at which all are in balance."""
     if system is None or not layout.num_rows or not model.nv:
@@ -282,9 +267,12 @@ def _minimum(
         force = system.row_force(layout, acceleration)
     else:
         both, num_iterations = implicit.solve_both(
-            layout, iterations, system, partial.weights, partial.is_split, start, tolerance
+            layout, iterations, system, partial.variants, partial.is_split, start, tolerance
         )
-        forces = jax.vmap(lambda weight, a: system.weighed(weight).row_force(layout, a))(partial.weights, both)
+        variants = partial.variants
+        forces = jax.vmap(lambda variant, a: system.varied(variant).row_force(layout, a))(variants, both)
+        if variants.is_mirrored is not None:  # forces are those of the rows as they stand
+            forces = jnp.where(variants.is_mirrored, -forces, forces)
         # In this order they are the whole contact's to the last bit where the two do not differ.
         acceleration, force = (x[1] + partial.share * (x[0] - x[1]) for x in (both, forces))
     return data.tree_replace(  # pyright: ignore[reportReturnType]

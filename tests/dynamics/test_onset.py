@@ -269,27 +269,59 @@ def test_several_contacts_share_the_step_and_none_jumps():
     assert _largest_jump(lambda places: compiled(places, "mujoco")) > 1e-5
 
 
-def test_a_ball_driven_through_a_soft_wall_has_no_jump_where_the_normal_flips():
-    task = mg.tasks.ball_wall()
-    scene = task.scene.with_softness(wall_softness(300.0))
+_WALL = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0" cone="{cone}"/>
+  <worldbody>
+    <geom type="box" size=".01 .2 .2" condim="{condim}"/>
+    <body pos="-.03 0 0"><freejoint/><geom type="sphere" size=".01" mass=".01" condim="{condim}"
+      solref="-300 -35" solimp="0 .3 .02"/></body>
+  </worldbody>
+</mujoco>
+"""
 
+
+@pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 1), ("pyramidal", 3), ("elliptic", 3)])
+def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim):
+    """The normal flips once, half way through. Neither a jump is left, nor the mean over the phases of a step moved."""
+    scene = _scene(_WALL.format(cone=cone, condim=condim))
+    qvel = jnp.array([1.9, 0.3, 0.0, 0.0, 4.0, 9.0])
+
+    @functools.partial(jax.jit, static_argnums=1)
     def outcome(places, kind):
         def at(place):
-            # In the middle of the wall, and away from its top.
-            qpos, qvel = jnp.array([0.195 + 0.001 * place, 0.02]), jnp.array([1.5, 0.1])
-
             def step(_, state):
                 moved = mg.step(scene.model, scene.data.replace(qpos=state[0], qvel=state[1]), onset=_ONSETS[kind])
                 return moved.qpos, moved.qvel
 
-            return jnp.concatenate(jax.lax.fori_loop(0, 10, step, (qpos, qvel)))
+            start = scene.data.qpos.at[0].add(place * 0.002 * 1.9)  # what the ball flies in one step
+            return jax.lax.fori_loop(0, 25, step, (start, qvel))[1][:3]
 
         return jax.vmap(at)(places)
 
-    compiled = jax.jit(outcome, static_argnums=1)
-    # The line crosses no impact but the flip.
-    assert _largest_jump(lambda places: compiled(places, "continuous"), 0.0, 3.0) < _ROUNDING
-    assert _largest_jump(lambda places: compiled(places, "mujoco"), 0.0, 3.0) > 1e-4
+    assert _largest_jump(lambda places: outcome(places, "continuous")) < _ROUNDING
+    assert _largest_jump(lambda places: outcome(places, "mujoco")) > 1e-4
+    phases = (np.arange(64) + 0.5) / 64
+    smooth, teeth = (np.asarray(outcome(phases, kind)) for kind in ("continuous", "mujoco"))
+    size = np.ptp(teeth, axis=0)
+    has_teeth = size > 1e-4  # along the wall only with friction
+    assert has_teeth.sum() == (1 if condim == 1 else 3)
+    assert (np.ptp(smooth, axis=0) < 0.1 * size)[has_teeth].all()
+    # A tenth of the teeth: the mean of a sawtooth is its centre only where it is linear.
+    assert (np.abs(smooth.mean(axis=0) - teeth.mean(axis=0)) < 0.1 * size)[has_teeth].all()
+
+
+def test_a_throw_through_the_softened_wall_has_no_teeth():
+    task = mg.tasks.ball_wall().with_softness(wall_softness(300.0))
+
+    def costs(task):
+        return np.asarray(jax.jit(jax.vmap(lambda angle: task.cost(angle[None])))(jnp.linspace(0.32, 0.57, 400)))
+
+    def roughness(values):
+        place = np.linspace(-1, 1, len(values))
+        return (values - np.polyval(np.polyfit(place, values, 5), place)).std()
+
+    assert roughness(costs(task)) < 0.05 * roughness(costs(task.with_onset(None)))
 
 
 _PUSHED = """
