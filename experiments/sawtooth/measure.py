@@ -20,7 +20,7 @@ from mjxgrad.diagnostics.slope import compare_to_slope, phases
 DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
 ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
 # The trend that an outcome may have over the interval; what it leaves is the sawtooth.
-_DEGREE = 5
+_DEGREE = 9
 
 
 @dataclass(frozen=True)

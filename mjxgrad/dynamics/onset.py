@@ -255,12 +255,11 @@ def _share(
     creep = gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
     if block.is_pyramid:
         slip = jnp.max(jnp.abs(rates - rate[:, None]), axis=1)
-        # Not of impacts, whose approach is many times what the weight gains in a step.
-        few, approach = (2 * h * gravity) ** 4, rate**4
-        rides = few / jnp.where(few + approach > 0, few + approach, 1.0)
-        creep = creep + _SLIP * h * damping * slip * rides
+        creep = creep + _SLIP * h * damping * slip * _is_slow(rate, 2 * h * gravity)
     floor = onset.width.astype(rate.dtype) * block.solimp[::each, 2]
-    travel, least = h * jnp.abs(rate), safe_sqrt((h * creep) ** 2 + floor**2)
+    # What weight and the contact itself do to a speed over such a length.
+    chatters = _is_slow(rate, 4 * (safe_sqrt(gravity * floor) + floor * resistance))
+    travel, least = h * jnp.abs(rate), safe_sqrt((h * creep) ** 2 + chatters * floor**2)
     width = jnp.where(travel > least, travel, least)
     slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
     distance = block.residual[::each] + h * rate * slow
@@ -270,6 +269,12 @@ def _share(
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
     share = _ramp(distance, width, jnp.where(_is_blind(model, geoms), 0.0, 0.5))
     return share, _side(model, data, contacts, geoms, width)
+
+
+def _is_slow(rate: Float[Array, " contacts"], speed: Float[Array, "..."]) -> Float[Array, " contacts"]:
+    """Return 1 for what is much slower than a speed, and 0 for impacts."""
+    own, other = speed**4, rate**4
+    return own / jnp.where(own + other > 0, own + other, 1.0)
 
 
 def _ramp(
