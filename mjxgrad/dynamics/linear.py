@@ -120,18 +120,40 @@ def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree
 
     def turn(state):
         is_left, result = state
-        # Of equals the first come first.
-        _, index = jax.lax.top_k(is_left.astype(jnp.float32), count)
-        part = function(*jax.tree.map(lambda x: jnp.take(x, index, axis=-1, mode="clip"), args))
-        place = jnp.cumsum(is_left) - 1
-        is_done = is_left & (place < count)
-
-        def put(whole: Array, few: Array) -> Array:
-            return jnp.where(is_done, jnp.take(few, place, axis=-1, mode="clip"), whole)
-
-        return is_left & ~is_done, jax.tree.map(put, result, part)
+        few = Few(is_left, count)
+        return is_left & ~few.is_taken, few.put(result, function(*few.take(args)))
 
     return jax.lax.while_loop(lambda state: jnp.any(state[0]), turn, (is_needed, default))[1]
+
+
+class Few:
+    """Some of a batch, taken out and put back: of those chosen the first, in their order, then others as there is room.
+
+    Args:
+        is_chosen: of the batch, which is the trailing axis of arrays.
+        count: for how many there is room.
+
+    Attributes:
+        is_taken: who is among them of those chosen.
+    """
+
+    def __init__(self, is_chosen: Bool[Array, " batch"], count: int):
+        # Of equals the first come first.
+        _, self._index = jax.lax.top_k(is_chosen.astype(jnp.float32), count)
+        self._place = jnp.cumsum(is_chosen) - 1
+        self.is_taken = is_chosen & (self._place < count)
+
+    def take(self, whole: PyTree) -> PyTree:
+        """Return arrays of these alone; an axis of length one serves all."""
+        return jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, self._index, axis=-1, mode="clip"), whole)
+
+    def put(self, whole: PyTree, part: PyTree) -> PyTree:
+        """Return the whole with the parts of those chosen in their places."""
+
+        def put(one: Array, few: Array) -> Array:
+            return jnp.where(self.is_taken, jnp.take(few, self._place, axis=-1, mode="clip"), one)
+
+        return jax.tree.map(put, whole, part)
 
 
 def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:

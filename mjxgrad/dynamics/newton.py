@@ -195,21 +195,11 @@ def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], 
         result: of those who are.
         count: of places for them, no fewer than there are.
     """
-    # Of equals the first come first: in their own order, then some that are done and stay as they are.
-    _, index = jax.lax.top_k(is_left.astype(jnp.float32), count)
-
-    def take(x: Array) -> Array:
-        return x if x.shape[-1] == 1 else jnp.take(x, index, axis=-1, mode="clip")
-
-    few = jax.tree.map(take, solver)
+    few = linear.Few(is_left, count)
+    part = few.take(solver)
     # Evaluated anew: that takes less than it takes to gather it.
-    began = few.measure(*(take(x) for x in (state.point.acceleration, state.is_near, state.num_iterations)))
-    place = jnp.cumsum(is_left) - 1
-    return jax.tree.map(
-        lambda whole, part: jnp.where(is_left, jnp.take(part, place, axis=-1, mode="clip"), whole),
-        result,
-        few.result(few.run(began, 0)),
-    )
+    began = part.measure(*few.take((state.point.acceleration, state.is_near, state.num_iterations)))
+    return few.put(result, part.result(part.run(began, 0)))
 
 
 class _Solver(eqx.Module):
