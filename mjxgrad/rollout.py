@@ -56,7 +56,7 @@ class Trajectory(eqx.Module):
             `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
             hardly have such a limit). Only `rollout` counts it.
         growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
-            velocities and positions alike; NaN unless asked for.
+            velocities and positions alike; None unless asked for.
     """
 
     qpos: Float[Array, "states nq"]
@@ -67,12 +67,12 @@ class Trajectory(eqx.Module):
     diverged: Bool[Array, ""]
     first_bad_step: Int[Array, ""]
     unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
-    growth: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan))
+    growth: Float[Array, ""] | None = None
 
     @property
     def explodes(self) -> Bool[Array, "*batch"]:
         """Whether the derivative has grown beyond belief: a thousandfold, or out of all numbers. False if it was not measured."""
-        return (self.growth > LARGEST_GROWTH) | jnp.isinf(self.growth)
+        return jnp.zeros_like(self.diverged) if self.growth is None else self.growth > LARGEST_GROWTH
 
 
 LARGEST_GROWTH = 1e3
@@ -208,8 +208,8 @@ def rollout(
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     tangent = _direction(state) if measure_growth else None
-    none = jnp.ones((), state.qvel.dtype) if measure_growth else jnp.asarray(jnp.nan)
-    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32), tangent, none)
+    length = jnp.ones((), state.qvel.dtype) if measure_growth else None
+    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32), tangent, length)
     (final, first_bad, unsolved, _, growth), (qpos, qvel, ctrl, seen) = jax.lax.scan(
         advance,
         start,
@@ -228,7 +228,7 @@ def rollout(
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
         unsolved=unsolved,
-        growth=jnp.where(jnp.isnan(growth), jnp.inf, growth) if measure_growth else growth,
+        growth=None if growth is None else jnp.where(jnp.isnan(growth), jnp.inf, growth),
     )
 
 

@@ -47,10 +47,10 @@ wall). Both sides push then for their share of the step: the present one for ψ 
 centres along the normal, and the mirrored contact, of the same depth and the opposite velocity, for the rest. For geoms with a
 centre of symmetry.
 
-**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not. So do jumps where the nearest face of
-a box changes by a right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still multiplies tangents,
-within what the width allows. The distance of boxes and meshes is known only where they overlap, except from planes, and of boxes
-from balls: there the ramp lies at 0 > r > -w, continuous and half a step late.
+**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not. So do jumps where the nearest face
+of a box changes by a right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still
+multiplies tangents, within what the width allows. The distance of boxes and meshes is known only where they overlap, except from
+planes, and of boxes from balls: there the ramp lies at 0 > r > -w, continuous and half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
