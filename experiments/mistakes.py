@@ -31,7 +31,14 @@ def validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
     except ValidationError as error:
-        return None, [_sentence(settings, detail, swept) for detail in error.errors()]
+        return None, [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
+
+
+def _follows(detail: ErrorDetails, error: ValidationError) -> bool:
+    """Tell whether an array is only too short for the mistakes within it, which are reported themselves."""
+    place = detail["loc"]
+    inner = (other["loc"][: len(place)] for other in error.errors() if len(other["loc"]) > len(place))
+    return detail["type"] == "too_short" and place in inner
 
 
 def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
@@ -49,6 +56,8 @@ def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) 
             expected = detail.get("ctx", {}).get("expected", "").replace("'", "")
             choices = expected.replace(" or ", ", ").split(", ")
             return f"{swept_path}: there is no {given}; {suggest(str(detail.get('input')), choices)}"
+        case "too_short":
+            return f"{swept_path}: must hold at least {detail.get('ctx', {}).get('min_length')}, got {given}"
         case "value_error":
             reason = detail["msg"].removeprefix("Value error, ")
             return f"{swept_path}: {reason}" if path else reason

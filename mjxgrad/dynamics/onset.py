@@ -194,21 +194,18 @@ def begin(
         each, count = block.rows_each, len(block.residual) // block.rows_each
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
-        share, side = (
-            None if x is None else jnp.repeat(x, each, total_repeat_length=each * count)
-            for x in _share(model, data, block, onset, geoms)
-        )
+        per_contact, side = _share(model, data, block, onset, geoms)
+        share = jnp.repeat(per_contact, each, total_repeat_length=each * count)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
         found.append(share)
-        sides.append(side)
-    side = None
-    if any(one is not None for one in sides):
-        side = jnp.concatenate(
-            [jnp.ones_like(share) if one is None else one for share, one in zip(found, sides, strict=True)]
-        )
-    return rows, _split(jnp.concatenate(found), side, np.concatenate([_firsts(block) for block in blocks]))
+        sides.append(None if side is None else jnp.repeat(side, each, total_repeat_length=each * count))
+    all_sides = None
+    if any(side is not None for side in sides):
+        pairs = zip(found, sides, strict=True)
+        all_sides = jnp.concatenate([jnp.ones_like(share) if side is None else side for share, side in pairs])
+    return rows, _split(jnp.concatenate(found), all_sides, np.concatenate([_firsts(block) for block in blocks]))
 
 
 def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> Partial | None:

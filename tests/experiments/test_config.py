@@ -68,6 +68,11 @@ def test_a_misspelt_key_in_a_table_is_answered_from_that_table(write):
     assert found == ('video.spede: unknown key; did you mean "speed"?',)
 
 
+def test_an_array_that_is_too_short_for_its_own_mistakes_alone_is_not_called_so():
+    assert mistakes("sawtooth", 'cases=["hoper"]') == ('cases[0]: there is no "hoper"; did you mean "hopper"?',)
+    assert mistakes("sawtooth", "cases=[]") == ("cases: must hold at least 1, got []",)
+
+
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
