@@ -19,7 +19,7 @@ _MARKERS = {"Euler": "o", "implicitfast": "s", "RK4": "^"}
 _ESTIMATORS = {
     "zeroth order": ZEROTH,
     "first order, discrete": FIRST,
-    "first order, event": "#cc79a7",
+    "first order, event": "#e69f00",
     "first order, onset": "#009e73",
     "α-order, onset": DEFAULT,
 }
