@@ -7,7 +7,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import FuncFormatter
 
-from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Outcome
+from experiments.bounce.outcome import Outcome
+from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, subplots

@@ -9,16 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-import mjxgrad as mg
-from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Cell, Outcome
+from experiments.bounce.outcome import Cell, Outcome
 from experiments.bounce.settings import BounceSettings, ImpedanceSettings
-from experiments.motion import at_time_step, motion
+from experiments.motion import ARMS, DISCRETE, at_time_step, motion
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.scene import Scene
 from mjxgrad.tasks.textbook import Bounce, bounce_scene, integrated_restitution
 
-_ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
 _TINY = 1e-7  # m; the ball flies 500 times as far in the shortest of time steps
 
 
@@ -40,7 +38,7 @@ class _Contacts(eqx.Module):
             geom_solimp=jnp.broadcast_to(self.solimp[cell], model.geom_solimp.shape),
         )
         data = self.scene.data.replace(qpos=start[None], qvel=-self.speed[None])
-        gradient, onset = _ARMS[arm]
+        gradient, onset = ARMS[arm]
         return motion(model, data, _height, num_times=1, steps_between=self.num_steps, gradient=gradient, onset=onset)[
             0
         ]
@@ -60,7 +58,7 @@ def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
     with workspace.stage("quadrature", "steps", 1):
         cells = [_cell(settings, *point) for point in grid]
     scene = bounce_scene()
-    found, differences = {arm: [] for arm in _ARMS}, []
+    found, differences = {arm: [] for arm in ARMS}, []
     starts = jnp.asarray(phases(settings.heights, settings.num_phases))
     with workspace.stage("rollouts", "time steps", len(settings.timesteps)) as advance_to:
         for timestep in settings.timesteps:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.bounce.settings import BounceSettings, ImpedanceSettings
+from experiments.motion import DISCRETE
 from mjxgrad.diagnostics import SlopeComparison
-
-DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
 
 
 @dataclass(frozen=True)

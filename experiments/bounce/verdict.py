@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 
-from experiments.bounce.outcome import CONTINUOUS, DISCRETE, EVENT, Outcome
+from experiments.bounce.outcome import Outcome
+from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Table
 
 # Steps in contact by which the outcome is told apart.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
-from experiments.motion import Read, at_time_step, motion
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, Read, at_time_step, motion
 from experiments.sawtooth.cases import case
 from experiments.sawtooth.settings import SawtoothSettings
 from experiments.workspace import Workspace
@@ -17,8 +17,6 @@ from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
 
-DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
-ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
 # The trend that an outcome may have over the interval; what it leaves is the sawtooth.
 _DEGREE = 9
 

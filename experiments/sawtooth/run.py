@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Figure, Report, Table
-from experiments.sawtooth.measure import ARMS, CONTINUOUS, DISCRETE, EVENT, Course, measure
+from experiments.sawtooth.measure import Course, measure
 from experiments.sawtooth.settings import SawtoothSettings
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 from experiments.workspace import Workspace

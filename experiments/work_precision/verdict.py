@@ -49,14 +49,7 @@ def findings(outcome: Outcome) -> list[str]:
         Sentences.
     """
     sentences = [_recommendation(course, outcome) for course in outcome.courses]
-    onset = _onset_against_step(outcome)
-    if onset:
-        sentences.append(
-            "With contact that begins within the step the error of the motion, at the same integrator and time step, is "
-            f"{', '.join(f'{ratio:.2g} ({title})' for title, ratio in onset)} times the step's in the median, and larger by more "
-            f"than a tenth at {sum(_worse(course) for course in outcome.courses)} of "
-            f"{sum(len(_onset_ratios(course)) for course in outcome.courses)} time steps."
-        )
+    sentences += _onset_against_step(outcome)
     loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]
     if loose:
         sentences.append(
@@ -83,9 +76,17 @@ def findings(outcome: Outcome) -> list[str]:
     return sentences
 
 
-def _onset_against_step(outcome: Outcome) -> list[tuple[str, float]]:
-    ratios = [(course.title, _onset_ratios(course)) for course in outcome.courses]
-    return [(title, float(np.median(found))) for title, found in ratios if found]
+def _onset_against_step(outcome: Outcome) -> list[str]:
+    """Say what contact that begins within the step makes of the error; nothing if it was nowhere tried."""
+    ratios = {course.title: found for course in outcome.courses if (found := _onset_ratios(course))}
+    if not ratios:
+        return []
+    every = np.concatenate([*ratios.values()])
+    listed = ", ".join(f"{np.median(found):.2g} ({title})" for title, found in ratios.items())
+    return [
+        f"With contact that begins within the step the error of the motion, at the same integrator and time step, is {listed} "
+        f"times the step's in the median, and larger by more than a tenth at {(every > 1.1).sum()} of {every.size} time steps."
+    ]
 
 
 def _onset_ratios(course: Course) -> list[float]:
@@ -104,10 +105,6 @@ def _onset_ratios(course: Course) -> list[float]:
     return [
         found[h] / plain[h] for h in found if np.isfinite(found[h]) and np.isfinite(plain[h]) and plain[h] > 3 * floor
     ]
-
-
-def _worse(course: Course) -> int:
-    return sum(ratio > 1.1 for ratio in _onset_ratios(course))
 
 
 def summary(outcome: Outcome) -> Table:

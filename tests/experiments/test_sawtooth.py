@@ -7,7 +7,8 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.sawtooth.measure import CONTINUOUS, DISCRETE, EVENT, Course
+from experiments.motion import CONTINUOUS, DISCRETE, EVENT
+from experiments.sawtooth.measure import Course
 from experiments.sawtooth.run import _errors, _rows, _teeth, _verdict
 from mjxgrad.diagnostics import compare_to_slope, phases
 
