@@ -12,6 +12,8 @@ no longer feel a tilt about it. The positions of the contacts do: each lies half
 n·(p - o) + d/2 is the height of the rim above the plane, and its derivative is the right one in every pose.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -29,6 +31,9 @@ _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER = (
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
+
+# How much sooner a ball outside an edge is too far from it to be pushed by both faces.
+_ROUND_EDGES = 4.0
 
 _Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
 """Distances, positions and frames."""
@@ -70,6 +75,49 @@ def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
         by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
     slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
     return np.concatenate(slots) if slots else np.zeros((0, 2), int)
+
+
+def other_sides(
+    model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
+) -> tuple[Any, Float[Array, " contacts"]]:
+    """Return the contacts that take the place of some as bodies move on, and by how much farther they are from doing so (m).
+
+    Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
+    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps.
+
+    Args:
+        model: with the geoms.
+        data: with their poses.
+        contact: as `collide` found them.
+        geoms: of each; constants where they are known. Faces of boxes change sides only there.
+    """
+    towards = data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]
+    pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
+    if isinstance(geoms, np.ndarray):
+        kinds = np.asarray(model.geom_type)[geoms]
+        in_box = np.flatnonzero((kinds == (_SPHERE, _BOX)).all(axis=1))
+        if in_box.size:
+            faces = _next_face(model, data, geoms[in_box])
+            pos, frame, nearer = (x.at[in_box].set(new) for x, new in zip((pos, frame, nearer), faces, strict=True))
+    return contact.replace(pos=pos, frame=frame), nearer
+
+
+def _next_face(
+    model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]
+) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"], Float[Array, " pairs"]]:
+    """Return position and frame of a ball's contact with the second nearest face of a box, and how much farther that is."""
+    distance, outward, beyond, sign = _from_box(model, data, geoms)
+    nearest = _largest(beyond)
+    opposite = -beyond - 2 * pick(geoms[:, 1], model.geom_size)
+    rest = jnp.where(nearest, opposite, beyond)
+    second = _largest(rest)
+    along_nearest, along_second = (jnp.sum(jnp.abs(outward) * axis, axis=1)[:, None] for axis in (nearest, second))
+    traded = outward + sign * (along_second - along_nearest) * (1.0 * nearest - 1.0 * second)
+    is_opposite = jnp.any(nearest & second, axis=1)
+    pos, frame = _towards_box(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
+    next_one = jnp.max(rest, axis=1)
+    # Round an edge the normal turns as the ball does: nothing to share.
+    return pos, frame, jnp.max(beyond, axis=1) - next_one + _ROUND_EDGES * jnp.where(next_one > 0, next_one, 0.0)
 
 
 def _joined(contacts: list):
@@ -114,24 +162,43 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray
 
 def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
     """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
+    distance, outward, *_ = _from_box(model, data, geoms)
+    pos, frame = _towards_box(model, data, geoms, distance, outward)
+    return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
+
+
+def _from_box(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> tuple[Array, Array, Array, Array]:
+    """Return how far a ball's centre lies outside a box, in which direction, and its distances and sides along the axes."""
     sphere, box = geoms.T
-    turn, size = pick(box, data.geom_xmat), pick(box, model.geom_size)
     away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
-    centre = contract("pji,pj->pi", turn, away)
-    beyond = jnp.abs(centre) - size
+    centre = contract("pji,pj->pi", pick(box, data.geom_xmat), away)
+    beyond = jnp.abs(centre) - pick(box, model.geom_size)
     is_inside = jnp.all(beyond <= 0, axis=1)
     sign = jnp.where(centre < 0, -1.0, 1.0)
     gap = sign * jnp.where(beyond > 0, beyond, 0.0)
     length = safe_norm(gap)
-    nearest = jnp.argmax(beyond, axis=1)
-    face = sign * (jnp.arange(3) == nearest[:, None])
+    face = sign * _largest(beyond)
     outward = jnp.where(is_inside[:, None], face, gap / jnp.where(length > 0, length, 1.0)[:, None])
-    distance = jnp.where(is_inside, jnp.max(beyond, axis=1), length)
-    radius = pick(sphere, model.geom_size)[:, 0]
-    normal = contract("pij,pj->pi", turn, -outward)
-    # Half-way between both surfaces.
-    pos = pick(sphere, data.geom_xpos) + (0.5 * (distance + radius))[:, None] * normal
-    return distance - radius, pos, jax.vmap(make_frame)(normal)
+    return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward, beyond, sign
+
+
+def _towards_box(
+    model: mjx.Model,
+    data: mjx.Data,
+    geoms: Int[np.ndarray, "pairs 2"],
+    distance: Float[Array, " pairs"],
+    outward: Float[Array, "pairs 3"],
+) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"]]:
+    """Return position and frame of contacts, half-way between both surfaces."""
+    sphere, box = geoms.T
+    normal = contract("pij,pj->pi", pick(box, data.geom_xmat), -outward)
+    reach = 0.5 * (distance + pick(sphere, model.geom_size)[:, 0])
+    return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
+
+
+def _largest(x: Float[Array, "pairs 3"]) -> Array:
+    """Return which is the largest of three."""
+    return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
 
 
 _FUNCTIONS = {(_PLANE, _BOX): _plane_box, (_PLANE, _CYLINDER): _plane_cylinder, (_SPHERE, _BOX): _sphere_box}

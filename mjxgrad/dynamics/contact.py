@@ -24,22 +24,33 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     chosen = np.nonzero(np.asarray(contact.dim) == dim)[0]
     if not chosen.size:
         return None
-    bodies = slot_bodies(model)
-    contact = jax.tree.map(lambda x: x[chosen[0] : chosen[-1] + 1], contact)
-    is_pyramid = dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    first = int(chosen[0])
+    contact = jax.tree.map(lambda x: x[first : chosen[-1] + 1], contact)
     contact = contact.replace(friction=least_friction(contact.friction))
-    friction = contact.friction[:, : dim - 1] if is_pyramid else None
-    if bodies is None:
-        of_slots = jnp.asarray(model.geom_bodyid)[contact.geom]
-        matrix = contact_jacobian(model, data, contact.pos, contact.frame, of_slots, dim)
-        rows = DenseRows.of_contacts(matrix, friction)
-    else:
-        of_slots = bodies[chosen]
-        rows = contact_rows(model, data, contact, of_slots, dim, friction)
-    inverse_weight = jnp.sum(model.body_invweight0[of_slots, 0], axis=1)
-    if is_pyramid:
+    rows = row_map(model, data, contact, first, dim)
+    inverse_weight = jnp.sum(model.body_invweight0[_bodies(model, contact, first), 0], axis=1)
+    if _has_pyramids(model, dim):
         return _pyramids(model, contact, rows, inverse_weight, dim)
     return _cones(model, contact, rows, inverse_weight, dim)
+
+
+def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
+    """Return the map of consecutive contacts of one dimension, the first of which has a number."""
+    friction = contact.friction[:, : dim - 1] if _has_pyramids(model, dim) else None
+    bodies = _bodies(model, contact, first)
+    if isinstance(bodies, np.ndarray):
+        return contact_rows(model, data, contact, bodies, dim, friction)
+    return DenseRows.of_contacts(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
+
+
+def _has_pyramids(model: mjx.Model, dim: int) -> bool:
+    return dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+
+def _bodies(model: mjx.Model, contact: Any, first: int) -> np.ndarray | Array:
+    """Return the bodies of consecutive contacts, as constants where they are known."""
+    known = slot_bodies(model)
+    return jnp.asarray(model.geom_bodyid)[contact.geom] if known is None else known[first : first + len(contact.dist)]
 
 
 def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:

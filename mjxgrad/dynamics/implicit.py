@@ -43,12 +43,12 @@ class Variant(eqx.Module):
     Attributes:
         weight: of the rows.
         reference: a_ref of the rows; None for that of the system.
-        is_mirrored: whose contact pushes from the other side, as -J; None for nobody.
+        map: J, where some contacts push from another side; None for that of the system.
     """
 
     weight: Float[Array, "*two rows"]
     reference: Float[Array, "*two rows"] | None = None
-    is_mirrored: Bool[Array, "*two rows"] | None = None
+    map: RowMap | None = None
 
     def __getitem__(self, number: int) -> "Variant":
         """Return that of one solve."""
@@ -64,7 +64,6 @@ class System(eqx.Module):
         map: J, also of rows that are inactive.
         is_active: which rows are not.
         rows: parameters of the rows' laws.
-        is_mirrored: rows whose sign is reversed; None for none.
     """
 
     inertia: Inertia
@@ -72,18 +71,14 @@ class System(eqx.Module):
     map: RowMap
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
-    is_mirrored: Bool[Array, "rows *batch"] | None = None
 
     def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
-        return self._turned(jnp.where(self.is_active, self.map.rates(velocity), 0.0))
+        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
 
     def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
         """Return Jᵀ f."""
-        return self.map.pull(self._turned(jnp.where(self.is_active, force, 0.0)))
-
-    def _turned(self, x: Float[Array, " rows"]) -> Float[Array, " rows"]:
-        return x if self.is_mirrored is None else jnp.where(self.is_mirrored, -x, x)
+        return self.map.pull(jnp.where(self.is_active, force, 0.0))
 
     def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return the constraint forces at an acceleration."""
@@ -98,11 +93,11 @@ class System(eqx.Module):
         """Return the same with what is different in one solve."""
         reference = self.rows.reference if variant.reference is None else variant.reference
         rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
-        return dataclasses.replace(self, rows=rows, is_mirrored=variant.is_mirrored)
+        return dataclasses.replace(self, rows=rows, map=self.map if variant.map is None else variant.map)
 
     def problem(self) -> Problem:
         """Return the same with entries; arrays may carry the batch as trailing axes here."""
-        jacobian = SparseRows.of(self.map, self.is_active, len(self.force), self.is_mirrored)
+        jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
         return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
 
 

@@ -42,15 +42,16 @@ impedance p d. It is continuous throughout, and the mean share is φ.
 
 On the floor r is taken ahead, r + h v (1 - h²v²/w²): that damps what else would swing on the ramp.
 
-**Change of sides.** The normal of two bodies flips where their centres pass each other along it (a ball driven through a thin
-wall). Both sides push then for their share of the step: the present one for ψ = 1/2 + m / w, at most 1, m the distance of the
-centres along the normal, and the mirrored contact, of the same depth and the opposite velocity, for the rest. For geoms with a
-centre of symmetry.
+**Change of sides.** The normal flips where two centres pass each other along it (a ball driven through a thin wall), and turns
+by a right angle where another face of a box comes nearest to a ball's centre within it. Both sides push then for their share of
+the step: the present one for ψ = 1/2 + δ / w, at most 1, with δ by how much nearer it is, w what δ changes by in a step, and the
+other one, at the same depth, for the rest. For geoms with a centre of symmetry, and balls in boxes.
 
-**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not. So do jumps where the nearest face
-of a box changes by a right angle. A contact of fewer than about three steps is smooth and still not resolved. Chatter still
-multiplies tangents, within what the width allows. The distance of boxes and meshes is known only where they overlap, except from
-planes, and of boxes from balls: there the ramp lies at 0 > r > -w, continuous and half a step late.
+**What it cannot do.** Real discontinuities remain: hit or miss, an edge that catches or not. So do jumps where two boxes change
+the faces that touch, and where three faces of a box are equally near within a step. A contact of fewer than about three steps is
+smooth and still not resolved. Chatter still multiplies tangents, within what the width allows. The distance of boxes and meshes
+is known only where they overlap, except from planes, and of boxes from balls: there the ramp lies at 0 > r > -w, continuous and
+half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
@@ -71,9 +72,11 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contacts import safe_sqrt
 from mjxgrad.dynamics import assembly
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.collision import slot_geoms
+from mjxgrad.dynamics.collision import other_sides, slot_geoms
+from mjxgrad.dynamics.contact import row_map
 from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import Variant
+from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
@@ -138,14 +141,14 @@ class Shares(eqx.Module):
         after: p₊ of each row, likewise.
         weight: Φ, the weight of the solve with p₊.
         is_split: whether the two solves differ.
-        is_mirrored: rows that push from the other side in the solve with p₋; None if none ever does.
+        map: of the rows in the solve with p₋, where some push from another side; None if none ever does.
     """
 
     before: Float[Array, " rows"]
     after: Float[Array, " rows"]
     weight: Float[Array, ""]
     is_split: Bool[Array, ""]
-    is_mirrored: Bool[Array, " rows"] | None
+    map: RowMap | None
 
 
 class Partial(eqx.Module):
@@ -194,18 +197,14 @@ def begin(
         each, count = block.rows_each, len(block.residual) // block.rows_each
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
-        per_contact, side = _share(model, data, block, onset, geoms)
-        share = jnp.repeat(per_contact, each, total_repeat_length=each * count)
+        share, side = _share(model, data, block, onset, geoms)
+        share = jnp.repeat(share, each, total_repeat_length=each * count)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
         found.append(share)
-        sides.append(None if side is None else jnp.repeat(side, each, total_repeat_length=each * count))
-    all_sides = None
-    if any(side is not None for side in sides):
-        pairs = zip(found, sides, strict=True)
-        all_sides = jnp.concatenate([jnp.ones_like(share) if side is None else side for share, side in pairs])
-    return rows, _split(jnp.concatenate(found), all_sides, np.concatenate([_firsts(block) for block in blocks]))
+        sides.append(side)
+    return rows, _split(blocks, found, sides)
 
 
 def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> Partial | None:
@@ -221,15 +220,12 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
         return None
     rows = assembly.joined(blocks)
     weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
-    if shares.is_mirrored is None:
+    if shares.map is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
-    reference, _ = assembly.law(model, data.qvel, rows)
-    _, damping = assembly.stiffness_damping(model, rows)
-    # The rate of a row is that of the other side reversed, its distance the same.
-    moves = jnp.where(shares.is_mirrored & rows.is_active, 2 * damping * rows.map.rates(data.qvel), 0.0)
-    is_mirrored = jnp.stack([jnp.zeros_like(shares.is_mirrored), shares.is_mirrored])
-    variants = Variant(weight, jnp.stack([reference, reference + moves]), is_mirrored)
-    return Partial(variants, shares.weight, shares.is_split)
+    turned = eqx.tree_at(lambda block: block.map, rows, shares.map)
+    references = [assembly.law(model, data.qvel, block)[0] for block in (rows, turned)]
+    maps = jax.tree.map(lambda *x: jnp.stack(x), rows.map, shares.map)
+    return Partial(Variant(weight, jnp.stack(references), maps), shares.weight, shares.is_split)
 
 
 def _firsts(block: Block) -> np.ndarray:
@@ -241,13 +237,25 @@ def _firsts(block: Block) -> np.ndarray:
     )
 
 
+class _Side(eqx.Module):
+    """What may push instead of the contacts of a block.
+
+    Attributes:
+        share: ψ, for which part of the step the present side pushes.
+        map: of the rows from the other side.
+    """
+
+    share: Float[Array, " contacts"]
+    map: RowMap
+
+
 def _share(
     model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None
-) -> tuple[Float[Array, " contacts"], Float[Array, " contacts"] | None]:
-    """Return φ of each contact or limit of a block, and ψ; None where no sides change."""
+) -> tuple[Float[Array, " contacts"], _Side | None]:
+    """Return φ of each contact or limit of a block, and what may push instead of it; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
-    rate = jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
+    rate = _normal(block, rates)
     stiffness, damping = (x[::each] for x in assembly.stiffness_damping(model, block))
     resistance = damping + safe_sqrt(stiffness)
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
@@ -267,7 +275,12 @@ def _share(
     slots = slot_geoms(model)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
     share = _ramp(distance, width, jnp.where(_is_blind(model, geoms), 0.0, 0.5))
-    return share, _side(model, data, contacts, geoms, width)
+    return share, _side(model, data, block, contacts, geoms, rate, least)
+
+
+def _normal(block: Block, rates: Float[Array, "contacts each"]) -> Float[Array, " contacts"]:
+    """Return the rates along the normal."""
+    return jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
 
 
 def _is_slow(rate: Float[Array, " contacts"], speed: Float[Array, "..."]) -> Float[Array, " contacts"]:
@@ -301,21 +314,42 @@ def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) ->
 
 
 def _side(
-    model: mjx.Model, data: mjx.Data, contacts: slice, geoms: Array | np.ndarray, width: Float[Array, " contacts"]
-) -> Float[Array, " contacts"] | None:
-    """Return ψ: 1 but where the centres of two geoms pass each other along the normal in this step; None if none can."""
-    can_pass = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
-    if isinstance(can_pass, np.ndarray) and not can_pass.any():
+    model: mjx.Model,
+    data: mjx.Data,
+    block: Block,
+    contacts: slice,
+    geoms: Array | np.ndarray,
+    rate: Float[Array, " contacts"],
+    least: Float[Array, " contacts"],
+) -> _Side | None:
+    """Return for how long each contact pushes from its present side, and how it does from another; None if none can."""
+    can_turn = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
+    if isinstance(can_turn, np.ndarray) and not can_turn.any():
         return None
-    normal = data._impl.contact.frame[contacts, 0]
-    apart = jnp.sum(normal * (data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]), axis=1)
-    share = 0.5 + apart / jnp.where(width > 0, width, 1.0)
-    return jnp.where(can_pass & (width > 0) & (share < 1), jnp.where(share > 0.5, share, 0.5), 1.0)
+    contact = jax.tree.map(lambda x: x[contacts], data._impl.contact)
+    others, nearer = other_sides(model, data, contact, geoms)
+    dim = block.rows_each // 2 + 1 if block.is_pyramid else block.rows_each
+    turned = row_map(model, data, others, contacts.start, dim)
+    turning = model.opt.timestep * jnp.abs(rate - _normal(block, turned.rates(data.qvel).reshape(-1, block.rows_each)))
+    width = jnp.where(turning > 2 * least, turning, 2 * least)
+    share = 0.5 + nearer / jnp.where(width > 0, width, 1.0)
+    return _Side(jnp.where(can_turn & (width > 0) & (share < 1), jnp.where(share > 0.5, share, 0.5), 1.0), turned)
 
 
-def _split(whole: Float[Array, " rows"], side: Float[Array, " rows"] | None, is_first: np.ndarray) -> Shares:
-    """Return the shares in two solves, from φ and ψ."""
-    share = whole if side is None else whole * side
+def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_Side | None]) -> Shares:
+    """Return the shares in two solves, from φ of the rows and what may push instead of them."""
+    is_first = np.concatenate([_firsts(block) for block in blocks])
+    whole, present = jnp.concatenate(shares), 1.0
+    if any(side is not None for side in sides):
+        present = jnp.concatenate(
+            [
+                jnp.ones_like(share)
+                if side is None
+                else jnp.repeat(side.share, block.rows_each, total_repeat_length=len(share))
+                for block, share, side in zip(blocks, shares, sides, strict=True)
+            ]
+        )
+    share = whole * present
     is_partial = (share > 0) & (share < 1)
     counts = jnp.where(is_partial & is_first, share * (1 - share), 0.0)
     total = jnp.sum(counts)
@@ -327,12 +361,28 @@ def _split(whole: Float[Array, " rows"], side: Float[Array, " rows"] | None, is_
     before = jnp.where(early > 0, early / rest, 0.0)
     before = jnp.where((share == 1) | ~is_split, share, before)
     after = jnp.where(late < 1, late, 1.0)
-    if side is None:
+    if isinstance(present, float):
         return Shares(before, after, weight, is_split, None)
     # Where it does not push from this side it does from the other; of both the larger share is left, less the smaller.
-    passes = (side < 1) & is_split
-    before, after = (jnp.where(passes, p - (1 - p) * whole, p) for p in (before, after))
-    return Shares(jnp.abs(before), jnp.where(after > 0, after, 0.0), weight, is_split, before < 0)
+    turns = (present < 1) & is_split
+    before, after = (jnp.where(turns, p - (1 - p) * whole, p) for p in (before, after))
+    maps, start = [], 0
+    for block, side in zip(blocks, sides, strict=True):
+        rows = slice(start, start + len(block.residual))
+        maps.append(block.map if side is None else _chosen(before[rows] < 0, side.map, block.map))
+        start = rows.stop
+    return Shares(jnp.abs(before), jnp.where(after > 0, after, 0.0), weight, is_split, JoinedRows(tuple(maps)))
+
+
+def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMap:
+    """Return a map with the rows of one where chosen and those of another elsewhere."""
+
+    def choose(a: Array, b: Array) -> Array:
+        if a is b:  # what both share, and is not by rows
+            return b
+        return jnp.where(is_other[:: len(is_other) // len(a)].reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, other, own)
 
 
 def _weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:

@@ -32,14 +32,8 @@ class SparseRows(eqx.Module):
     num_dofs: int = eqx.field(static=True)
 
     @classmethod
-    def of(
-        cls,
-        rows: RowMap,
-        is_active: Bool[Array, "rows *batch"],
-        num_dofs: int,
-        is_mirrored: Bool[Array, "rows *batch"] | None = None,
-    ) -> "SparseRows":
-        """Return the entries of a map; rows that are not active are zero, and those of mirrored contacts negative."""
+    def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
+        """Return the entries of a map; rows that are not active are zero."""
         if len(rows.groups) > _MOST_GROUPS:
             rows = DenseRows(
                 rows.matrix(), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
@@ -48,11 +42,6 @@ class SparseRows(eqx.Module):
         for group, entries in zip(rows.groups, rows.directions(), strict=True):
             active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
             active = active[:, :1] if group.is_pyramid else active
-            if is_mirrored is not None:
-                turned = is_mirrored[start : start + group.num_rows].reshape(
-                    active.shape[0], group.rows_each, *active.shape[2:]
-                )
-                entries = jnp.where(turned[:, : active.shape[1], None], -entries, entries)
             pieces.append(jnp.where(active[:, :, None], entries, 0.0))
             start += group.num_rows
         return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)

@@ -24,7 +24,7 @@ from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.implicit import System
+from mjxgrad.dynamics.implicit import System, Variant
 from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows
@@ -265,20 +265,25 @@ def _minimum(
     if partial is None:
         acceleration, num_iterations = implicit.solve(layout, iterations, system, start, tolerance)
         force = system.row_force(layout, acceleration)
+        total = system.pull(force)
     else:
         both, num_iterations = implicit.solve_both(
             layout, iterations, system, partial.variants, partial.is_split, start, tolerance
         )
-        variants = partial.variants
-        forces = jax.vmap(lambda variant, a: system.varied(variant).row_force(layout, a))(variants, both)
-        if variants.is_mirrored is not None:  # forces are those of the rows as they stand
-            forces = jnp.where(variants.is_mirrored, -forces, forces)
+
+        def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
+            varied = system.varied(variant)
+            force = varied.row_force(layout, acceleration)
+            return force, varied.pull(force)
+
         # In this order they are the whole contact's to the last bit where the two do not differ.
-        acceleration, force = (x[1] + partial.share * (x[0] - x[1]) for x in (both, forces))
+        acceleration, force, total = (
+            x[1] + partial.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(partial.variants, both))
+        )
     return data.tree_replace(  # pyright: ignore[reportReturnType]
         {
             "qacc": acceleration,
-            "qfrc_constraint": system.pull(force),
+            "qfrc_constraint": total,
             "_impl.efc_force": force,
             "_impl.solver_niter": num_iterations.astype(data._impl.solver_niter.dtype),
         }
