@@ -117,7 +117,7 @@ def system_of(
     """
     reference, weight = law(model, data.qvel if velocity is None else velocity, block)
     rows = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)
-    return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, rows)
+    return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, rows)  # pyright: ignore[reportArgumentType]
 
 
 def cone_scales(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> tuple[Float[Array, "contacts dim"], ...]:

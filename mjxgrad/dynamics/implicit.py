@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mjxgrad.dynamics import constraint, factor, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
 from mjxgrad.dynamics.inertia import Inertia
-from mjxgrad.dynamics.jacobian import RowMap
+from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 from mjxgrad.dynamics.newton import Problem
 from mjxgrad.dynamics.sparse import SparseRows
 
@@ -43,12 +43,12 @@ class Variant(eqx.Module):
     Attributes:
         weight: of the rows.
         reference: a_ref of the rows; None for that of the system.
-        map: J, where some contacts push from another side; None for that of the system.
+        parts: of J, where contacts may push from another side; None where they never do.
     """
 
     weight: Float[Array, "*two rows"]
     reference: Float[Array, "*two rows"] | None = None
-    map: RowMap | None = None
+    parts: tuple[RowMap | None, ...] | None = None
 
     def __getitem__(self, number: int) -> "Variant":
         """Return that of one solve."""
@@ -68,7 +68,7 @@ class System(eqx.Module):
 
     inertia: Inertia
     force: Float[Array, "nv *batch"]
-    map: RowMap
+    map: JoinedRows
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
 
@@ -93,7 +93,7 @@ class System(eqx.Module):
         """Return the same with what is different in one solve."""
         reference = self.rows.reference if variant.reference is None else variant.reference
         rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
-        return dataclasses.replace(self, rows=rows, map=self.map if variant.map is None else variant.map)
+        return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
 
     def problem(self) -> Problem:
         """Return the same with entries; arrays may carry the batch as trailing axes here."""

@@ -295,6 +295,13 @@ class JoinedRows(RowMap):
 
     parts: tuple[RowMap, ...]
 
+    def with_parts(self, others: tuple[RowMap | None, ...] | None) -> "JoinedRows":
+        """Return the same with other parts where there are some."""
+        if others is None:
+            return self
+        pairs = zip(self.parts, others, strict=True)
+        return JoinedRows(tuple(own if other is None else other for own, other in pairs))
+
     @property
     def groups(self) -> tuple[Group, ...]:
         return tuple(group for part in self.parts for group in part.groups)

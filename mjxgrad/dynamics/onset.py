@@ -76,7 +76,7 @@ from mjxgrad.dynamics.collision import other_sides, slot_geoms
 from mjxgrad.dynamics.contact import row_map
 from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import Variant
-from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
+from mjxgrad.dynamics.jacobian import RowMap
 
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
@@ -141,14 +141,14 @@ class Shares(eqx.Module):
         after: p₊ of each row, likewise.
         weight: Φ, the weight of the solve with p₊.
         is_split: whether the two solves differ.
-        map: of the rows in the solve with p₋, where some push from another side; None if none ever does.
+        parts: of J, block by block, in the solve with p₋, where some push from another side; None where none ever does.
     """
 
     before: Float[Array, " rows"]
     after: Float[Array, " rows"]
     weight: Float[Array, ""]
     is_split: Bool[Array, ""]
-    map: RowMap | None
+    parts: tuple[RowMap | None, ...] | None
 
 
 class Partial(eqx.Module):
@@ -220,12 +220,15 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
         return None
     rows = assembly.joined(blocks)
     weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
-    if shares.map is None:
+    if shares.parts is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
-    turned = eqx.tree_at(lambda block: block.map, rows, shares.map)
+    turned = eqx.tree_at(lambda block: block.map, rows, rows.map.with_parts(shares.parts))
     references = [assembly.law(model, data.qvel, block)[0] for block in (rows, turned)]
-    maps = jax.tree.map(lambda *x: jnp.stack(x), rows.map, shares.map)
-    return Partial(Variant(weight, jnp.stack(references), maps), shares.weight, shares.is_split)
+    parts = tuple(
+        None if other is None else jax.tree.map(lambda *x: jnp.stack(x), block.map, other)
+        for block, other in zip(blocks, shares.parts, strict=True)
+    )
+    return Partial(Variant(weight, jnp.stack(references), parts), shares.weight, shares.is_split)
 
 
 def _firsts(block: Block) -> np.ndarray:
@@ -366,12 +369,12 @@ def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_S
     # Where it does not push from this side it does from the other; of both the larger share is left, less the smaller.
     turns = (present < 1) & is_split
     before, after = (jnp.where(turns, p - (1 - p) * whole, p) for p in (before, after))
-    maps, start = [], 0
+    parts, start = [], 0
     for block, side in zip(blocks, sides, strict=True):
         rows = slice(start, start + len(block.residual))
-        maps.append(block.map if side is None else _chosen(before[rows] < 0, side.map, block.map))
+        parts.append(None if side is None else _chosen(before[rows] < 0, side.map, block.map))
         start = rows.stop
-    return Shares(jnp.abs(before), jnp.where(after > 0, after, 0.0), weight, is_split, JoinedRows(tuple(maps)))
+    return Shares(jnp.abs(before), jnp.where(after > 0, after, 0.0), weight, is_split, tuple(parts))
 
 
 def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMap:

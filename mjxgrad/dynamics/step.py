@@ -27,7 +27,7 @@ from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.implicit import System, Variant
 from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
-from mjxgrad.dynamics.jacobian import DenseRows
+from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
 from mjxgrad.dynamics.known import is_known_to_be
 from mjxgrad.dynamics.onset import Onset, Partial, Shares
 from mjxgrad.smoothing import Smoothing
@@ -179,7 +179,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """
     layout, impl = assembly.row_layout(model, data), data._impl
     rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
-    entries = DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones))
+    entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
     active = jnp.ones(layout.num_rows, bool)
     system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
     return _minimum(model, data, layout, system, _start(model, data))
