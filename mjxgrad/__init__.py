@@ -1,9 +1,9 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
+from mjxgrad import baselines, diagnostics, estimators, integration, planning, render, smoothing, tasks
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
-from mjxgrad.dynamics import Onset, forward, solve, step
+from mjxgrad.dynamics import Onset, contact_force, forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -51,6 +51,7 @@ __all__ = [
     "check_stability",
     "check_trajectory",
     "closed_loop",
+    "contact_force",
     "diagnostics",
     "estimated_gradient",
     "estimators",
@@ -65,6 +66,7 @@ __all__ = [
     "over_devices",
     "parameter_noise",
     "planning",
+    "render",
     "rollout",
     "smoothing",
     "solve",

@@ -1,7 +1,13 @@
 """From a trajectory to frames to a video, offscreen."""
 
 import copy
+import functools
+import importlib
 import os
+import platform
+import subprocess
+import sys
+import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +15,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
 
 from mjxgrad.scene import Scene
 
@@ -26,7 +31,7 @@ def frames(
     scene: Scene | mujoco.MjModel,
     qpos: Float[np.ndarray, "states nq"] | Float[Array, "states nq"],
     *,
-    timestep: Number,
+    timestep: Number | None = None,
     fps: Number = 30.0,
     speed: Number = 1.0,
     height: int = 360,
@@ -42,7 +47,7 @@ def frames(
     Args:
         scene: what moves; a scene's complete C model is drawn, or a C model itself.
         qpos: the states, one per `timestep`, the first at time zero.
-        timestep: simulated time between two states, in s.
+        timestep: simulated time between two states, in s; None is the model's own.
         fps: frames per second of the video.
         speed: simulated over shown time; 0.25 is four times slower than real.
         height: in pixels.
@@ -59,6 +64,8 @@ def frames(
         RenderingUnavailableError: if there is no OpenGL.
     """
     mj_model = scene.mj_model if isinstance(scene, Scene) else scene
+    if timestep is None:
+        timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(qpos, dtype=np.float64)
     _check(mj_model, positions, timestep=timestep, fps=fps, speed=speed, height=height, width=width)
     mj_model = copy.copy(mj_model)
@@ -116,11 +123,14 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
 
     Raises:
         OSError: if the file cannot be written.
-        RuntimeError: if ffmpeg fails.
+        RuntimeError: if ffmpeg fails, or is not installed.
     """
     # Imported here, for mediapy brings IPython with it, and drawing needs neither.
-    import imageio_ffmpeg
-    import mediapy
+    try:
+        import imageio_ffmpeg
+        import mediapy
+    except ImportError as error:
+        raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
     path = Path(path)
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
@@ -161,7 +171,35 @@ def _free_camera(mj_model: mujoco.MjModel) -> mujoco.MjvCamera:
     return camera
 
 
+# A broken driver may end the process that tries it, so another one does.
+_PROBE = """
+import mujoco
+with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8) as renderer:
+    renderer.render()
+print("rendered")
+"""
+
+
+@functools.cache
+def _choose_opengl() -> None:
+    """Choose EGL or OSMesa, whichever works, where nobody chose and there is no display."""
+    chosen = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+    if chosen or platform.system() != "Linux":
+        return
+    for name in ("egl", "osmesa"):
+        environment = {**os.environ, "MUJOCO_GL": name}
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False, cwd=tempfile.gettempdir()
+        )
+        if b"rendered" in probe.stdout:
+            # MuJoCo chose while it was imported; to try that choice first would spoil the process for the others.
+            context = importlib.import_module(f"mujoco.{name}").GLContext
+            importlib.import_module("mujoco.rendering.classic.gl_context").GLContext = context
+            return
+
+
 def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    _choose_opengl()
     try:
         with warnings.catch_warnings():
             # glfw warns of what it is about to raise.
@@ -172,20 +210,20 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Rende
         reason = str(error).partition(",")[0] or type(error).__name__
         raise RenderingUnavailableError(
             "rendering needs an OpenGL that works without a display, and none was found: install libosmesa6 (draws on "
-            "the processor) or libegl1 (with a GPU's driver) and start Python with MUJOCO_GL=osmesa or MUJOCO_GL=egl; "
-            f"without a display MuJoCo said: {reason}"
+            f"the processor) or libegl1 (with a GPU's driver); MuJoCo said: {reason}"
         ) from error
 
 
 def _captioned(video: np.ndarray, caption: str) -> np.ndarray:
     """Put a band with a caption above every frame."""
+    # Pillow's own font lacks Greek letters; matplotlib brings one that has them, and Pillow.
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
     width = video.shape[2]
     size = max(11, width // 28)
     band = Image.new("RGB", (width, 2 * size), (24, 28, 36))
     draw = ImageDraw.Draw(band)
-    # Pillow's own font lacks Greek letters; matplotlib, which mediapy needs anyway, brings one that has them.
-    import matplotlib
-
     font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
     draw.text((width / 2, size), caption, font=font, fill=(238, 240, 244), anchor="mm")
     return np.concatenate([np.broadcast_to(np.asarray(band), (len(video), *np.asarray(band).shape)), video], axis=1)

@@ -99,6 +99,9 @@ def joints(state: State) -> Float[Array, " 6"]:
 
 def _path() -> Path:
     # Imported here: only this task needs it.
-    import gymnasium
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
 
     return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
