@@ -1,6 +1,7 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
+from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import Onset, forward, solve, step
@@ -27,7 +28,6 @@ from mjxgrad.rollout import (
 )
 from mjxgrad.scene import LeaveOut, Scene, load_scene
 from mjxgrad.smoothing import Smoothing
-from mjxgrad.softness import Softness
 
 __all__ = [
     "Convergence",

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.contact import Softness
 from mjxgrad.scene import SceneWarning, load_scene
-from mjxgrad.softness import Softness
 
 # Friction other than 1 and impedance that still rises at rest: neither factor of the rest depth is trivial.
 BALL = """

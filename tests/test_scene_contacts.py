@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import load_scene
 from mjxgrad.scene.contact_check import largest_stable_step
 

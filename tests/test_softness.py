@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjxgrad.contact import Softness
 from mjxgrad.scene import SceneWarning, load_scene
-from mjxgrad.softness import Softness
 
 # Nothing alike: formats, priorities, weights and an explicit pair.
 BALLS = """

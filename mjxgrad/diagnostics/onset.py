@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair
+from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.contact import contact_jacobian
 from mjxgrad.rollout import Trajectory

@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad._math import safe_norm
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.law import impedance
 from mjxgrad.dynamics import rotation, tree
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.contact import contact_jacobian
-from mjxgrad.dynamics.impedance import impedance
 from mjxgrad.dynamics.jacobian import DenseRows
 
 
@@ -46,7 +47,7 @@ def _block(
     return Block(
         map=DenseRows(jacobian.reshape(count * each, -1)),
         residual=flat,
-        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
+        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], safe_norm(residual))),
         solimp=spread(model.eq_solimp[ids]),
         inverse_weight=inverse_weight.reshape(-1),
         solref=spread(model.eq_solref[ids]),

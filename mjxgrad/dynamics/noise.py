@@ -31,10 +31,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly
+from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Noise, RowLayout
-from mjxgrad.dynamics.impedance import impedance
 from mjxgrad.smoothing import Kernel, Smoothing
 
 # Far below the stiffness of any contact (1/s²). Without stiffness noise on the distance does nothing, and c divides.
@@ -105,7 +104,7 @@ def _noisy(
     def spread(x: Array) -> Array:
         return jnp.repeat(x, each, axis=0, total_repeat_length=len(block.residual))
 
-    stiffness = assembly.stiffness_damping(model, block)[0][::each]
+    stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
     gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
     is_known = spread(known)

@@ -68,13 +68,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import safe_sqrt
+from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import other_sides, slot_geoms
 from mjxgrad.dynamics.contact import row_map
-from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import Variant
 from mjxgrad.dynamics.jacobian import RowMap
 
@@ -259,7 +259,7 @@ def _share(
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
     rate = _normal(block, rates)
-    stiffness, damping = (x[::each] for x in assembly.stiffness_damping(model, block))
+    stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     resistance = damping + safe_sqrt(stiffness)
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
     creep = gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))

@@ -12,13 +12,6 @@ from jaxtyping import Array, Float
 _SERIES = 1e-4
 
 
-def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Return the Euclidean norm over the last axis, with derivative zero at the zero vector."""
-    square = jnp.sum(x * x, axis=-1)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
 def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z)."""
     real = p[..., :1] * q[..., :1] - jnp.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)

@@ -19,6 +19,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
+from mjxgrad._static import is_known_to_be
 from mjxgrad.dynamics import assembly, events, factor, forces, implicit, noise, smooth
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.block import Block
@@ -28,7 +29,6 @@ from mjxgrad.dynamics.implicit import System, Variant
 from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
-from mjxgrad.dynamics.known import is_known_to_be
 from mjxgrad.dynamics.onset import Onset, Partial, Shares
 from mjxgrad.smoothing import Smoothing
 

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad.contacts import contact_parameters
+from mjxgrad.contact.law import impedance
+from mjxgrad.contact.parameters import contact_parameters
 from mjxgrad.dynamics import assembly, constraint, noise
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.impedance import impedance
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.scene import Scene
 from mjxgrad.smoothing.smoothing import Smoothing

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.smoothing.kernels import KERNELS, Kernel
 
 KernelName = Literal["gaussian", "logistic", "log_barrier"]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics.impedance import impedance, is_square
+from mjxgrad.contact.law import impedance, is_square
 
 PARABOLA = np.array([[0.9, 0.95, 0.001, 0.3, 2.0], [0.1, 0.99, 0.02, 0.5, 2.0]])
 

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair, contact_pairs, contact_parameters
-from mjxgrad.softness.knob import Softness
-from mjxgrad.softness.selection import is_known
+from mjxgrad._static import is_known
+from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
+from mjxgrad.contact.softness import Softness
 
 _ABOVE_NOTHING = 1e-6  # m; a body that hovers by less rests where it should
 

@@ -1,4 +1,4 @@
-r"""The knob: how soft contacts are, set alike on every pair of geoms that can touch.
+r"""How soft contacts are, set alike on every pair of geoms that can touch.
 
 MuJoCo's contact is a spring and damper in units of the contact's own mass, scaled by an
 impedance $d \in (0, 1)$: $a_\text{ref} = -B v - K d(r) r$, $K = k / d_w^2$, $B = b / d_w$. The
@@ -13,18 +13,24 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair, ContactParameters, contact_parameters, deciding_geoms, safe_sqrt
-from mjxgrad.resting import compensated_stiffness
-from mjxgrad.softness import selection
+from mjxgrad._static import is_known
+from mjxgrad.contact.law import compensated_stiffness
+from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters, deciding_geoms
 
 _PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
 _SUBSETS = ("geoms", "pairs", "bodies", "groups")
 # What is positive by nature is interpolated by ratios.
 _GEOMETRIC = ("stiffness", "width", "rest_acceleration")
+_Pairs = tuple[ContactPair, ...]
+# As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
+_WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
+_ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
 
 
 def _as_float(value: Any) -> Array:
@@ -46,7 +52,7 @@ class Softness(eqx.Module):
 
     A margin moves the place where force begins away from the surface, and with it the place of rest: bodies hover by
     the margin less their depth. `rest_acceleration` gives the height back, exactly under one load, by a softer
-    spring, $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`mjxgrad.resting` for any). Shrinking the geoms by
+    spring, $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Shrinking the geoms by
     the margin would undo it, for a margin is nothing but larger geoms; a lower impedance runs out at $d = 0$
     where $k m > a_0$. The price: n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
 
@@ -100,7 +106,7 @@ class Softness(eqx.Module):
             ("rest_acceleration", lambda x: x > 0, "positive"),
         ):
             value = getattr(self, name)
-            if selection.is_known(value) and not np.all(is_valid(np.asarray(value))):
+            if is_known(value) and not np.all(is_valid(np.asarray(value))):
                 raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
 
     @classmethod
@@ -179,7 +185,7 @@ class Softness(eqx.Module):
         Raises:
             ValueError: if a name is unknown or can touch nothing.
         """
-        return selection.select(model, geoms=self.geoms, pairs=self.pairs, bodies=self.bodies, groups=self.groups)
+        return _select(model, geoms=self.geoms, pairs=self.pairs, bodies=self.bodies, groups=self.groups)
 
     def apply(self, model: mjx.Model) -> mjx.Model:
         r"""Write this softness into a model.
@@ -208,7 +214,7 @@ class Softness(eqx.Module):
             model = self._set_margin(model, selected, list(explicit))
         if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
             return model
-        selection.refuse_shared_geoms(model, selected)
+        _refuse_shared_geoms(model, selected)
         # For each place to be written, the pair that it belongs to.
         geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
 
@@ -227,12 +233,12 @@ class Softness(eqx.Module):
 
     def _solref(self, model: mjx.Model, pairs: tuple[ContactPair, ...], before: ContactParameters) -> Array:
         """The direct format for each pair, from a model that has the other parts."""
-        refuse = functools.partial(selection.refuse_disagreement, model, pairs)
+        refuse = functools.partial(_refuse_disagreement, model, pairs)
         stiffness, damping_ratio = self.stiffness, self.damping_ratio
         if stiffness is None:
             stiffness = before.stiffness
             refuse(stiffness, "stiffness", "give Softness a stiffness")
-            if self.rest_acceleration is not None and selection.is_known(before.margin) and np.any(before.margin):
+            if self.rest_acceleration is not None and is_known(before.margin) and np.any(before.margin):
                 raise ValueError(
                     "stiffness must be given with rest_acceleration where contacts have a margin already, got none; their "
                     "present stiffness may have been made for that margin"
@@ -252,7 +258,7 @@ class Softness(eqx.Module):
 
     def _set_margin(self, model: mjx.Model, pairs: tuple[ContactPair, ...], explicit: list[int]) -> mjx.Model:
         """Write the margin to explicit pairs, and share it among the geoms of the others."""
-        geoms, shares, kept = selection.margin_shares(model, pairs)
+        geoms, shares, kept = _margin_shares(model, pairs)
         geom_margin, pair_margin = model.geom_margin, model.pair_margin
         if geoms.size:
             missing = self.margin - kept @ geom_margin
@@ -285,3 +291,153 @@ def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
     if not places:
         return values
     return values.at[np.array(list(places))].set(per_pair[np.array(list(places.values()))])
+
+
+def _select(
+    model: mjx.Model,
+    *,
+    geoms: tuple[str, ...] | None = None,
+    pairs: tuple[tuple[str, str], ...] | None = None,
+    bodies: tuple[str, ...] | None = None,
+    groups: tuple[int, ...] | None = None,
+) -> _Pairs:
+    """Give the pairs that are named in one of four ways; all of them without a name.
+
+    Args:
+        model: of MJX.
+        geoms: pairs with at least one of these geoms.
+        pairs: exactly these.
+        bodies: pairs with at least one geom of these bodies.
+        groups: pairs with at least one geom of these groups, MJCF's `group`.
+
+    Raises:
+        ValueError: if a name is unknown or can touch nothing.
+    """
+    everything = contact_pairs(model)
+    if pairs is not None:
+        known = {frozenset(pair.names) for pair in everything}
+        for names in pairs:
+            if frozenset(names) not in known:
+                raise ValueError(
+                    f"softness.pairs must name pairs of geoms that can touch, got {names!r}; "
+                    f"those that can: {', '.join(str(p) for p in everything) or 'none'}"
+                )
+        wanted = {frozenset(names) for names in pairs}
+        return tuple(p for p in everything if frozenset(p.names) in wanted)
+    if geoms is not None:
+        return _with_any(everything, "geoms", geoms, [set(pair.names) for pair in everything])
+    if bodies is not None:
+        return _with_any(everything, "bodies", bodies, [_body_names(model, pair) for pair in everything])
+    if groups is not None:
+        members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
+        return _with_any(everything, "groups", groups, members)
+    return everything
+
+
+def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
+    """Refuse to change pairs whose geoms also decide the contact of others.
+
+    Raises:
+        ValueError: naming both pairs and the geom.
+    """
+    decided_by = {geom: pair for pair in selected for geom in deciding_geoms(model, pair)}
+    for other in contact_pairs(model):
+        if other in selected:
+            continue
+        for geom in deciding_geoms(model, other):
+            if geom in decided_by:
+                raise ValueError(_shared(decided_by[geom], other, geom))
+
+
+def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part: str, remedy: str) -> None:
+    """Refuse to write one value per pair where pairs with different ones share a geom; not looked at if traced.
+
+    Raises:
+        ValueError: naming both pairs and their values.
+    """
+    if not is_known(values):
+        return
+    known, first = np.asarray(values), {}
+    for i, pair in enumerate(selected):
+        for geom in deciding_geoms(model, pair):
+            j = first.setdefault(geom, i)
+            if not np.isclose(known[i], known[j], rtol=1e-5):
+                raise ValueError(
+                    f"{part} must be given, or be the same now in the pairs {selected[j]} and "
+                    f"{pair}, which share a geom, got {known[j]:.4g} and {known[i]:.4g}; {remedy}"
+                )
+
+
+def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    r"""Say how a margin of pairs becomes margins of geoms, which MuJoCo adds, and leaves other pairs alone.
+
+    A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
+    each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair.
+
+    Args:
+        model: of MJX.
+        selected: the pairs; those with parameters of their own have no part in it.
+
+    Returns:
+        The geoms to write; the matrix from what each pair misses to their margins; the matrix P over all geoms.
+
+    Raises:
+        ValueError: if the margins of the pairs cannot be set without those of others, or a geom is a mesh or height field,
+            for which MJX computes no distances.
+    """
+    for pair in selected:
+        if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
+            raise ValueError(
+                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only where "
+                "they touch; select other pairs, or replace the mesh by primitive geoms"
+            )
+    implicit = [pair for pair in selected if pair.explicit < 0]
+    others = [pair for pair in contact_pairs(model) if pair.explicit < 0 and pair not in selected]
+    taken = {geom: other for other in others for geom in (other.geom1, other.geom2)}
+    free = sorted({geom for pair in implicit for geom in (pair.geom1, pair.geom2)} - taken.keys())
+    column = {geom: i for i, geom in enumerate(free)}
+    shares, kept = np.zeros((len(implicit), len(free))), np.zeros((len(implicit), model.ngeom))
+    for row, pair in enumerate(implicit):
+        for geom in (pair.geom1, pair.geom2):
+            if geom in column:
+                shares[row, column[geom]] += 1
+            else:
+                kept[row, geom] += 1
+        if not shares[row].any():
+            raise ValueError(_shared(pair, taken[pair.geom1], pair.geom1))
+    solution = np.linalg.pinv(shares)
+    # Whether they can be met must not depend on values, which may be traced: every right-hand side has to be in reach.
+    wanted = np.column_stack([np.ones(len(implicit)), kept])
+    unmet = np.abs(shares @ solution @ wanted - wanted).max(axis=1, initial=0.0)
+    if unmet.max(initial=0.0) > _ROUNDING:
+        row = int(np.argmax(unmet))
+        raise ValueError(
+            f"margin of the pair {implicit[row]} cannot be set while geoms that it shares with others keep theirs; select "
+            "all pairs of these geoms, or list the pair as <pair> in the MJCF's <contact>"
+        )
+    return np.array(free, dtype=int), solution, kept
+
+
+def _with_any(everything: _Pairs, kind: str, wanted: tuple, members: list[set]) -> _Pairs:
+    known = set().union(*members)
+    for one in wanted:
+        if one not in known:
+            raise ValueError(
+                f"softness.{kind} must name {kind} that can touch another, got {one!r}; "
+                f"those that can: {', '.join(str(x) for x in sorted(known)) or 'none'}"
+            )
+    return tuple(pair for pair, names in zip(everything, members, strict=True) if names & set(wanted))
+
+
+def _body_names(model: mjx.Model, pair: ContactPair) -> set[str]:
+    bodies = {int(model.geom_bodyid[geom]) for geom in (pair.geom1, pair.geom2)}
+    return {mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}" for body in bodies}
+
+
+def _shared(pair: ContactPair, other: ContactPair, geom: int) -> str:
+    name = other.names[0] if geom == other.geom1 else other.names[1]
+    return (
+        f"softness of the pair {pair} would also change the pair {other}, "
+        f"which shares the geom {name!r}; select that pair too, or list one of "
+        f"the two as <pair> in the MJCF's <contact> so that it has its own parameters"
+    )

@@ -9,7 +9,7 @@ reference acceleration of a contact at distance $r < 0$, measured from its margi
 $a_\text{ref} = -B v - K d(r) r$ with $K = k / d_w^2$ and $B = b / d_w$. Here $k = \omega_0^2$ is
 the stiffness and $b$ the damping, both per unit of the contact's effective mass: at full
 impedance the contact is the oscillator $\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being
-the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$; `mjxgrad.resting` has other profiles.
+the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$; `contact.law` has other profiles.
 
 References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
@@ -23,8 +23,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import geom_pairs, mjx
-from mjxgrad.resting import rest_depth
+from mjxgrad.contact.law import rest_depth, stiffness_damping
 
 _DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
@@ -62,7 +63,7 @@ class ContactParameters(eqx.Module):
         width: penetration over which the impedance rises, in m.
         friction: two sliding, one torsional (m) and two rolling (m) coefficients.
         margin: distance at which contact begins, in m.
-        pyramid: $c$ of `mjxgrad.resting`, by which the normal direction of a pyramid yields more or less; else 1.
+        pyramid: $c$ of `contact.law`, by which the normal direction of a pyramid yields more or less; else 1.
         solref: as MuJoCo mixes it, before `refsafe` and before formats are resolved.
         solimp: as MuJoCo mixes it, before it is clamped.
         timestep: of the model, in s.
@@ -105,7 +106,7 @@ class ContactParameters(eqx.Module):
 
         Args:
             acceleration: $a_0$ at which the bodies would approach without contact, in m/s²; for one body on the ground
-                gravity's, for a stack of n alike n times that. See `mjxgrad.resting` for when this is exact.
+                gravity's, for a stack of n alike n times that. See `contact.law` for when this is exact.
 
         Returns:
             One depth per pair, in m.
@@ -119,12 +120,6 @@ class ContactParameters(eqx.Module):
             acceleration: as for `rest_depth`.
         """
         return self.margin - self.rest_depth(acceleration)
-
-
-def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root whose derivative at zero is zero instead of infinite."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
@@ -184,7 +179,7 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
     """
     pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)
-    stiffness, damping = resolve_solref(model, solref)
+    stiffness, damping = stiffness_damping(model, solref)
     low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
     return ContactParameters(
         stiffness=stiffness,
@@ -262,17 +257,3 @@ def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array
     neither = (solmix1 < smallest) & (solmix2 < smallest)
     total = jnp.where(neither, 1.0, solmix1 + solmix2)
     return jnp.select([neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total)
-
-
-def resolve_solref(model: mjx.Model, solref: Array) -> tuple[Array, Array]:
-    """Give stiffness (1/s²) and damping (1/s) of rows of `solref`, of either format, after `refsafe`."""
-    time_constant, damping_ratio = solref[:, 0], solref[:, 1]
-    if not int(model.opt.disableflags) & mujoco.mjtDisableBit.mjDSBL_REFSAFE.value:
-        time_constant = jnp.maximum(time_constant, 2 * model.opt.timestep)
-    is_standard = solref[:, 0] > 0
-    # The branch not taken must stay finite, or its derivative poisons the other one.
-    time_constant = jnp.where(is_standard, time_constant, 1.0)
-    damping_ratio = jnp.where(is_standard, damping_ratio, 1.0)
-    stiffness = jnp.where(is_standard, (time_constant * damping_ratio) ** -2, -solref[:, 0])
-    damping = jnp.where(is_standard, 2.0 / time_constant, -solref[:, 1])
-    return stiffness, damping

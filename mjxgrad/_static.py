@@ -11,6 +11,14 @@ def known(values: Any) -> np.ndarray | None:
     return None if isinstance(values, jax.core.Tracer) else np.asarray(values)
 
 
+def is_known(value: Any) -> bool:
+    """Return whether this is an array that can be looked at.
+
+    Trees of other things than numbers (axes of vmap, shapes) go through the same constructors.
+    """
+    return isinstance(value, jax.Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
+
+
 def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> bool:
     """Return whether all numbers of an array, or of one of its columns, are known, and are this one."""
     found = known(values)
