@@ -1,10 +1,10 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, integration, planning, smoothing, tasks
+from mjxgrad import baselines, diagnostics, estimators, integration, planning, tasks
 from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
-from mjxgrad.dynamics import Onset, forward, solve, step
+from mjxgrad.dynamics import Onset, Smoothing, forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -27,7 +27,6 @@ from mjxgrad.rollout import (
     rollout,
 )
 from mjxgrad.scene import LeaveOut, Scene, load_scene
-from mjxgrad.smoothing import Smoothing
 
 __all__ = [
     "Convergence",
@@ -66,7 +65,6 @@ __all__ = [
     "parameter_noise",
     "planning",
     "rollout",
-    "smoothing",
     "solve",
     "step",
     "tasks",

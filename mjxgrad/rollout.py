@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import Gradient, Onset, check_gradient, forward, step
+from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene, SceneWarning
-from mjxgrad.smoothing import Smoothing, smoothing_warnings
 
 Policy = Callable[[PyTree, "State"], Float[Array, " nu"]]
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]

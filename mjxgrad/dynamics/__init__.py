@@ -1,6 +1,7 @@
 """One step that can be differentiated."""
 
 from mjxgrad.dynamics.onset import Onset
+from mjxgrad.dynamics.smoothing import Smoothing, smoothing_warnings
 from mjxgrad.dynamics.step import Gradient, check_gradient, forward, solve, step
 
-__all__ = ["Gradient", "Onset", "check_gradient", "forward", "solve", "step"]
+__all__ = ["Gradient", "Onset", "Smoothing", "check_gradient", "forward", "smoothing_warnings", "solve", "step"]

@@ -33,8 +33,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad.dynamics.kernels import Kernel
 from mjxgrad.dynamics.linear import add, sum_of_few
-from mjxgrad.smoothing.kernels import Kernel
 
 
 @dataclasses.dataclass(frozen=True)

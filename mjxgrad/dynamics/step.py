@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known_to_be
-from mjxgrad.dynamics import assembly, events, factor, forces, implicit, noise, smooth
+from mjxgrad.dynamics import assembly, events, factor, forces, implicit, smooth
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
@@ -30,7 +30,7 @@ from mjxgrad.dynamics.inertia import Inertia, inertia_of
 from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
 from mjxgrad.dynamics.onset import Onset, Partial, Shares
-from mjxgrad.smoothing import Smoothing
+from mjxgrad.dynamics.smoothing import Smoothing, smoothed
 
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
@@ -216,7 +216,7 @@ def _smoothed_solve(
     """
     is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
-    blocks, uncertain, layout = noise.smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
+    blocks, uncertain, layout = smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
     partial = onsets.partial(model, data, blocks if is_forward else begun, shares)
     if uncertain is None or not model.nv:
         return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)

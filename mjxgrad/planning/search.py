@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad.planning.smoothers import Smoother
+from mjxgrad.planning.models import Smoother
+from mjxgrad.planning.system import System
 from mjxgrad.planning.tree import Nodes, Reach, lineage, planted, reach
-from mjxgrad.smoothing.system import System
 from mjxgrad.task import as_pytree
 
 # Kinds of samples: a pose of what the goal is about, wherever the rest may be; or all positions.

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.smoothing.linear_model import LinearModel
-from mjxgrad.smoothing.system import System
+from mjxgrad.planning.linear_model import LinearModel
+from mjxgrad.planning.system import System
 
 
 class Reach(eqx.Module):

@@ -16,11 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad.contact import Softness
-from mjxgrad.dynamics import Gradient, Onset, check_gradient
+from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.smoothing.smoothing import Smoothing
 from mjxgrad.task import finite_cost
 from mjxgrad.tasks.files import scene_path
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad.smoothing.system import System
+from mjxgrad.planning.system import System
 
 
 class LinearModel(eqx.Module):

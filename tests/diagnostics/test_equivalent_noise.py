@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.smoothing.probe import contact_profile, probe
-from tests.smoothing.test_kernels import DISTRIBUTIONS
+from mjxgrad.diagnostics.equivalent_noise import contact_profile, probe
+from tests.dynamics.test_kernels import DISTRIBUTIONS
 
 SCENE = """<mujoco><worldbody><geom type="plane" size="5 5 .1" solimp="{0}" margin="{1}"/>
   <body pos="0 0 1"><freejoint/><geom size=".1" solimp="{0}"/></body></worldbody></mujoco>"""

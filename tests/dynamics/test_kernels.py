@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from mjxgrad.smoothing import KERNELS
+from mjxgrad.dynamics.kernels import KERNELS
 
 kernels = pytest.mark.parametrize("name", list(KERNELS))
 POINTS = np.array([-6.0, -1.3, -0.2, 0.0, 0.7, 2.1, 5.0])

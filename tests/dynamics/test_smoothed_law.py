@@ -9,8 +9,8 @@ import pytest
 
 from mjxgrad.dynamics import constraint
 from mjxgrad.dynamics.constraint import ConeGroup, Noise, RowLayout, Rows
-from mjxgrad.smoothing import KERNELS
-from tests.smoothing.test_kernels import DISTRIBUTIONS
+from mjxgrad.dynamics.kernels import KERNELS
+from tests.dynamics.test_kernels import DISTRIBUTIONS
 
 kernels = pytest.mark.parametrize("name", list(KERNELS))
 LENGTH, RATE = 2e-3, 900.0  # m, 1/s²

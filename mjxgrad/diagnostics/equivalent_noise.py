@@ -20,12 +20,12 @@ from jaxtyping import Array, Float
 
 from mjxgrad.contact.law import impedance
 from mjxgrad.contact.parameters import contact_parameters
-from mjxgrad.dynamics import assembly, constraint, noise
+from mjxgrad.dynamics import assembly, constraint
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import DenseRows
+from mjxgrad.dynamics.smoothing import Smoothing, noisy_rows
 from mjxgrad.scene import Scene
-from mjxgrad.smoothing.smoothing import Smoothing
 
 Profile = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 _ForceAt = Callable[[np.ndarray], np.ndarray]
@@ -161,7 +161,7 @@ def contact_profile(
         )
         layout, row_noise = RowLayout(0, 0, len(distance)), None
         if smoothing is not None:
-            block, row_noise, layout = noise.noisy_rows(scene.model, block, smoothing, layout)
+            block, row_noise, layout = noisy_rows(scene.model, block, smoothing, layout)
         reference, weight = assembly.law(scene.model, jnp.zeros(1, distance.dtype), block)
         rows = Rows(reference, weight, zero, (), row_noise)
         return constraint.force(layout, rows, jnp.where(block.is_active, acceleration, 0.0) - reference)

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from mjxgrad.smoothing import Smoothing, linear_model
-from mjxgrad.smoothing.linear_model import LinearModel
-from mjxgrad.smoothing.system import System
+from mjxgrad.dynamics import Smoothing
+from mjxgrad.planning import linear_model
+from mjxgrad.planning.linear_model import LinearModel
+from mjxgrad.planning.system import System
 
 
 class Smoother(eqx.Module):

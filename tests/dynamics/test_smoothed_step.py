@@ -12,10 +12,11 @@ from scipy import optimize
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import smoothing_warnings
+from mjxgrad.dynamics.kernels import KERNELS
 from mjxgrad.scene import SceneWarning
-from mjxgrad.smoothing import KERNELS, smoothing_warnings
-from tests.smoothing.test_kernels import DISTRIBUTIONS
-from tests.smoothing.test_law import _nodes
+from tests.dynamics.test_kernels import DISTRIBUTIONS
+from tests.dynamics.test_smoothed_law import _nodes
 
 # A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
 SCENE = """<mujoco><option timestep="0.002" cone="{cone}" tolerance="1e-13" iterations="100"/><worldbody>
