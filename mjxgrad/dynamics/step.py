@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known_to_be
-from mjxgrad.dynamics import assembly, events, factor, forces, implicit, smooth
+from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
@@ -292,11 +292,11 @@ def _minimum(
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     """Run the stages up to the unconstrained acceleration and gather the rows; tendons and cameras are MJX's."""
-    data = smooth.com_pos(model, smooth.kinematics(model, data))
+    data = kinematics.com_pos(model, kinematics.kinematics(model, data))
     data = mjx.camlight(model, data)
     if model.ntendon:
         data = mjx.tendon(model, data)
-    data = smooth.crb(model, data)
+    data = kinematics.crb(model, data)
     if model.ntendon:
         data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
@@ -319,7 +319,7 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     ):
         return data.qacc
     damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
-    slowed = factor.solve_positive_definite(
+    slowed = cholesky.solve_positive_definite(
         inertia.matrix + jnp.diag(damping), damping * data.qacc, lambda x: inertia.apply(x) + damping * x
     )
     return data.qacc - slowed
@@ -331,7 +331,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " n
     if derivative is None:
         return data.qacc
     mass = mjx.full_m(model, data) - model.opt.timestep * derivative
-    return factor.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+    return cholesky.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
 
 
 def _advance(

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import factor
+from mjxgrad.dynamics import cholesky
 
 _WAYS = {
-    "written out": factor.written_out,
-    "kernel": functools.partial(factor.in_one_kernel, interpret=jax.default_backend() != "gpu"),
-    "chosen": factor.cholesky_solve,
+    "written out": cholesky.written_out,
+    "kernel": functools.partial(cholesky.in_one_kernel, interpret=jax.default_backend() != "gpu"),
+    "chosen": cholesky.cholesky_solve,
 }
 
 
@@ -48,6 +48,6 @@ def test_an_indefinite_member_is_not_finite_and_its_neighbour_is_right(way):
 def test_a_gpu_is_given_one_kernel_and_the_cpu_beside_it_none(monkeypatch):
     monkeypatch.setattr(factor, "_has_kernels", lambda: True)
     matrices, vectors = _systems(5, 4)
-    traced = jax.jit(factor.cholesky_solve).trace(jnp.moveaxis(matrices, 0, -1), vectors.T)
+    traced = jax.jit(cholesky.cholesky_solve).trace(jnp.moveaxis(matrices, 0, -1), vectors.T)
     count = {name: traced.lower(lowering_platforms=(name,)).as_text().count("gpu.triton") for name in ("cuda", "cpu")}
     assert count == {"cuda": 1, "cpu": 0}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import forces, smooth
+from mjxgrad.dynamics import forces, kinematics
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 # Sums of some tens of products of numbers of order one, in another order than the reference takes them.
@@ -120,8 +120,8 @@ def random_state(model):
 
 def run(model, data):
     """All stages, in the order of a step."""
-    data = smooth.com_pos(model, smooth.kinematics(model, data))
-    data = forces.transmission(model, smooth.crb(model, data))
+    data = kinematics.com_pos(model, kinematics.kinematics(model, data))
+    data = forces.transmission(model, kinematics.crb(model, data))
     data = forces.fwd_actuation(model, forces.fwd_velocity(model, data))
     return forces.fwd_acceleration(model, data)
 
