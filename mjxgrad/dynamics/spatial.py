@@ -158,7 +158,8 @@ def cross(a: Float[Array, "n 3"], b: Float[Array, "n 3"]) -> Float[Array, "n 3"]
 
 def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z); leading axes of any number are broadcast."""
-    return _multiply(*jnp.broadcast_arrays(p, q))
+    dtype = jnp.result_type(p, q)
+    return _multiply(*jnp.broadcast_arrays(jnp.asarray(p, dtype), jnp.asarray(q, dtype)))
 
 
 def rotation_matrix(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
