@@ -54,5 +54,5 @@ def test_any_part_can_be_imported_first():
     graph = {m: {t for t in _imported(m, only_on_loading=True) if t in MODULES} - {m} for m in MODULES}
     for module, targets in graph.items():
         around = {t.rsplit(".", i)[0] for t in targets for i in range(1, t.count(".") + 1)}
-        targets |= {a for a in around if not module.startswith(a)}
+        targets |= {a for a in around if not f"{module}.".startswith(f"{a}.")}
     graphlib.TopologicalSorter(graph).prepare()
