@@ -2,6 +2,6 @@
 
 from mjxgrad.dynamics.onset import Onset
 from mjxgrad.dynamics.smoothing import Smoothing, smoothing_warnings
-from mjxgrad.dynamics.step import Gradient, check_gradient, forward, solve, step
+from mjxgrad.dynamics.stepping import Gradient, check_gradient, forward, solve, step
 
 __all__ = ["Gradient", "Onset", "Smoothing", "check_gradient", "forward", "smoothing_warnings", "solve", "step"]

@@ -3,9 +3,9 @@
 from mjxgrad.planning.cost import Cost, GoalCost
 from mjxgrad.planning.linear_model import LinearModel
 from mjxgrad.planning.models import Analytic, Exact, Sampled, Smoother
-from mjxgrad.planning.search import Path, Sampling, Search, path, search
 from mjxgrad.planning.system import FunctionSystem, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
+from mjxgrad.planning.tree import Path, Sampling, Search, path, search
 
 __all__ = [
     "Analytic",
