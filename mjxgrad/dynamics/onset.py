@@ -70,6 +70,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
+from mjxgrad._static import is_known
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly
 from mjxgrad.dynamics.block import Block
@@ -111,7 +112,7 @@ class Onset(eqx.Module):
         Raises:
             ValueError: if the width is negative or not finite.
         """
-        if isinstance(self.width, jax.Array | np.ndarray) and not isinstance(self.width, jax.core.Tracer):
+        if is_known(self.width):
             known = np.asarray(self.width)
             if not np.all((known >= 0) & np.isfinite(known)):
                 raise ValueError(
