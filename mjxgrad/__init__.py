@@ -1,6 +1,14 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import baselines, diagnostics, estimators, integration, planning, tasks
+from mjxgrad._rollout import (
+    DivergedError,
+    State,
+    Trajectory,
+    check_trajectory,
+    initial_state,
+    rollout,
+)
 from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
@@ -18,14 +26,6 @@ from mjxgrad.optimiser import (
     optimise,
 )
 from mjxgrad.policy import linear_policy, mlp_policy
-from mjxgrad.rollout import (
-    DivergedError,
-    State,
-    Trajectory,
-    check_trajectory,
-    initial_state,
-    rollout,
-)
 from mjxgrad.scene import LeaveOut, Scene, load_scene
 
 __all__ = [

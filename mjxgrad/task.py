@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
+from mjxgrad._rollout import State, Trajectory, rollout
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
-from mjxgrad.rollout import State, Trajectory, rollout
 from mjxgrad.scene import Scene
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]

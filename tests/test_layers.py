@@ -14,7 +14,7 @@ ORDER = (
     ("contact",),
     ("dynamics",),
     ("scene",),
-    ("rollout",),
+    ("_rollout",),
     ("task",),
     ("objective", "policy"),
     ("estimators",),

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from mjxgrad._rollout import initial_state
 from mjxgrad.planning.system import SceneSystem
-from mjxgrad.rollout import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 
