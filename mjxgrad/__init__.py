@@ -1,9 +1,18 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, integration, planning, render, smoothing, tasks
+from mjxgrad import baselines, diagnostics, estimators, integration, planning, render, tasks
+from mjxgrad._rollout import (
+    DivergedError,
+    State,
+    Trajectory,
+    check_trajectory,
+    initial_state,
+    rollout,
+)
+from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
-from mjxgrad.dynamics import Onset, contact_force, forward, solve, step
+from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -17,17 +26,7 @@ from mjxgrad.optimiser import (
     optimise,
 )
 from mjxgrad.policy import linear_policy, mlp_policy
-from mjxgrad.rollout import (
-    DivergedError,
-    State,
-    Trajectory,
-    check_trajectory,
-    initial_state,
-    rollout,
-)
 from mjxgrad.scene import LeaveOut, Scene, load_scene
-from mjxgrad.smoothing import Smoothing
-from mjxgrad.softness import Softness
 
 __all__ = [
     "Convergence",
@@ -68,7 +67,6 @@ __all__ = [
     "planning",
     "render",
     "rollout",
-    "smoothing",
     "solve",
     "step",
     "tasks",

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import Gradient, Onset, check_gradient
-from mjxgrad.rollout import State, Trajectory, rollout
+from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
-from mjxgrad.smoothing import Smoothing
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 

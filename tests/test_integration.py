@@ -12,7 +12,7 @@ from mjxgrad.integration import adaptive_rollout, substepped_rollout
 pytest.importorskip("diffrax")
 
 RADIUS, STEP, HORIZON = 0.05, 2e-3, 100
-# A constant impedance of 0.9 and critical damping: the ball comes back with e⁻² of its speed (tests of textbook.bounce).
+# A constant impedance of 0.9 and critical damping: the ball comes back with e⁻² of its speed (tests of contact.bounce).
 BALL = f"""
 <mujoco>
   <option gravity="0 0 0" timestep="{STEP}"/>
@@ -51,7 +51,7 @@ def thrown(scene, height):
 
 
 def closed_form(height):
-    """Height at 0.2 s: contact takes 2 t_c = 40 ms at critical damping and constant impedance (facts of textbook.bounce)."""
+    """Height at 0.2 s: contact takes 2 t_c = 40 ms at critical damping and constant impedance (facts of contact.bounce)."""
     bounce = mg.tasks.textbook.Bounce(time_constant=0.02, damping_ratio=1.0)
     return bounce.height(height, HORIZON * STEP)
 

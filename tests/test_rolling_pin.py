@@ -12,7 +12,7 @@ import mjxgrad as mg
 from experiments.rolling_pin.outcome import Descent, Outcome
 from experiments.rolling_pin.settings import RollingPinSettings
 from experiments.rolling_pin.verdict import findings, table, verdict
-from mjxgrad.smoothing import Smoothing
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.rolling_pin import DENT, DEPTH, rolling_pin
 
 HORIZON = 40

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.masks import TooManyMasksError, keep_pairs
 from mjxgrad.scene.separation import proven_distance
 from mjxgrad.scene.volume import rotation_matrix, volume_of

@@ -4,8 +4,8 @@ import jax
 import pytest
 from scipy.optimize import brentq
 
+from mjxgrad.contact import Softness
 from mjxgrad.scene import load_scene
-from mjxgrad.softness import Softness
 
 BALL_WALL = """
 <mujoco>

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjxgrad._rollout import rollout
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
-from mjxgrad.rollout import rollout
 from mjxgrad.tasks import friction, motion_planning, push, push_softness, tennis
 from mjxgrad.tasks.files import scene_path
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 import mjxgrad as mg
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.leave_out import omit
 from mjxgrad.scene.omissions import switch_off
 

@@ -14,7 +14,7 @@ from experiments.billiards import hard
 from experiments.billiards.outcome import Outcome, Run
 from experiments.billiards.settings import BilliardsSettings, MethodSettings
 from experiments.workspace import Workspace
-from mjxgrad.smoothing.smoothing import Smoothing
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.billiards import Billiards, billiards
 
 

@@ -16,8 +16,8 @@ from experiments.cube_toss.settings import CubeTossSettings
 from experiments.failure import ExperimentError
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
+from mjxgrad._rollout import data_of
 from mjxgrad.integration import adaptive_rollout, substepped_step
-from mjxgrad.rollout import data_of
 from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 
 # Half the step of the reference's difference quotient (m/s), and its tolerance.

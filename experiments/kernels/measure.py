@@ -10,8 +10,8 @@ import mjxgrad as mg
 from experiments.kernels.outcome import Linear, Motion, Outcome, Profile
 from experiments.kernels.settings import KernelsSettings
 from experiments.workspace import Workspace
-from mjxgrad.smoothing import KERNELS
-from mjxgrad.smoothing.probe import contact_profile, probe
+from mjxgrad.diagnostics.equivalent_noise import contact_profile, probe
+from mjxgrad.dynamics.kernels import KERNELS
 
 # A ball on a slide joint over a plane, without gravity, driven by a force.
 _SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" tolerance="1e-12"/>

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.kernels.settings import KernelsSettings
-from mjxgrad.smoothing.probe import EquivalentNoise
+from mjxgrad.diagnostics.equivalent_noise import EquivalentNoise
 
 TITLES = {"gaussian": "Gaussian", "logistic": "logistic", "log_barrier": "log barrier"}
 # Derivatives of the velocity after a step, and what they are by: two entries of A and the one of B.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 import mjxgrad as mg
-from mjxgrad.rollout import State, data_of, state_of
+from mjxgrad._rollout import State, data_of, state_of
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.hopper import hopper
 

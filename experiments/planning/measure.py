@@ -11,6 +11,7 @@ import mjxgrad as mg
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import PlanningSettings
 from experiments.workspace import Workspace
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import (
     Analytic,
     Exact,
@@ -23,7 +24,6 @@ from mjxgrad.planning import (
     path,
     search,
 )
-from mjxgrad.smoothing import Smoothing
 from mjxgrad.tasks.planar_pusher import PlanarPusher, beside_rod, planar_pusher
 
 # Weights of the rod's x, y and turn; a turn of 0.17 rad counts as much as 0.03 m.

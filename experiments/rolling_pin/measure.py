@@ -15,7 +15,7 @@ import mjxgrad as mg
 from experiments.rolling_pin.outcome import Descent, Outcome
 from experiments.rolling_pin.settings import RollingPinSettings
 from experiments.workspace import Workspace
-from mjxgrad.smoothing import Smoothing
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.rolling_pin import STIFFNESS, RollingPin, rolling_pin
 
 

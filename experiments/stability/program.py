@@ -14,8 +14,8 @@ import mjxgrad as mg
 from experiments.stability.reference import Course, unbalanced
 from experiments.stability.scenes import StabilityScene
 from mjxgrad._mjx import mjx
+from mjxgrad._rollout import Observe, Trajectory
 from mjxgrad.dynamics import Gradient
-from mjxgrad.rollout import Observe, Trajectory
 
 
 class Steps(eqx.Module):

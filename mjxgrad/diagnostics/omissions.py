@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from mjxgrad.contacts import contact_pairs
-from mjxgrad.rollout import Trajectory
+from mjxgrad._rollout import Trajectory
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import LeaveOut, Scene
 from mjxgrad.scene.refusals import element_name
 

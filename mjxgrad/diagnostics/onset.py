@@ -37,10 +37,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair
+from mjxgrad._rollout import Trajectory
+from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.contact import contact_jacobian
-from mjxgrad.rollout import Trajectory
 from mjxgrad.scene import Scene
 
 STEPS_NEEDED = 2.0

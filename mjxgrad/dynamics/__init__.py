@@ -2,6 +2,17 @@
 
 from mjxgrad.dynamics.contact_forces import contact_force
 from mjxgrad.dynamics.onset import Onset
-from mjxgrad.dynamics.step import Gradient, check_gradient, forward, solve, step
+from mjxgrad.dynamics.smoothing import Smoothing, smoothing_warnings
+from mjxgrad.dynamics.stepping import Gradient, check_gradient, forward, solve, step
 
-__all__ = ["Gradient", "Onset", "check_gradient", "contact_force", "forward", "solve", "step"]
+__all__ = [
+    "Gradient",
+    "Onset",
+    "Smoothing",
+    "check_gradient",
+    "contact_force",
+    "forward",
+    "smoothing_warnings",
+    "solve",
+    "step",
+]

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.dynamics import contact, equality, limits
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import ConeGroup, Noise, RowLayout, Rows
@@ -91,7 +92,7 @@ def law(
     """Return a_ref and weight D of rows; those of inactive rows are zero and of no effect."""
     residual = jnp.where(block.is_active, block.residual, 0.0)
     rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
-    stiffness, damping = stiffness_damping(model, block)
+    stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
     impedance = block.impedance.present
     weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
     return -damping * rate - stiffness * impedance * residual, weight
@@ -145,21 +146,3 @@ def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
         blocks += [limits.ball_limits(model, data), limits.joint_limits(model, data), limits.tendon_limits(model, data)]
     blocks += [contact.contacts(model, data, dim) for dim in _CONDIMS]
     return blocks
-
-
-def stiffness_damping(model: mjx.Model, block: Block) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
-    """Return K and B of each row.
-
-    Each format is evaluated on numbers that are its own, so that no infinity of the other enters the derivative. Under
-    refsafe the time constant is clamped from below at two time steps; at the clamp itself the derivative is that of the
-    unclamped side, since from there every larger value counts.
-    """
-    first, second, largest = block.solref[:, 0], block.solref[:, 1], block.impedance.full
-    time_constant = jnp.where(first > 0, first, 1.0)
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
-        shortest = 2 * model.opt.timestep
-        time_constant = jnp.where(time_constant >= shortest, time_constant, shortest)
-    ratio = jnp.where(second > 0, second, 1.0)
-    stiffness = jnp.where(first > 0, 1 / (largest * time_constant * ratio) ** 2, -first / largest**2)
-    damping = jnp.where(second > 0, 2 / (largest * time_constant), -second / largest)
-    return stiffness, damping

@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad.dynamics.impedance import Impedance
+from mjxgrad.contact.law import Impedance
 from mjxgrad.dynamics.jacobian import RowMap
 
 

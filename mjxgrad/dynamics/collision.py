@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mjxgrad._math import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
-from mjxgrad.dynamics.rotation import safe_norm
 from mjxgrad.dynamics.spatial import contract, dot, pick
 
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.

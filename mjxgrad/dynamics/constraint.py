@@ -10,7 +10,7 @@ T = |u₁..|:
   (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
-Rows under noise (see `noise`) have the mean of these costs: of x + c w over noise w on the distance, where it makes
+Rows under noise (see `smoothing`) have the mean of these costs: of x + c w over noise w on the distance, where it makes
 contact. That of ½ min(x, 0)² is convex in x with the derivative -`_mean_push`. For the cone it is as simple, since its
 three zones are the sum of two such terms,
 
@@ -33,8 +33,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad.dynamics.kernels import Kernel
 from mjxgrad.dynamics.linear import add, sum_of_few
-from mjxgrad.smoothing.kernels import Kernel
 
 
 @dataclasses.dataclass(frozen=True)

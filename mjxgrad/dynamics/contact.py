@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.law import impedance, is_square
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import slot_geoms
-from mjxgrad.dynamics.impedance import impedance, is_square
 from mjxgrad.dynamics.jacobian import ContactRows, DenseRows, RowMap, Side
 
 

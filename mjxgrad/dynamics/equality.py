@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad._math import safe_norm
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import rotation, tree
+from mjxgrad.contact.law import impedance
+from mjxgrad.dynamics import rotation, spatial, tree
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.contact import contact_jacobian
-from mjxgrad.dynamics.impedance import impedance
 from mjxgrad.dynamics.jacobian import DenseRows
 
 
@@ -46,7 +47,7 @@ def _block(
     return Block(
         map=DenseRows(jacobian.reshape(count * each, -1)),
         residual=flat,
-        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], rotation.safe_norm(residual))),
+        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], safe_norm(residual))),
         solimp=spread(model.eq_solimp[ids]),
         inverse_weight=inverse_weight.reshape(-1),
         solref=spread(model.eq_solref[ids]),
@@ -114,18 +115,18 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     # The data of a weld hold the second body's anchor first.
     points = _points(model, data, ids, settings[:, :6].reshape(-1, 2, 3)[:, ::-1])
     scale = settings[:, 10:11]
-    first = rotation.multiply(data.xquat[bodies[:, 0]], settings[:, 6:10])
+    first = spatial.multiply(data.xquat[bodies[:, 0]], settings[:, 6:10])
     second = data.xquat[bodies[:, 1]]
     if is_site.any():
         quaternions = model.site_quat[np.where(is_site[:, None], objects, 0)]
-        of_sites = rotation.multiply(data.xquat[bodies], quaternions)
+        of_sites = spatial.multiply(data.xquat[bodies], quaternions)
         first = jnp.where(is_site[:, None], of_sites[:, 0], first)
         second = jnp.where(is_site[:, None], of_sites[:, 1], second)
     back = rotation.conjugate(second)
-    error = rotation.multiply(back, first)[:, 1:] * scale
+    error = spatial.multiply(back, first)[:, 1:] * scale
     turning = _turning(model, data, bodies)  # constraints, nv, 3
     axis = jnp.concatenate([jnp.zeros_like(turning[..., :1]), turning], axis=-1)
-    rate = rotation.multiply(rotation.multiply(back[:, None], axis), first[:, None])[..., 1:]
+    rate = spatial.multiply(spatial.multiply(back[:, None], axis), first[:, None])[..., 1:]
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
     weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
     return _block(

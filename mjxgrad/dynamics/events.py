@@ -61,12 +61,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import safe_sqrt
+from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
-from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import System
 
 # Nodes and weights of Gauss and Legendre on (0, 1).
@@ -203,7 +203,7 @@ def _events(
 ) -> _Events:
     is_event = _per_row(plan, begins | ends)
     touching = _in_contact(assembly.joined(blocks), is_event)
-    damping = model.opt.timestep * assembly.stiffness_damping(model, touching)[1]
+    damping = model.opt.timestep * stiffness_damping(model, touching.solref, touching.impedance.full)[1]
     return _Events(
         system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),
         damping=jnp.where(_per_row(plan, ends), 0.0, damping),
@@ -224,7 +224,7 @@ def _creep(model: mjx.Model, blocks: list[Block]) -> Float[Array, " contacts"]:
     for block in blocks:
         if not block.rows_each:
             continue
-        stiffness, damping = assembly.stiffness_damping(model, block)
+        stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
         rate = (damping + safe_sqrt(stiffness))[:: block.rows_each]
         share = gravity / (2 * jnp.where(rate > 0, rate, 1.0))
         speeds.append(jnp.where(rate > 0, share, 0.0) if block.is_contact else jnp.zeros_like(rate))

@@ -4,13 +4,14 @@ Drop-ins for MJX's stages. Whatever a model has beyond actuators of hinges and s
 and dampers, is left to MJX: each function says what.
 """
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import factor, rotation, smooth, spatial, springs, tree
+from mjxgrad.dynamics import cholesky, kinematics, rotation, spatial, tree
 from mjxgrad.dynamics.spatial import contract, pick
 
 _Disable = mujoco.mjtDisableBit
@@ -18,6 +19,8 @@ _Joint = mujoco.mjtJoint
 _ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _ON_AXES = (_Joint.mjJNT_HINGE, _Joint.mjJNT_SLIDE)
 _BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+# MJX's norm counts as zero where every entry is below this (the absolute tolerance of `allclose`).
+_CUT_OFF = 1e-8
 
 
 def _drives_axes(model: mjx.Model) -> bool:
@@ -62,7 +65,7 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.ntendon:
         rate = contract("tv,v->t", data._impl.ten_J, data.qvel)
         data = data.tree_replace({"_impl.ten_velocity": rate})  # pyright: ignore[reportAssignmentType]
-    data = smooth.rne(model, passive(model, smooth.com_vel(model, data)))
+    data = kinematics.rne(model, passive(model, kinematics.com_vel(model, data)))
     return mjx.tendon_bias(model, data) if model.ntendon else data
 
 
@@ -79,7 +82,7 @@ def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     flags = model.opt.disableflags
     compensates = model.flg_gravcomp and not flags & _Disable.mjDSBL_GRAVITY
     if model.ntendon or compensates or model.opt._impl.has_fluid_params:
-        return springs.restore_derivative(model, mjx.passive(model, data))
+        return _restore_derivative(model, mjx.passive(model, data))
     none = jnp.zeros_like(data.qvel)
     # MJX leaves out both where either is disabled.
     if flags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
@@ -103,6 +106,27 @@ def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]
             stretch = jnp.concatenate([q[:, :3] - rest[:, :3], stretch], axis=1)
         forces.append(-(stiffness[:, None] * stretch).reshape(-1))
     return jnp.concatenate(forces)
+
+
+def _restore_derivative(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Return data whose `qfrc_passive` has the derivative of rotational springs at their reference.
+
+    MJX writes the torque of a ball or free joint's spring with a norm that it cuts off near zero, and returns a derivative of
+    zero there, as if the spring had gone. The torque itself is zero at the reference, so adding the difference of the analytic
+    torque and its own frozen value restores the derivative and leaves the force.
+    """
+    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    joints = np.nonzero(free | (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL))[0]
+    off = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
+    if not joints.size or model.opt.disableflags & off:
+        return data
+    addresses = (model.jnt_qposadr + 3 * free)[joints][:, None] + np.arange(4)
+    dofs = (model.jnt_dofadr + 3 * free)[joints][:, None] + np.arange(3)
+    turn = spatial.multiply(rotation.conjugate(model.qpos_spring[addresses]), data.qpos[addresses])
+    torque = -model.jnt_stiffness[joints][:, None] * rotation.logarithm(turn)
+    is_cut = jnp.all(jnp.abs(turn[:, 1:]) <= _CUT_OFF, axis=1, keepdims=True)
+    missing = jnp.where(is_cut, torque - jax.lax.stop_gradient(torque), 0.0)
+    return data.replace(qfrc_passive=data.qfrc_passive.at[dofs].add(missing))
 
 
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -167,7 +191,7 @@ def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     push, torque = data.xfrc_applied[:, :3], data.xfrc_applied[:, 3:]
     lever = data.xipos - pick(model.body_rootid, data.subtree_com)
     wrench = jnp.concatenate([torque + spatial.cross(lever, push), push], axis=1)
-    applied = data.qfrc_applied + smooth.generalised_force(model, data, wrench)
+    applied = data.qfrc_applied + kinematics.generalised_force(model, data, wrench)
     total = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
-    unconstrained = factor.solve_positive_definite(mjx.full_m(model, data), total)
+    unconstrained = cholesky.solve_positive_definite(mjx.full_m(model, data), total)
     return data.replace(qfrc_smooth=total, qacc_smooth=unconstrained)

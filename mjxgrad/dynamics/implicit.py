@@ -27,7 +27,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, factor, linear, newton
+from mjxgrad.dynamics import cholesky, constraint, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
 from mjxgrad.dynamics.inertia import Inertia
 from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
@@ -213,7 +213,7 @@ def respond(
 
     def run(system, bend, force):
         problem = system.problem()
-        return factor.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
+        return cholesky.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
 
     def run_where(system, bend, force, is_needed):
         return linear.on_few(run, is_needed, jnp.zeros_like(force), system, bend, force)

@@ -1,7 +1,7 @@
 r"""The mass matrix as a linear map: applied without being formed.
 
 M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
-ancestors, a product with each body's inertia, sums over descendants, as in `smooth.rne`. Its derivative is of the same
+ancestors, a product with each body's inertia, sums over descendants, as in `kinematics.rne`. Its derivative is of the same
 kind, where that of the matrix is a matrix.
 """
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import rotation
+from mjxgrad.dynamics import rotation, spatial
 
 
 def integrate_position(
@@ -44,7 +44,7 @@ def position_change(model: mjx.Model, start: Float[Array, " nq"], end: Float[Arr
     if not turning.size:
         return end - start
     quaternions = turning[:, :1] + np.arange(4)
-    turned = rotation.logarithm(rotation.multiply(rotation.conjugate(start[quaternions]), end[quaternions]))
+    turned = rotation.logarithm(spatial.multiply(rotation.conjugate(start[quaternions]), end[quaternions]))
     change = jnp.zeros(model.nv, start.dtype).at[dofs].set((end - start)[first])
     return change.at[turning[:, 1:] + np.arange(3)].set(turned)
 

@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad._math import safe_norm
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.law import impedance, is_square
 from mjxgrad.dynamics import rotation
 from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.impedance import impedance, is_square
 from mjxgrad.dynamics.jacobian import AxisRows, DenseRows, JoinedRows, RowMap
 
 
@@ -77,8 +78,8 @@ def ball_limits(model: mjx.Model, data: mjx.Data) -> Block | None:
     if not joints.size:
         return None
     quaternion = data.qpos[model.jnt_qposadr[joints][:, None] + np.arange(4)]
-    turn = rotation.logarithm(quaternion / rotation.safe_norm(quaternion)[:, None])
-    angle = rotation.safe_norm(turn)
+    turn = rotation.logarithm(quaternion / safe_norm(quaternion)[:, None])
+    angle = safe_norm(turn)
     axis = turn / jnp.where(angle > 0, angle, 1.0)[:, None]
     dofs = model.jnt_dofadr[joints]
     select = np.zeros((len(joints), 3, model.nv))

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, factor, linear
+from mjxgrad.dynamics import cholesky, constraint, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.sparse import SparseRows
 
@@ -270,7 +270,7 @@ class _Solver(eqx.Module):
 
 def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:
     """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
-    newton = -factor.cholesky_solve(hessian, gradient)
+    newton = -cholesky.cholesky_solve(hessian, gradient)
     return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / linear.diagonal(hessian))
 
 

@@ -68,13 +68,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import safe_sqrt
+from mjxgrad._static import is_known
+from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly
 from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import other_sides, slot_geoms
 from mjxgrad.dynamics.contact import row_map
-from mjxgrad.dynamics.impedance import Impedance
 from mjxgrad.dynamics.implicit import Variant
 from mjxgrad.dynamics.jacobian import RowMap
 
@@ -111,7 +112,7 @@ class Onset(eqx.Module):
         Raises:
             ValueError: if the width is negative or not finite.
         """
-        if isinstance(self.width, jax.Array | np.ndarray) and not isinstance(self.width, jax.core.Tracer):
+        if is_known(self.width):
             known = np.asarray(self.width)
             if not np.all((known >= 0) & np.isfinite(known)):
                 raise ValueError(
@@ -259,7 +260,7 @@ def _share(
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
     rate = _normal(block, rates)
-    stiffness, damping = (x[::each] for x in assembly.stiffness_damping(model, block))
+    stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     resistance = damping + safe_sqrt(stiffness)
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
     creep = gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))

@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from mjxgrad._mjx import mjx
+from mjxgrad._static import known
 from mjxgrad.dynamics import spatial, tree
-from mjxgrad.dynamics.known import known
 from mjxgrad.dynamics.spatial import contract, pick
 
 _Joint = mujoco.mjtJoint

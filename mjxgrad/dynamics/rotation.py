@@ -7,23 +7,11 @@ has its true derivative at zero angular velocity (half the time step), where div
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjxgrad.dynamics.spatial import multiply
+
 # Below this squared angle the truncated series are exact to double precision: the first term left out of either is
 # smaller than (1e-4)**3 / 46080 = 2e-17.
 _SERIES = 1e-4
-
-
-def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Return the Euclidean norm over the last axis, with derivative zero at the zero vector."""
-    square = jnp.sum(x * x, axis=-1)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
-def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
-    """Return the Hamilton product p q of quaternions (w, x, y, z)."""
-    real = p[..., :1] * q[..., :1] - jnp.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
-    imaginary = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + jnp.cross(p[..., 1:], q[..., 1:])
-    return jnp.concatenate([real, imaginary], axis=-1)
 
 
 def conjugate(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:

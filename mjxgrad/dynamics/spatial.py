@@ -1,7 +1,7 @@
 """Rotations, cross products and inertias of many bodies at once.
 
 Motions are (angular, linear), forces (torque, force), about one point for a whole kinematic tree and in world axes. All
-functions take one leading axis of items.
+functions but `multiply` take one leading axis of items.
 """
 
 import jax
@@ -156,9 +156,10 @@ def cross(a: Float[Array, "n 3"], b: Float[Array, "n 3"]) -> Float[Array, "n 3"]
     return _cross(a, b)
 
 
-def multiply(p: Float[Array, "n 4"], q: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-    """Return the Hamilton product p q of quaternions (w, x, y, z)."""
-    return _multiply(p, q)
+def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
+    """Return the Hamilton product p q of quaternions (w, x, y, z); leading axes of any number are broadcast."""
+    dtype = jnp.result_type(p, q)
+    return _multiply(*jnp.broadcast_arrays(jnp.asarray(p, dtype), jnp.asarray(q, dtype)))
 
 
 def rotation_matrix(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from mjxgrad._rollout import State, data_of
 from mjxgrad.dynamics import forward
 from mjxgrad.dynamics.integrate import integrate_position
-from mjxgrad.rollout import State, data_of
 from mjxgrad.scene import Scene
 
 Rates = tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " na"]]

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from mjxgrad._rollout import State, Trajectory, is_sound
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
-from mjxgrad.rollout import State, Trajectory, is_sound
 from mjxgrad.scene import Scene
 
 Advance = Callable[[State, Float[Array, " nu"], Float[Array, ""]], State]

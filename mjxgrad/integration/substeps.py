@@ -5,10 +5,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
+from mjxgrad._rollout import State, Trajectory, data_of, state_of
 from mjxgrad.dynamics import Gradient, assembly, check_gradient, step
 from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration.march import control_rows, march
-from mjxgrad.rollout import State, Trajectory, data_of, state_of
 from mjxgrad.scene import Scene
 
 

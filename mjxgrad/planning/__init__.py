@@ -1,11 +1,11 @@
 """Plans through contact: trajectory optimisation and search trees, both on smoothed linear models."""
 
 from mjxgrad.planning.cost import Cost, GoalCost
-from mjxgrad.planning.search import Path, Sampling, Search, path, search
-from mjxgrad.planning.smoothers import Analytic, Exact, Sampled, Smoother
+from mjxgrad.planning.linear_model import LinearModel
+from mjxgrad.planning.models import Analytic, Exact, Sampled, Smoother
+from mjxgrad.planning.system import FunctionSystem, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
-from mjxgrad.smoothing.linear_model import LinearModel
-from mjxgrad.smoothing.system import FunctionSystem, SceneSystem, System
+from mjxgrad.planning.tree import Path, Sampling, Search, path, search
 
 __all__ = [
     "Analytic",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad.smoothing.system import System
+from mjxgrad.planning.system import System
 
 
 class Cost(eqx.Module):

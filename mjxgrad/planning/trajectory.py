@@ -8,8 +8,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad.planning.backward import Feedback, backward_pass
 from mjxgrad.planning.cost import Cost, stage_model, terminal_model
-from mjxgrad.planning.smoothers import Smoother
-from mjxgrad.smoothing.system import System
+from mjxgrad.planning.models import Smoother
+from mjxgrad.planning.system import System
 
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair, contact_parameters
+from mjxgrad.contact.parameters import ContactPair, contact_parameters
 
 
 def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:

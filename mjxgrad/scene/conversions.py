@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import contact_pairs, deciding_geoms
+from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
 from mjxgrad.scene.refusals import describe_pair, element_name, has_medium
 
 _DISABLE = mujoco.mjtDisableBit

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 
 from mjxgrad._mjx import make_efc_type
-from mjxgrad.contacts import ContactPair, contact_pairs
+from mjxgrad.contact.parameters import ContactPair, contact_pairs
 from mjxgrad.scene.masks import TooManyMasksError, keep_pairs
 from mjxgrad.scene.omissions import Omission
 from mjxgrad.scene.separation import proven_distance

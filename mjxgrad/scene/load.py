@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import mujoco
 
 from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact import Softness, softness_warnings
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
 from mjxgrad.scene.leave_out import LeaveOut, omit
 from mjxgrad.scene.omissions import switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneWarning
-from mjxgrad.softness import Softness, softness_warnings
 
 _FLOAT32_TOLERANCE = 1e-6
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold

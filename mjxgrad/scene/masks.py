@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from mjxgrad.contacts import ContactPair
+from mjxgrad.contact.parameters import ContactPair
 
 _NUM_BITS = 31  # of a signed integer, the sign left alone
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.refusals import has_medium
 
 _DISABLE = mujoco.mjtDisableBit

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import has_collision_fn, mjx
-from mjxgrad.contacts import contact_pairs
+from mjxgrad.contact.parameters import contact_pairs
 
 _OBJECT = mujoco.mjtObj
 _ENABLE = mujoco.mjtEnableBit

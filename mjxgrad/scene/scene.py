@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contacts import ContactPair, ContactParameters, contact_parameters
+from mjxgrad.contact import Softness, softness_warnings
+from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.scene.contact_check import contact_warnings
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.leave_out import OmittedPair
 from mjxgrad.scene.omissions import Omission
 from mjxgrad.scene.summary import summarise
-from mjxgrad.softness import Softness, softness_warnings
 
 
 class SceneWarning(UserWarning):

@@ -8,7 +8,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad.contacts import ContactParameters
+from mjxgrad.contact.parameters import ContactParameters
 from mjxgrad.scene.contact_check import contact_differences, format_number, name_pairs
 
 if TYPE_CHECKING:

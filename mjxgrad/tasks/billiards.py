@@ -15,12 +15,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import Gradient, Onset, check_gradient
+from mjxgrad._rollout import Trajectory, initial_state, rollout
+from mjxgrad.contact import Softness
+from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
-from mjxgrad.rollout import Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.smoothing.smoothing import Smoothing
-from mjxgrad.softness import Softness
 from mjxgrad.task import finite_cost
 from mjxgrad.tasks.files import scene_path
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad.rollout import State, initial_state
+from mjxgrad._rollout import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.files import scene_path
 

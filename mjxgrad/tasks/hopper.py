@@ -13,9 +13,9 @@ import mujoco
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.objective import ActionNoise, closed_loop
 from mjxgrad.policy import Affine, LinearPolicy, linear_policy
-from mjxgrad.rollout import State, Trajectory, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.task import SceneTask
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.rollout import initial_state
+from mjxgrad._rollout import initial_state
+from mjxgrad.planning.system import SceneSystem
 from mjxgrad.scene import load_scene
-from mjxgrad.smoothing.system import SceneSystem
 from mjxgrad.tasks.files import scene_path
 
 SPEED_LIMIT = 0.4  # m/s, per axis; the range of the scene's actuators

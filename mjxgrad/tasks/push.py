@@ -8,8 +8,8 @@ References:
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjxgrad.contact import Softness
 from mjxgrad.scene import load_scene
-from mjxgrad.softness import Softness
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
 from mjxgrad.tasks.story import Settings, StoryTask, story_task

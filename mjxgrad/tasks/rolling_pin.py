@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._rollout import Trajectory, initial_state
+from mjxgrad.contact import Softness
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.objective import ActionNoise, open_loop
-from mjxgrad.rollout import Trajectory, initial_state
 from mjxgrad.scene import load_scene
-from mjxgrad.smoothing import Smoothing
-from mjxgrad.softness import Softness
 from mjxgrad.task import SceneTask
 from mjxgrad.tasks.files import scene_path
 

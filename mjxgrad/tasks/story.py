@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from mjxgrad._rollout import State, Trajectory, initial_state
+from mjxgrad.contact import Softness
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.rollout import State, Trajectory, initial_state
 from mjxgrad.scene import Scene
-from mjxgrad.softness import Softness
 from mjxgrad.task import SceneTask
 from mjxgrad.tasks.published import Published, QuadraticCost
 

@@ -9,8 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from mjxgrad._rollout import State, initial_state
 from mjxgrad.policy import linear_policy
-from mjxgrad.rollout import State, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost

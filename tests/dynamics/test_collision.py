@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import smooth
+from mjxgrad.dynamics import kinematics
 from mjxgrad.dynamics.collision import collide, slot_geoms
 from tests.dynamics.scenes import central_difference
 
@@ -38,7 +38,9 @@ BALLS = """
 
 
 def _finder(model):
-    return jax.jit(lambda data: collide(model, smooth.com_pos(model, smooth.kinematics(model, data)))._impl.contact)
+    return jax.jit(
+        lambda data: collide(model, kinematics.com_pos(model, kinematics.kinematics(model, data)))._impl.contact
+    )
 
 
 def _poses(seed, num_boxes=2):

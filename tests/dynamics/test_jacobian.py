@@ -11,7 +11,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, constraint, linear, smooth
+from mjxgrad.dynamics import assembly, constraint, kinematics, linear
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import Bend
 from mjxgrad.dynamics.contact import slot_bodies
@@ -51,8 +51,8 @@ def _rows(cone):
     model = mjx.put_model(mj_model)
 
     def prepare(data):
-        data = smooth.com_pos(model, smooth.kinematics(model, data))
-        data = collide(model, smooth.com_vel(model, smooth.crb(model, data)))
+        data = kinematics.com_pos(model, kinematics.kinematics(model, data))
+        data = collide(model, kinematics.com_vel(model, kinematics.crb(model, data)))
         block = assembly.joined(assembly.gather(model, data))
         return data, block, block.map.matrix()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import orientation, smooth, tree
+from mjxgrad.dynamics import kinematics, orientation, tree
 
 # Sums of some tens of products of numbers of order one, in another order.
 ROUNDING = 1e3 * np.finfo(float).eps
@@ -54,7 +54,7 @@ FIELDS = (
     "site_xmat",
 )
 # Under jax.jit numbers of an argument are not known, and turns are multiplied.
-by_products = jax.jit(smooth.kinematics)
+by_products = jax.jit(kinematics.kinematics)
 
 
 def load(axis="1 2 2"):
@@ -73,7 +73,7 @@ def test_angles_give_the_poses_of_c_mujoco():
     model, reference = load()
     device, data = mjx.put_model(model), mjx.put_data(model, reference)
     assert is_planar(device)
-    placed = jax.jit(lambda data: smooth.kinematics(device, data))(data)
+    placed = jax.jit(lambda data: kinematics.kinematics(device, data))(data)
     mujoco.mj_kinematics(model, reference)
     for name in FIELDS:
         expected = np.asarray(getattr(reference, name)).reshape(getattr(placed, name).shape)
@@ -93,7 +93,7 @@ def test_derivatives_of_angles_are_those_of_products():
 
     ours, theirs = (
         jax.jit(jax.grad(lambda *x, k=k: value(k, *x), argnums=(0, 1)))(data.qpos, lengths)
-        for k in (smooth.kinematics, by_products)
+        for k in (kinematics.kinematics, by_products)
     )
     for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING * max(1, np.abs(expected).max()))
@@ -111,7 +111,7 @@ def test_what_is_differentiated_by_is_not_known():
     device, data = mjx.put_model(model), mjx.put_data(model, reference)
 
     def height(axis):
-        return smooth.kinematics(device.replace(jnt_axis=axis), data).geom_xpos[:, 2].sum()
+        return kinematics.kinematics(device.replace(jnt_axis=axis), data).geom_xpos[:, 2].sum()
 
     def multiplied(axis):
         return by_products(device.replace(jnt_axis=axis), data).geom_xpos[:, 2].sum()

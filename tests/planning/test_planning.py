@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import (
     Analytic,
     Cost,
@@ -21,9 +22,8 @@ from mjxgrad.planning import (
 )
 from mjxgrad.planning.box import minimise_in_box
 from mjxgrad.planning.cost import terminal_model
+from mjxgrad.planning.linear_model import LinearModel
 from mjxgrad.planning.tree import reach
-from mjxgrad.smoothing import Smoothing
-from mjxgrad.smoothing.linear_model import LinearModel
 
 A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.02, 0.0], [0.1, 0.05]])
 HORIZON, START, GOAL = 6, jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3])

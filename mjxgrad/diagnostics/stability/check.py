@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import COLLISION_FUNCTIONS
-from mjxgrad.contacts import ContactPair, resolve_solref
+from mjxgrad.contact.law import stiffness_damping
+from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.diagnostics.stability.report import StabilityReport
 from mjxgrad.diagnostics.stability.spring import Spring
 from mjxgrad.scene import Scene
@@ -94,7 +95,7 @@ def _others(scene: Scene) -> Iterator[Spring]:
         chosen = np.flatnonzero(active) if is_on[kind] else np.zeros(0, int)
         if not chosen.size:
             continue
-        stiffness, damping = (np.asarray(x, float) for x in resolve_solref(model, solref))
+        stiffness, damping = (np.asarray(x, float) for x in stiffness_damping(model, solref))
         for i in chosen:
             name = mujoco.mj_id2name(c_model, which, i) or f"{kind} {i}"
             size = np.inf if ranges is None else float(np.ptp(np.asarray(ranges[i], float)))

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from mjxgrad.contact.bounce import Bounce
 from mjxgrad.scene.contact_check import largest_stable_step, steepest
-from mjxgrad.tasks.textbook.bounce import Bounce
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ References:
     arXiv:2202.00817, section 3 and figure 2.
 """
 
-from mjxgrad.tasks.textbook.bounce import Bounce, bounce_scene, integrated_restitution
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
+from mjxgrad.tasks.textbook.bounce import bounce_scene
 from mjxgrad.tasks.textbook.problem import Textbook
 from mjxgrad.tasks.textbook.sine import QuadraticSine, quadratic_sine
 from mjxgrad.tasks.textbook.step import Heaviside, SoftHeaviside, heaviside, soft_heaviside

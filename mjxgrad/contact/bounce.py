@@ -1,0 +1,116 @@
+r"""A ball that bounces once: what MuJoCo's contact does to it, in closed form and by quadrature.
+
+Without gravity and with a single sliding joint, contact at depth $-r$ is the oscillator
+$\ddot r = d(r)\, a_\text{ref}$, $a_\text{ref} = -B \dot r - K d(r) r$, as long as it pushes. For a constant impedance
+$d$ this is $\ddot r = -2 \zeta \omega_0 \dot r - \omega_0^2 r$ with $\omega_0 = 1 / (t_c \zeta)$, whatever $d$ is. It pushes
+from $r = 0$ until $\ddot r = 0$. Before and after, the ball flies, so the motion does not depend on where it started but
+for its timing, and $dz/dz_0 = -e$ for the height at any later time: the restitution is the derivative.
+
+References:
+    MuJoCo documentation, "Solver parameters" (the oscillator and its impedance).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from scipy.integrate import solve_ivp
+
+
+def _as_float(value: ArrayLike) -> Array:
+    return jnp.asarray(value, float)
+
+
+class Bounce(eqx.Module):
+    r"""One bounce under a constant impedance, in closed form; traceable, and shapes broadcast.
+
+    Attributes:
+        time_constant: $t_c$, the first number of `solref`, in s.
+        damping_ratio: $\zeta$, the second; any positive number.
+        speed: of approach, in m/s.
+    """
+
+    time_constant: Float[Array, "..."] = eqx.field(converter=_as_float)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=_as_float)
+    speed: Float[Array, "..."] = eqx.field(converter=_as_float, default=1.0)
+
+    @property
+    def frequency(self) -> Float[Array, "..."]:
+        r"""Give $\omega_0 = 1 / (t_c \zeta)$, in rad/s."""
+        return 1 / (self.time_constant * self.damping_ratio)
+
+    @property
+    def restitution(self) -> Float[Array, "..."]:
+        r"""Give $e = \exp(-2 \zeta \arccos\zeta / \sqrt{1 - \zeta^2})$, continued beyond $\zeta = 1$, where it is $e^{-2}$."""
+        return jnp.exp(-2 * self.damping_ratio * _angle(self.damping_ratio))
+
+    @property
+    def duration(self) -> Float[Array, "..."]:
+        r"""Give how long the ball is pushed, $2 \arccos\zeta / (\omega_0 \sqrt{1 - \zeta^2})$, in s."""
+        return 2 * _angle(self.damping_ratio) / self.frequency
+
+    def height(self, start: Float[ArrayLike, "..."], time: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+        """Give the height after the bounce, in m.
+
+        Args:
+            start: height at time zero, in m above the floor.
+            time: after the contact has ended, in s.
+        """
+        released = -2 * self.damping_ratio * self.speed * self.restitution / self.frequency
+        flown = jnp.asarray(time) - start / self.speed - self.duration
+        return released + self.restitution * self.speed * flown
+
+
+def integrated_restitution(
+    time_constant: float, damping_ratio: float, impedance: tuple[float, float, float], speed: float = 1.0
+) -> tuple[float, float]:
+    r"""Integrate the contact with an impedance that varies with depth, to ten digits.
+
+    Args:
+        time_constant: first number of `solref`, in s.
+        damping_ratio: its second.
+        impedance: the first three numbers of `solimp`: $d_0$, $d_w$ and the width in m. The last two are the default ones.
+        speed: of approach, in m/s.
+
+    Returns:
+        Restitution, which is $-dz/dz_0$ after the bounce, and how long the ball is pushed, in s.
+
+    Raises:
+        ValueError: if the ball is not released within a hundred time constants.
+    """
+    lowest, highest = mujoco.mjMINIMP, mujoco.mjMAXIMP
+    first, last, width = np.clip(impedance[0], lowest, highest), np.clip(impedance[1], lowest, highest), impedance[2]
+    damping, stiffness = 2 / (last * time_constant), 1 / (last * time_constant * damping_ratio) ** 2
+
+    def acceleration(_: float, state: np.ndarray) -> float:
+        share = min(abs(state[0]) / width, 1.0)
+        # MuJoCo's smooth step of power 2 about the middle, its default.
+        rise = 2 * share**2 if share < 0.5 else 1 - 2 * (1 - share) ** 2
+        d = first + (last - first) * rise
+        return float(d * (-damping * state[1] - stiffness * d * state[0]))
+
+    acceleration.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
+    acceleration.direction = -1  # pyright: ignore[reportFunctionMemberAccess]
+    found = solve_ivp(
+        lambda t, state: (state[1], acceleration(t, state)),
+        (0, 100 * time_constant),
+        np.array([0.0, -speed]),
+        events=acceleration,
+        rtol=1e-10,
+        atol=1e-14,
+        max_step=time_constant / 20,
+    )
+    if not len(found.t_events[0]):
+        raise ValueError(f"the ball must be released within {100 * time_constant} s, got no release: damp it less")
+    return float(found.y[1, -1] / speed), float(found.t[-1])
+
+
+def _angle(damping_ratio: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""Return $\arccos\zeta / \sqrt{1 - \zeta^2}$, which is smooth at 1 though its parts are not."""
+    gap = 1 - damping_ratio
+    is_near = jnp.abs(gap) < 1e-4
+    below = jnp.where(is_near | (gap < 0), 0.5, damping_ratio)
+    above = jnp.where(is_near | (gap > 0), 2.0, damping_ratio)
+    far = jnp.where(gap > 0, jnp.arccos(below) / jnp.sqrt(1 - below**2), jnp.arccosh(above) / jnp.sqrt(above**2 - 1))
+    return jnp.where(is_near, 1 + gap / 3 + 2 * gap**2 / 15, far)

@@ -1,0 +1,259 @@
+r"""Which geoms can touch, and how soft their contact effectively is.
+
+MuJoCo derives the parameters of a contact from those of its two geoms (or of an explicit
+`<pair>`), clamps some of them and reads `solref` in either of two formats. What the dynamics
+sees is brought here to one form, in which pairs can be compared and swept.
+
+With impedance $d(r)$ rising from $d_0$ at the surface to $d_w$ at penetration `width`, the
+reference acceleration of a contact at distance $r < 0$, measured from its margin, is
+$a_\text{ref} = -B v - K d(r) r$ with $K = k / d_w^2$ and $B = b / d_w$. Here $k = \omega_0^2$ is
+the stiffness and $b$ the damping, both per unit of the contact's effective mass: at full
+impedance the contact is the oscillator $\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being
+the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$; `contact.law` has other profiles.
+
+References:
+    MuJoCo documentation, "Solver parameters" and "Contact parameters".
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from mjxgrad._math import safe_sqrt
+from mjxgrad._mjx import geom_pairs, mjx
+from mjxgrad.contact.law import rest_depth, stiffness_damping
+
+_DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
+
+
+@dataclass(frozen=True)
+class ContactPair:
+    """Two geoms that MJX tests for contact.
+
+    Attributes:
+        geom1: index of the first geom; MJX orders the two by geom type.
+        geom2: index of the second geom.
+        explicit: index of the `<pair>` that holds the parameters, -1 if the geoms hold them.
+        condim: dimension of the contact: 1, 3, 4 or 6.
+        names: of the two geoms.
+    """
+
+    geom1: int
+    geom2: int
+    explicit: int
+    condim: int
+    names: tuple[str, str]
+
+    def __str__(self) -> str:
+        """The two names, as messages print them."""
+        return " – ".join(self.names)
+
+
+class ContactParameters(eqx.Module):
+    r"""Effective contact parameters of some pairs, one row each.
+
+    Attributes:
+        stiffness: $k = \omega_0^2$, in 1/s².
+        damping: $b$, in 1/s.
+        impedance: $d_0$ and $d_w$.
+        width: penetration over which the impedance rises, in m.
+        friction: two sliding, one torsional (m) and two rolling (m) coefficients.
+        margin: distance at which contact begins, in m.
+        pyramid: $c$ of `contact.law`, by which the normal direction of a pyramid yields more or less; else 1.
+        solref: as MuJoCo mixes it, before `refsafe` and before formats are resolved.
+        solimp: as MuJoCo mixes it, before it is clamped.
+        timestep: of the model, in s.
+    """
+
+    stiffness: Float[Array, "*batch pairs"]
+    damping: Float[Array, "*batch pairs"]
+    impedance: Float[Array, "*batch pairs 2"]
+    width: Float[Array, "*batch pairs"]
+    friction: Float[Array, "*batch pairs 5"]
+    margin: Float[Array, "*batch pairs"]
+    pyramid: Float[Array, "*batch pairs"]
+    solref: Float[Array, "*batch pairs 2"]
+    solimp: Float[Array, "*batch pairs 5"]
+    timestep: Float[Array, "*batch"]
+
+    @property
+    def natural_frequency(self) -> Float[Array, "*batch pairs"]:
+        r"""$\omega_0 = \sqrt k$, in rad/s."""
+        return safe_sqrt(self.stiffness)
+
+    @property
+    def time_constant(self) -> Float[Array, "*batch pairs"]:
+        """$2 / b$, in s: the decay time of a critically damped contact; infinite if undamped."""
+        return 2.0 / self.damping
+
+    @property
+    def damping_ratio(self) -> Float[Array, "*batch pairs"]:
+        r"""$b / (2 \sqrt k)$; infinite without stiffness."""
+        return self.damping / (2.0 * self.natural_frequency)
+
+    @property
+    def stability(self) -> Float[Array, "*batch pairs"]:
+        """$h^2 k + 2 h b$; semi-implicit Euler is stable at full impedance while below 4."""
+        timestep = self.timestep[..., None]
+        return timestep**2 * self.stiffness + 2.0 * timestep * self.damping
+
+    def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
+        """Depth at rest below the distance at which contact begins; $(1 - d_w) a_0 / k$ for constant impedance.
+
+        Args:
+            acceleration: $a_0$ at which the bodies would approach without contact, in m/s²; for one body on the ground
+                gravity's, for a stack of n alike n times that. See `contact.law` for when this is exact.
+
+        Returns:
+            One depth per pair, in m.
+        """
+        return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
+
+    def rest_distance(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
+        """Distance of the geoms at rest, margin less `rest_depth`: positive where they hover (m).
+
+        Args:
+            acceleration: as for `rest_depth`.
+        """
+        return self.margin - self.rest_depth(acceleration)
+
+
+def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
+    """Name of a geom, or of its body with the geom's place in it."""
+    name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+    if name:
+        return name
+    body = int(model.geom_bodyid[geom])
+    body_name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
+    return f"{body_name}[{geom - int(model.body_geomadr[body])}]"
+
+
+def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
+    """List the pairs of geoms that MJX tests for contact, in no particular order.
+
+    Args:
+        model: of C MuJoCo or of MJX. Only its static structure is read.
+
+    Returns:
+        The pairs; none if contacts or constraints are disabled.
+    """
+    if int(model.opt.disableflags) & _DISABLES_CONTACT:
+        return ()
+    return tuple(
+        ContactPair(
+            geom1=int(geom1),
+            geom2=int(geom2),
+            explicit=int(explicit),
+            condim=_condim(model, geom1, geom2, explicit),
+            names=(geom_name(model, int(geom1)), geom_name(model, int(geom2))),
+        )
+        for geom1, geom2, explicit in geom_pairs(model)
+    )
+
+
+def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tuple[int, ...]:
+    """Geoms whose parameters decide those of a pair: none if explicit, one if it has priority."""
+    if pair.explicit >= 0:
+        return ()
+    priority1, priority2 = model.geom_priority[[pair.geom1, pair.geom2]]
+    if priority1 == priority2:
+        return (pair.geom1, pair.geom2)
+    return (pair.geom1,) if priority1 > priority2 else (pair.geom2,)
+
+
+def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
+    """Compute what the dynamics makes of the contact parameters in a model.
+
+    Differentiable with respect to the model's leaves, and traceable.
+
+    Args:
+        model: of MJX; leaves may be traced.
+        pairs: of that model; all that can touch, if left out.
+
+    Returns:
+        One row per pair, in the order given.
+    """
+    pairs = contact_pairs(model) if pairs is None else pairs
+    solref, solimp, friction, margin = _mix(model, pairs)
+    stiffness, damping = stiffness_damping(model, solref)
+    low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
+    return ContactParameters(
+        stiffness=stiffness,
+        damping=damping,
+        impedance=jnp.clip(solimp[:, :2], low, high),
+        width=jnp.maximum(solimp[:, 2], mujoco.mjMINVAL),
+        friction=friction,
+        margin=margin,
+        pyramid=_pyramid_factor(model, pairs, friction[:, 0]),
+        solref=solref,
+        solimp=solimp,
+        timestep=jnp.asarray(model.opt.timestep),
+    )
+
+
+def _condim(model, geom1, geom2, explicit) -> int:
+    if explicit >= 0:
+        return int(model.pair_dim[explicit])
+    priority1, priority2 = model.geom_priority[[geom1, geom2]]
+    condim1, condim2 = model.geom_condim[[geom1, geom2]]
+    if priority1 == priority2:
+        return int(max(condim1, condim2))
+    return int(condim1 if priority1 > priority2 else condim2)
+
+
+def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: Array) -> Array:
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return jnp.ones_like(friction)
+    condim = np.array([pair.condim for pair in pairs], dtype=int)
+    factor = friction**2 * (1 + friction**2) / (np.maximum(condim - 1, 1) * model.opt.impratio)
+    return jnp.where(condim > 1, factor, 1.0)
+
+
+def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
+    """Combine the parameters of two geoms by MuJoCo's rules."""
+    geom1 = np.array([pair.geom1 for pair in pairs], dtype=int)
+    geom2 = np.array([pair.geom2 for pair in pairs], dtype=int)
+    explicit = np.array([pair.explicit for pair in pairs], dtype=int)
+
+    weight = _mix_weight(model, geom1, geom2)[:, None]
+    solref1, solref2 = model.geom_solref[geom1], model.geom_solref[geom2]
+    both_standard = (solref1[:, :1] > 0) & (solref2[:, :1] > 0)
+    # Numbers of the direct format are negative, so the smaller one is the stiffer one.
+    solref = jnp.where(
+        both_standard,
+        weight * solref1 + (1 - weight) * solref2,
+        jnp.minimum(solref1, solref2),
+    )
+    solimp = weight * model.geom_solimp[geom1] + (1 - weight) * model.geom_solimp[geom2]
+    friction = jnp.maximum(model.geom_friction[geom1], model.geom_friction[geom2])
+
+    priority1, priority2 = model.geom_priority[geom1], model.geom_priority[geom2]
+    winner = np.where(priority1 > priority2, geom1, geom2)
+    has_winner = (priority1 != priority2)[:, None]
+    solref = jnp.where(has_winner, model.geom_solref[winner], solref)
+    solimp = jnp.where(has_winner, model.geom_solimp[winner], solimp)
+    friction = jnp.where(has_winner, model.geom_friction[winner], friction)[:, [0, 0, 1, 2, 2]]
+    margin = model.geom_margin[geom1] + model.geom_margin[geom2]
+
+    if not (explicit >= 0).any():
+        return solref, solimp, friction, margin
+    is_explicit = (explicit >= 0)[:, None]
+    return (
+        jnp.where(is_explicit, model.pair_solref[explicit], solref),
+        jnp.where(is_explicit, model.pair_solimp[explicit], solimp),
+        jnp.where(is_explicit, model.pair_friction[explicit], friction),
+        jnp.where(is_explicit[:, 0], model.pair_margin[explicit], margin),
+    )
+
+
+def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array:
+    """Weight of the first geom: its share of `solmix`, one half if both are zero."""
+    solmix1, solmix2 = model.geom_solmix[geom1], model.geom_solmix[geom2]
+    smallest = mujoco.mjMINVAL
+    neither = (solmix1 < smallest) & (solmix2 < smallest)
+    total = jnp.where(neither, 1.0, solmix1 + solmix2)
+    return jnp.select([neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total)

@@ -1,0 +1,443 @@
+r"""How soft contacts are, set alike on every pair of geoms that can touch.
+
+MuJoCo's contact is a spring and damper in units of the contact's own mass, scaled by an
+impedance $d \in (0, 1)$: $a_\text{ref} = -B v - K d(r) r$, $K = k / d_w^2$, $B = b / d_w$. The
+stiffness is $k = \omega_0^2$ and the damping $b = 2 \zeta \omega_0$. Raising $k$ makes contact
+stiffer; raising $d$ makes it yield less to a sustained force: at rest under the acceleration
+$a_0$ the depth is $(1 - d_w) a_0 / k$. With a margin the force begins at that distance from the surface.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from mjxgrad._math import safe_sqrt
+from mjxgrad._mjx import mjx
+from mjxgrad._static import is_known
+from mjxgrad.contact.law import compensated_stiffness
+from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters, deciding_geoms
+
+_PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
+_SUBSETS = ("geoms", "pairs", "bodies", "groups")
+# What is positive by nature is interpolated by ratios.
+_GEOMETRIC = ("stiffness", "width", "rest_acceleration")
+_Pairs = tuple[ContactPair, ...]
+# As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
+_WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
+_ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
+
+
+def _as_float(value: Any) -> Array:
+    # Integers are converted too: 10000 is a natural way to write a stiffness.
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def _as_optional_float(value: Any) -> Array | None:
+    return None if value is None else _as_float(value)
+
+
+class Softness(eqx.Module):
+    r"""Contact softness, set consistently on all pairs of geoms or on some of them.
+
+    Stiffness and damping are written in MuJoCo's direct format, solref $= (-k, -b)$ with
+    $b = 2 \zeta \sqrt k$: in the standard format `refsafe` silently replaces a time constant
+    below two time steps, and the direct one it leaves alone. They are written to both geoms of
+    a pair, so that neither mixing nor priority changes them.
+
+    A margin moves the place where force begins away from the surface, and with it the place of rest: bodies hover by
+    the margin less their depth. `rest_acceleration` gives the height back, exactly under one load, by a softer
+    spring, $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Shrinking the geoms by
+    the margin would undo it, for a margin is nothing but larger geoms; a lower impedance runs out at $d = 0$
+    where $k m > a_0$. The price: n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
+
+    A part left as `None` stays as it is in the model; of stiffness and damping ratio the one not
+    given keeps its present effective value. Every part is a leaf of a pytree, so that a sweep is
+    one `jax.vmap` over a `Softness` with a leading axis (see `sweep`).
+
+    Attributes:
+        stiffness: $k = \omega_0^2$, in 1/s²; positive. With `rest_acceleration`, that without margin.
+        damping_ratio: $\zeta$; 1 is critical.
+        impedance: a constant $d$, or $(d_0, d_w)$ at the surface and at depth `width`. MuJoCo
+            keeps it between 1e-4 and 0.9999.
+        width: depth over which the impedance rises from $d_0$ to $d_w$, in m.
+        margin: distance at which force begins, in m; at least 0. It is that of the pair, shared among its geoms.
+        rest_acceleration: $a_0$ under which bodies rest as high as without margin, in m/s²; None lets them hover.
+        geoms: change only pairs with at least one of these geoms, by name.
+        pairs: change only these pairs, by the names of their geoms.
+        bodies: change only pairs with at least one geom of these bodies, by name.
+        groups: change only pairs with at least one geom of these groups (MJCF's `group`, 0 to 5).
+    """
+
+    stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    impedance: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    width: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    margin: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
+    pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
+    bodies: tuple[str, ...] | None = eqx.field(static=True, default=None)
+    groups: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        """Refuse several subsets at once, and values without meaning if they are known.
+
+        Raises:
+            ValueError: if more than one of `geoms`, `pairs`, `bodies` and `groups` is given; if a part is out of its range;
+                if `rest_acceleration` comes without a margin.
+        """
+        given = [name for name in _SUBSETS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"Softness takes either geoms or pairs, bodies or groups, got {' and '.join(given)}")
+        if self.rest_acceleration is not None and self.margin is None:
+            raise ValueError("rest_acceleration must come with a margin, got none; give Softness a margin, too")
+        for name, is_valid, requirement in (
+            ("stiffness", lambda x: x > 0, "positive"),
+            ("damping_ratio", lambda x: x >= 0, "at least 0"),
+            ("impedance", lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+            ("width", lambda x: x > 0, "positive"),
+            ("margin", lambda x: (x >= 0) & np.isfinite(x), "finite and at least 0"),
+            ("rest_acceleration", lambda x: x > 0, "positive"),
+        ):
+            value = getattr(self, name)
+            if is_known(value) and not np.all(is_valid(np.asarray(value))):
+                raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
+
+    @classmethod
+    def sweep(cls, **parts: Any) -> "Softness":
+        """Stack several values of softness for `jax.vmap`, broadcasting what stays the same.
+
+        `Softness.sweep(stiffness=[1e2, 1e4], damping_ratio=1.0)` has two values of each.
+
+        Args:
+            **parts: as for `Softness`, each with or without a leading axis; an impedance
+                $(d_0, d_w)$ has its pair of numbers on the last axis.
+
+        Returns:
+            One `Softness` whose leaves share their leading axis.
+        """
+        static = {name: parts.pop(name) for name in _SUBSETS if name in parts}
+        arrays = {name: _as_float(value) for name, value in parts.items() if value is not None}
+        lengths = {name: a.shape[0] for name, a in arrays.items() if a.ndim}
+        length = max(lengths.values(), default=1)
+        for name, a in arrays.items():
+            is_pair = name == "impedance" and a.shape == (2,) and length != 2
+            if a.ndim == 0 or is_pair:
+                arrays[name] = jnp.broadcast_to(a, (length, *a.shape))
+        return cls(**arrays, **static)
+
+    @classmethod
+    def between(cls, start: "Softness", end: "Softness", progress: Float[ArrayLike, ""]) -> "Softness":
+        """Go a part of the way from one softness to another; traceable.
+
+        Stiffness, width and rest acceleration change by equal factors, the rest by equal amounts. Where a smoothing of
+        `optimise` lowers a scale from 1, `lambda scale: objective(Softness.between(hard, soft, scale))` hardens the
+        contact with it.
+
+        Args:
+            start: at progress 0.
+            end: at progress 1; with the same parts and the same subset.
+            progress: clipped to between 0 and 1.
+
+        Raises:
+            ValueError: if the two differ in the parts that they give or in their subset.
+        """
+        share = jnp.clip(_as_float(progress), 0.0, 1.0)
+        parts = {}
+        for name in _SUBSETS:
+            if getattr(start, name) != getattr(end, name):
+                raise ValueError(
+                    f"start and end must have the same {name}, got {getattr(start, name)} and {getattr(end, name)}"
+                )
+            parts[name] = getattr(start, name)
+        for name in _PARTS:
+            first, last = getattr(start, name), getattr(end, name)
+            if (first is None) != (last is None):
+                raise ValueError(f"start and end must both have a {name} or neither, got {first} and {last}")
+            if first is not None and last is not None:
+                is_geometric = name in _GEOMETRIC
+                parts[name] = first ** (1 - share) * last**share if is_geometric else (1 - share) * first + share * last
+        return cls(**parts)
+
+    def schedule(self, end: "Softness", num_steps: int) -> Callable[[ArrayLike], "Softness"]:
+        """Give a softness that goes to another in a number of steps and stays there, as a function of the step.
+
+        Args:
+            end: see `between`.
+            num_steps: at least 1.
+
+        Raises:
+            ValueError: if `num_steps` is below 1.
+        """
+        if num_steps < 1:
+            raise ValueError(f"num_steps must be at least 1, got {num_steps}")
+        return lambda step: Softness.between(self, end, jnp.asarray(step) / num_steps)
+
+    def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
+        """Give the pairs that this changes.
+
+        Raises:
+            ValueError: if a name is unknown or can touch nothing.
+        """
+        return _select(model, geoms=self.geoms, pairs=self.pairs, bodies=self.bodies, groups=self.groups)
+
+    def apply(self, model: mjx.Model) -> mjx.Model:
+        r"""Write this softness into a model.
+
+        Traceable and differentiable with respect to every part and to the model's leaves. If only
+        one of stiffness and damping ratio is given, a geom that takes part in several pairs can
+        keep the other's present value only if those pairs agree in it.
+
+        Args:
+            model: of MJX.
+
+        Returns:
+            The model with other `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`.
+
+        Raises:
+            ValueError: if a part has a leading axis; if a name is unknown; if a geom to be changed
+                also decides the contact of a pair that was not selected; if the present values
+                to be kept disagree; if a margin is asked of a mesh or height field, or a height to be kept of a contact
+                that has a margin already and no stiffness given.
+        """
+        self._refuse_batch()
+        selected = self.selected(model)
+        before = contact_parameters(model, selected)
+        explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
+        if self.margin is not None:
+            model = self._set_margin(model, selected, list(explicit))
+        if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
+            return model
+        _refuse_shared_geoms(model, selected)
+        # For each place to be written, the pair that it belongs to.
+        geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
+
+        if self.impedance is not None or self.width is not None:
+            model = model.replace(
+                geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
+                pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
+            )
+        if any(part is not None for part in (self.stiffness, self.damping_ratio, self.rest_acceleration)):
+            solref = self._solref(model, selected, before)
+            model = model.replace(
+                geom_solref=_write(model.geom_solref, geoms, solref),
+                pair_solref=_write(model.pair_solref, explicit, solref),
+            )
+        return model
+
+    def _solref(self, model: mjx.Model, pairs: tuple[ContactPair, ...], before: ContactParameters) -> Array:
+        """The direct format for each pair, from a model that has the other parts."""
+        refuse = functools.partial(_refuse_disagreement, model, pairs)
+        stiffness, damping_ratio = self.stiffness, self.damping_ratio
+        if stiffness is None:
+            stiffness = before.stiffness
+            refuse(stiffness, "stiffness", "give Softness a stiffness")
+            if self.rest_acceleration is not None and is_known(before.margin) and np.any(before.margin):
+                raise ValueError(
+                    "stiffness must be given with rest_acceleration where contacts have a margin already, got none; their "
+                    "present stiffness may have been made for that margin"
+                )
+        if damping_ratio is None:
+            damping_ratio = before.damping_ratio
+            refuse(damping_ratio, "damping_ratio", "give Softness a damping_ratio")
+        stiffness = jnp.broadcast_to(stiffness, before.stiffness.shape)
+        if self.rest_acceleration is not None:
+            present = contact_parameters(model, pairs)
+            load = present.pyramid * self.rest_acceleration
+            stiffness = compensated_stiffness(stiffness, present.solimp, present.margin, load)
+            remedy = "list one of them as <pair> in the MJCF's <contact>"
+            refuse(stiffness, "stiffness that keeps the height", remedy)
+        damping = 2.0 * damping_ratio * safe_sqrt(stiffness)
+        return jnp.stack([-stiffness, -jnp.broadcast_to(damping, stiffness.shape)], axis=-1)
+
+    def _set_margin(self, model: mjx.Model, pairs: tuple[ContactPair, ...], explicit: list[int]) -> mjx.Model:
+        """Write the margin to explicit pairs, and share it among the geoms of the others."""
+        geoms, shares, kept = _margin_shares(model, pairs)
+        geom_margin, pair_margin = model.geom_margin, model.pair_margin
+        if geoms.size:
+            missing = self.margin - kept @ geom_margin
+            geom_margin = geom_margin.at[geoms].set((shares @ missing).astype(geom_margin.dtype))
+        if explicit:
+            pair_margin = pair_margin.at[np.array(explicit)].set(self.margin)
+        return model.replace(geom_margin=geom_margin, pair_margin=pair_margin)
+
+    def _set_solimp(self, solimp: Array, rows: list[int]) -> Array:
+        """Write impedance and width; they mix linearly, so the rest keeps its mixed value."""
+        if not rows:
+            return solimp
+        if self.impedance is not None:
+            solimp = solimp.at[np.array(rows), :2].set(self.impedance)
+        if self.width is not None:
+            solimp = solimp.at[np.array(rows), 2].set(self.width)
+        return solimp
+
+    def _refuse_batch(self) -> None:
+        for name in _PARTS:
+            value = getattr(self, name)
+            allowed = [(), (2,)] if name == "impedance" else [()]
+            if value is not None and value.shape not in allowed:
+                raise ValueError(
+                    f"{name} must be one value to be applied, got shape {value.shape}; apply a sweep under jax.vmap"
+                )
+
+
+def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
+    if not places:
+        return values
+    return values.at[np.array(list(places))].set(per_pair[np.array(list(places.values()))])
+
+
+def _select(
+    model: mjx.Model,
+    *,
+    geoms: tuple[str, ...] | None = None,
+    pairs: tuple[tuple[str, str], ...] | None = None,
+    bodies: tuple[str, ...] | None = None,
+    groups: tuple[int, ...] | None = None,
+) -> _Pairs:
+    """Give the pairs that are named in one of four ways; all of them without a name.
+
+    Args:
+        model: of MJX.
+        geoms: pairs with at least one of these geoms.
+        pairs: exactly these.
+        bodies: pairs with at least one geom of these bodies.
+        groups: pairs with at least one geom of these groups, MJCF's `group`.
+
+    Raises:
+        ValueError: if a name is unknown or can touch nothing.
+    """
+    everything = contact_pairs(model)
+    if pairs is not None:
+        known = {frozenset(pair.names) for pair in everything}
+        for names in pairs:
+            if frozenset(names) not in known:
+                raise ValueError(
+                    f"softness.pairs must name pairs of geoms that can touch, got {names!r}; "
+                    f"those that can: {', '.join(str(p) for p in everything) or 'none'}"
+                )
+        wanted = {frozenset(names) for names in pairs}
+        return tuple(p for p in everything if frozenset(p.names) in wanted)
+    if geoms is not None:
+        return _with_any(everything, "geoms", geoms, [set(pair.names) for pair in everything])
+    if bodies is not None:
+        return _with_any(everything, "bodies", bodies, [_body_names(model, pair) for pair in everything])
+    if groups is not None:
+        members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
+        return _with_any(everything, "groups", groups, members)
+    return everything
+
+
+def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
+    """Refuse to change pairs whose geoms also decide the contact of others.
+
+    Raises:
+        ValueError: naming both pairs and the geom.
+    """
+    decided_by = {geom: pair for pair in selected for geom in deciding_geoms(model, pair)}
+    for other in contact_pairs(model):
+        if other in selected:
+            continue
+        for geom in deciding_geoms(model, other):
+            if geom in decided_by:
+                raise ValueError(_shared(decided_by[geom], other, geom))
+
+
+def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part: str, remedy: str) -> None:
+    """Refuse to write one value per pair where pairs with different ones share a geom; not looked at if traced.
+
+    Raises:
+        ValueError: naming both pairs and their values.
+    """
+    if not is_known(values):
+        return
+    known, first = np.asarray(values), {}
+    for i, pair in enumerate(selected):
+        for geom in deciding_geoms(model, pair):
+            j = first.setdefault(geom, i)
+            if not np.isclose(known[i], known[j], rtol=1e-5):
+                raise ValueError(
+                    f"{part} must be given, or be the same now in the pairs {selected[j]} and "
+                    f"{pair}, which share a geom, got {known[j]:.4g} and {known[i]:.4g}; {remedy}"
+                )
+
+
+def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    r"""Say how a margin of pairs becomes margins of geoms, which MuJoCo adds, and leaves other pairs alone.
+
+    A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
+    each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair.
+
+    Args:
+        model: of MJX.
+        selected: the pairs; those with parameters of their own have no part in it.
+
+    Returns:
+        The geoms to write; the matrix from what each pair misses to their margins; the matrix P over all geoms.
+
+    Raises:
+        ValueError: if the margins of the pairs cannot be set without those of others, or a geom is a mesh or height field,
+            for which MJX computes no distances.
+    """
+    for pair in selected:
+        if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
+            raise ValueError(
+                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only where "
+                "they touch; select other pairs, or replace the mesh by primitive geoms"
+            )
+    implicit = [pair for pair in selected if pair.explicit < 0]
+    others = [pair for pair in contact_pairs(model) if pair.explicit < 0 and pair not in selected]
+    taken = {geom: other for other in others for geom in (other.geom1, other.geom2)}
+    free = sorted({geom for pair in implicit for geom in (pair.geom1, pair.geom2)} - taken.keys())
+    column = {geom: i for i, geom in enumerate(free)}
+    shares, kept = np.zeros((len(implicit), len(free))), np.zeros((len(implicit), model.ngeom))
+    for row, pair in enumerate(implicit):
+        for geom in (pair.geom1, pair.geom2):
+            if geom in column:
+                shares[row, column[geom]] += 1
+            else:
+                kept[row, geom] += 1
+        if not shares[row].any():
+            raise ValueError(_shared(pair, taken[pair.geom1], pair.geom1))
+    solution = np.linalg.pinv(shares)
+    # Whether they can be met must not depend on values, which may be traced: every right-hand side has to be in reach.
+    wanted = np.column_stack([np.ones(len(implicit)), kept])
+    unmet = np.abs(shares @ solution @ wanted - wanted).max(axis=1, initial=0.0)
+    if unmet.max(initial=0.0) > _ROUNDING:
+        row = int(np.argmax(unmet))
+        raise ValueError(
+            f"margin of the pair {implicit[row]} cannot be set while geoms that it shares with others keep theirs; select "
+            "all pairs of these geoms, or list the pair as <pair> in the MJCF's <contact>"
+        )
+    return np.array(free, dtype=int), solution, kept
+
+
+def _with_any(everything: _Pairs, kind: str, wanted: tuple, members: list[set]) -> _Pairs:
+    known = set().union(*members)
+    for one in wanted:
+        if one not in known:
+            raise ValueError(
+                f"softness.{kind} must name {kind} that can touch another, got {one!r}; "
+                f"those that can: {', '.join(str(x) for x in sorted(known)) or 'none'}"
+            )
+    return tuple(pair for pair, names in zip(everything, members, strict=True) if names & set(wanted))
+
+
+def _body_names(model: mjx.Model, pair: ContactPair) -> set[str]:
+    bodies = {int(model.geom_bodyid[geom]) for geom in (pair.geom1, pair.geom2)}
+    return {mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}" for body in bodies}
+
+
+def _shared(pair: ContactPair, other: ContactPair, geom: int) -> str:
+    name = other.names[0] if geom == other.geom1 else other.names[1]
+    return (
+        f"softness of the pair {pair} would also change the pair {other}, "
+        f"which shares the geom {name!r}; select that pair too, or list one of "
+        f"the two as <pair> in the MJCF's <contact> so that it has its own parameters"
+    )

@@ -1,0 +1,261 @@
+r"""Contacts and limits averaged over noise on their distance, in closed form, within the solver.
+
+Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
+decides whether there is contact at all, $r + w < 0$. The mean of each row's cost over the noise is again convex and has a closed
+form, so the same solve finds the acceleration.
+What is averaged is thus the step's contact law and not the motion.
+
+As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters: a row without it
+(`gated=False`) acts wherever $J a - a_\text{ref} + K d w < 0$, touching or not, and its damping brakes bodies that
+approach from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact. It is the row that
+interior-point and barrier methods smooth.
+
+A row has x = J a + B J v + c r with c = K d(r), and pushes with -D x where x < 0 and r < 0. Noise w on r makes that
+x + c w and r + w. With ρ the noise's density, P its distribution function and S its softened ramp, in units of its
+length (see `kernels`), the mean push is
+
+    F(x) = -D ∫_{w < W} (x + c w) ρ(w) dw,        W = min(-r, -x/c),
+
+that is D c S(x/c) while x > c r, and from there on downwards the tangent to that: noise-free parts of x that are
+positive mean a row that lets go before the bodies part, negative ones a row that pushes until they do. The cost is a
+mean of convex functions of a, so the problem stays convex, and the rows need nothing but the two numbers of
+`constraint.Noise`, spread = c times length, gate = c r. The edges of a pyramid share their noise, which changes
+nothing, since the mean of a sum is the sum of the means; cones: see `constraint`.
+
+Two of a row's parameters depend on depth themselves, through the impedance: the weight D and c. They are taken at one
+depth, the mean of -(r + w) where it is positive. For bodies in contact this is their depth as the length goes to zero;
+for bodies apart it is about how far noise drives them into each other when it does. (At the mean distance itself,
+contacts whose impedance begins at zero would have no force at a distance at all.)
+
+MJX knows the distance of boxes, meshes and height fields only where they overlap, and says 1 or more elsewhere: such
+slots have no rows.
+"""
+
+import dataclasses
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad._static import is_known
+from mjxgrad.contact.law import impedance, stiffness_damping
+from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.constraint import Noise, RowLayout
+from mjxgrad.dynamics.kernels import KERNELS, Kernel
+
+KernelName = Literal["gaussian", "logistic", "log_barrier"]
+Mode = Literal["forward", "backward"]
+
+# Far below the stiffness of any contact (1/s²). Without stiffness noise on the distance does nothing, and c divides.
+_SOFTEST = 1e-3
+# Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
+# derivative.
+_WEIGHTLESS = 1e30
+_BALL_ON_BOX = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)}
+_CONVEX = {int(kind) for kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)}
+
+
+def _as_length(value: Any) -> Array:
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+def _as_optional_length(value: Any) -> Array | None:
+    return None if value is None else _as_length(value)
+
+
+class Smoothing(eqx.Module):
+    """Noise on the distance of every contact, averaged in the solver without sampling.
+
+    A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
+
+    Attributes:
+        length: of the noise (m): the standard deviation of the Gaussian, and for the other kernels the one that gives
+            the same mean absolute value.
+        kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach some lengths far, the last
+            one falls off as 1/r.
+        mode: "forward" moves by the smoothed contact: force at a distance, and derivatives to match. "backward" moves
+            as without smoothing, and takes the derivative of the smoothed step at each state that is visited.
+        limit_length: likewise for the limits of joints and tendons, in their own units (m or rad); None leaves them as
+            they are. Apart from contacts, since no one length fits metres and radians.
+        gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
+    """
+
+    length: Float[Array, "..."] = eqx.field(converter=_as_length)
+    # Plain strings, so that a name that there is not meets the check below, which knows the choices.
+    kernel: str = eqx.field(static=True, default="gaussian")
+    mode: str = eqx.field(static=True, default="forward")
+    limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_optional_length, default=None, kw_only=True)
+    gated: bool = eqx.field(static=True, default=True, kw_only=True)
+
+    def __check_init__(self):
+        """Refuse names that there are not, and lengths without meaning if they are known.
+
+        Raises:
+            ValueError: if a length is not positive and finite, or there is no such kernel or mode.
+        """
+        for name, choices in (("kernel", get_args(KernelName)), ("mode", get_args(Mode))):
+            if (given := getattr(self, name)) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
+        remedies = {
+            "length": "for a step without smoothing give smoothing=None",
+            "limit_length": "None leaves limits alone",
+        }
+        for name, remedy in remedies.items():
+            value = getattr(self, name)
+            if not is_known(value):
+                continue
+            known = np.asarray(value)
+            if not np.all((known > 0) & np.isfinite(known)):
+                raise ValueError(f"{name} must be positive and finite, got {known!s}: {remedy}")
+
+    @property
+    def noise(self) -> Kernel:
+        """The kernel itself, in units of the length."""
+        return KERNELS[self.kernel]
+
+    def check(self, gradient: str) -> None:
+        """Refuse what a single step cannot take.
+
+        Raises:
+            ValueError: if a length has a leading axis, or the event correction is asked for, too.
+        """
+        for name in ("length", "limit_length"):
+            value = getattr(self, name)
+            if value is not None and value.ndim:
+                raise ValueError(f"{name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap")
+        if gradient == "event":
+            raise ValueError(
+                "gradient must be 'discrete' with smoothing, got 'event': the derivative of a smoothed contact already knows "
+                "that its time moves; smooth limits by limit_length"
+            )
+
+
+def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
+    """Say which parts of a smoothing have no effect on a model.
+
+    Args:
+        smoothing: as given to a step or rollout.
+        model: of MJX; only its static structure is read.
+
+    Returns:
+        Sentences that name what is not smoothed; none if everything is.
+    """
+    messages = []
+    pairs = contact_pairs(model)
+    if not pairs:
+        messages.append(f"smoothing of {smoothing.kernel} contact has no effect: no two geoms of the scene can touch")
+    blind = [str(pair) for pair in pairs if _is_blind(model, pair.geom1, pair.geom2)]
+    if blind:
+        shown = ", ".join(blind[:4]) + (f" and {len(blind) - 4} more" if len(blind) > 4 else "")
+        messages.append(
+            f"smoothing gives no force at a distance to {shown}: MJX knows the distance of a box, mesh or height field from "
+            "anything but a plane only where they overlap; build them of spheres and capsules"
+        )
+    if smoothing.limit_length is not None and not has_limits(model):
+        messages.append("limit_length has no effect: no joint or tendon of the scene has a limit")
+    return messages
+
+
+def has_limits(model: mjx.Model) -> bool:
+    """Whether some joint or tendon has a limit that acts."""
+    if int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        return False
+    return bool(np.any(model.jnt_limited) or np.any(model.tendon_limited))
+
+
+def _is_blind(model: mjx.Model, geom1: int, geom2: int) -> bool:
+    kinds = {int(model.geom_type[geom1]), int(model.geom_type[geom2])}
+    return bool(kinds & _CONVEX) and int(mujoco.mjtGeom.mjGEOM_PLANE) not in kinds and kinds != _BALL_ON_BOX
+
+
+def smoothed(
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing, layout: RowLayout
+) -> tuple[list[Block], Noise | None, RowLayout]:
+    """Return rows, their noise and their laws under noise.
+
+    Args:
+        model: with the solver's options.
+        data: with contacts.
+        blocks: the rows of this state.
+        smoothing: which noise, and on what.
+        layout: the laws of the rows without noise.
+
+    Returns:
+        The rows, present at any distance where they have noise; the noise of all rows, with numbers without meaning
+        where there is none; the laws. Noise is None, and nothing else changes, if there is nothing to be smoothed.
+    """
+    has_distance, num_contacts = _has_distance(model, data), 0
+    rows, noises, first = [], [], None
+    start = 0
+    for block in blocks:
+        each, count = block.rows_each, len(block.residual)
+        length = smoothing.length if block.is_contact else smoothing.limit_length
+        if not each or length is None:
+            noise = Noise(jnp.ones_like(block.residual), jnp.zeros_like(block.residual))
+        else:
+            known = jnp.ones(count // each, bool)
+            if block.is_contact:
+                known = has_distance[num_contacts : num_contacts + count // each]
+                num_contacts += count // each
+            block, noise = _noisy(model, block, known, length.astype(block.residual.dtype), smoothing)
+            first = start if first is None else first
+        rows.append(block)
+        noises.append(noise)
+        start += count
+    if first is None:
+        return blocks, None, layout
+    noise = Noise(*(jnp.concatenate([getattr(n, name) for n in noises]) for name in ("spread", "gate")))
+    return rows, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=first)
+
+
+def noisy_rows(
+    model: mjx.Model, block: Block, smoothing: Smoothing, layout: RowLayout
+) -> tuple[Block, Noise, RowLayout]:
+    """Return contact rows under noise that are a whole problem's, as `smoothed` does; all at a known distance."""
+    known = jnp.ones(len(block.residual) // block.rows_each, bool)
+    block, noise = _noisy(model, block, known, smoothing.length.astype(block.residual.dtype), smoothing)
+    return block, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=0)
+
+
+def _noisy(
+    model: mjx.Model, block: Block, known: Bool[Array, " groups"], length: Float[Array, ""], smoothing: Smoothing
+) -> tuple[Block, Noise]:
+    """Return a block that is present at any known distance, and its noise."""
+    each, kernel = block.rows_each, smoothing.noise
+    distance = jnp.where(known, block.residual[::each], 1.0)
+    depth = _depth(kernel, distance, length)
+    resistance = impedance(block.solimp[::each], depth)
+
+    def spread(x: Array) -> Array:
+        return jnp.repeat(x, each, axis=0, total_repeat_length=len(block.residual))
+
+    stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
+    rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
+    gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
+    is_present = spread(known)
+    present = eqx.tree_at(
+        lambda b: (b.impedance, b.inverse_weight, b.is_active),
+        block,
+        (jax.tree.map(spread, resistance), jnp.where(is_present, block.inverse_weight, _WEIGHTLESS), is_present),
+    )
+    return present, Noise(spread(rate * length), spread(gate))
+
+
+def _depth(kernel: Kernel, distance: Float[Array, " groups"], length: Float[Array, ""]) -> Float[Array, " groups"]:
+    """Return the mean of -(r + w) where it is positive (m or rad)."""
+    return length * kernel.depth(distance / length)
+
+
+def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
+    contact = data._impl.contact
+    is_convex = np.isin(model.geom_type, list(_CONVEX))
+    if not is_convex.any() or not len(contact.dist):
+        return jnp.ones(len(contact.dist), bool)
+    # Of a ball on a box it is known, and of no interest beyond a metre.
+    return ~(jnp.any(jnp.asarray(is_convex)[contact.geom], axis=1) & (contact.dist >= 1))

@@ -1,0 +1,327 @@
+r"""Smoothed linear models of a step: what state and control do to the next state on average over a little noise.
+
+Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \operatorname{diag} s^2)$, the mean step is
+
+    E f(x + dx + w_x, u + du + w_u)  ≈  c + A dx + B du.
+
+Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
+Across a contact the mean is smooth even where f is not: before a touch, A and B already know what a push will do.
+
+Three ways to the same model: `first_order` averages Jacobians and misses what they do not see (a jump of f; under
+`gradient="discrete"` the moving time of an impact); `zeroth_order` fits a plane to samples of f and misses nothing, at the
+price of noise; `analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
+distance of contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it
+agrees with the others as far as a contact's impedance is small against one.
+
+References:
+    Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
+    Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact
+    Models. T-RO 2023, arXiv:2206.10787 (the analytic way).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+
+from mjxgrad.planning.system import System
+
+
+class LinearModel(eqx.Module):
+    """A linear model of a step; under `jax.vmap` every field gains leading axes.
+
+    Attributes:
+        A: derivative of the next state's change by the present one's; without columns if it was not asked for.
+        B: derivative of the next state's change by the control.
+        c: the mean next state.
+        A_error: standard error of each entry of `A`; zero where nothing is sampled.
+        B_error: of `B`.
+        c_error: of `c`, in the coordinates of a change.
+        finite_fraction: share of the samples that were finite; the others are left out. If too few are left to fit a model,
+            all numbers are NaN.
+    """
+
+    A: Float[Array, "n columns"]
+    B: Float[Array, "n m"]
+    c: Float[Array, " state"]
+    A_error: Float[Array, "n columns"]
+    B_error: Float[Array, "n m"]
+    c_error: Float[Array, " n"]
+    finite_fraction: Float[Array, ""]
+
+
+def analytic(
+    system: System, state: Float[Array, " state"], control: Float[Array, " m"], *, wrt_state: bool = True
+) -> LinearModel:
+    """Linearise the step itself; with `SceneSystem.smoothing` that is the smoothed solver's, without it the plain one's.
+
+    Args:
+        system: what to linearise.
+        state: where.
+        control: under which control.
+        wrt_state: whether A is wanted.
+
+    Returns:
+        The model, without sampling error.
+    """
+    noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
+    jacobian, ends = _linearised(system, state, control, noise, wrt_state)
+    change, jacobian = _changes(system, ends, ends[0], jacobian)
+    is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
+    exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
+    return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1, num_controls=control.size)
+
+
+def first_order(
+    system: System,
+    state: Float[Array, " state"],
+    control: Float[Array, " m"],
+    key: PRNGKeyArray,
+    *,
+    stddev_state: ArrayLike = 0.0,
+    stddev_control: ArrayLike = 0.0,
+    num_samples: int,
+    wrt_state: bool = True,
+) -> LinearModel:
+    """Average Jacobians over samples of the noise.
+
+    The mean next state is that of the samples less what their mean Jacobian explains of it (each sample's own left out), so
+    that noise adds nothing to a linear step: A, B and c are then exact.
+
+    Args:
+        system: what to linearise.
+        state: where.
+        control: around which control.
+        key: consumed here.
+        stddev_state: of the noise on the state, a number or one per coordinate of a change; at least 0.
+        stddev_control: of the noise on the control, a number or one per control; at least 0.
+        num_samples: at least 2.
+        wrt_state: whether A is wanted; the state's noise acts in any case.
+
+    Returns:
+        The model.
+
+    Raises:
+        ValueError: if a standard deviation is negative or does not fit, or there are too few samples.
+    """
+    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
+    _check_count(num_samples, 2)
+    noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
+    # The step without noise runs in the same batch: a call of its own would be compiled a second time.
+    jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
+    value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
+    is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
+    jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
+    value = jnp.where(is_finite[:, None], value, 0.0)
+    count = is_finite.sum()
+    mean, error = _mean(jacobian, is_finite)
+    others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
+    seen = noise[:, -jacobian.shape[2] :]
+    rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
+    return _model(system, ends[0], mean, error, rest, rest_error, is_finite, least=2, num_controls=control.size)
+
+
+def zeroth_order(
+    system: System,
+    state: Float[Array, " state"],
+    control: Float[Array, " m"],
+    key: PRNGKeyArray,
+    *,
+    stddev_state: ArrayLike,
+    stddev_control: ArrayLike,
+    num_samples: int,
+) -> LinearModel:
+    r"""Fit a plane to samples of the step by least squares; nothing is differentiated.
+
+    Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
+    Its errors do not assume that the samples scatter alike everywhere (White's, with leverage taken out, HC3), for across a
+    contact they do not.
+
+    Args:
+        system: what to linearise; it need not have derivatives.
+        state: where.
+        control: around which control.
+        key: consumed here.
+        stddev_state: of the noise on the state, a number or one per coordinate of a change; where it is 0 the step is not
+            seen to vary, and that column of A is zero, with an infinite error.
+        stddev_control: of the noise on the control, likewise for B.
+        num_samples: at least two more than there are coordinates of state and control.
+
+    Returns:
+        The model.
+
+    Raises:
+        ValueError: if a standard deviation is negative or does not fit, or there are too few samples.
+    """
+    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
+    least = stddev.size + 2
+    _check_count(num_samples, least)
+    unit = jax.random.normal(key, (num_samples, stddev.size), state.dtype)
+    nominal, value = _sampled(system, state, control, stddev * unit)
+    is_finite = jnp.all(jnp.isfinite(value), axis=1)
+    value = jnp.where(is_finite[:, None], value, 0.0)
+    # In units of the noise the normal equations are well conditioned whatever the units of the coordinates.
+    design = jnp.where(is_finite[:, None], jnp.concatenate([jnp.ones((num_samples, 1)), unit], axis=1), 0.0)
+    # Too few finite samples make the equations singular; then the ones on the diagonal keep them solvable, and no one sees it.
+    enough = is_finite.sum() >= least
+    gram = design.T @ design + jnp.where(enough, 0.0, 1.0) * jnp.eye(least - 1)
+    influence = jnp.linalg.solve(gram, design.T)
+    slope = influence @ value
+    leverage = jnp.einsum("ip,pi->i", design, influence)
+    residual = (value - design @ slope) / (1 - jnp.minimum(leverage, 1 - 1e-6))[:, None]
+    error = jnp.sqrt(influence**2 @ residual**2)
+    is_seen = stddev[:, None] > 0
+    scale = jnp.where(is_seen, stddev[:, None], 1.0)
+    jacobian = jnp.where(is_seen, slope[1:] / scale, 0.0).T
+    jacobian_error = jnp.where(is_seen, error[1:] / scale, jnp.inf).T
+    return _model(
+        system, nominal, jacobian, jacobian_error, slope[0], error[0], is_finite, least=least, num_controls=control.size
+    )
+
+
+def mean_step(
+    system: System,
+    state: Float[Array, " state"],
+    control: Float[Array, " m"],
+    key: PRNGKeyArray,
+    *,
+    stddev_state: ArrayLike = 0.0,
+    stddev_control: ArrayLike = 0.0,
+    num_samples: int,
+) -> Float[Array, " state"]:
+    """Return the mean next state under noise. The same key gives the same noise: as a function of the state it is one map.
+
+    Args:
+        system: what to step.
+        state: where.
+        control: around which control.
+        key: consumed here.
+        stddev_state: of the noise on the state, as for `first_order`.
+        stddev_control: of the noise on the control.
+        num_samples: at least 1. Each is taken with its mirror image, so that a linear step is averaged without error.
+
+    Returns:
+        The mean of the samples that are finite.
+
+    Raises:
+        ValueError: if a standard deviation is negative or does not fit, or there is no sample.
+    """
+    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
+    _check_count(num_samples, 1)
+    noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
+    nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
+    is_finite = jnp.all(jnp.isfinite(value), axis=1)
+    mean, _ = _mean(jnp.where(is_finite[:, None], value, 0.0), is_finite)
+    return system.retract(nominal, mean)
+
+
+def _perturbed(
+    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, " both"]
+) -> Float[Array, " state"]:
+    """Return the next state under noise on state and control."""
+    n = system.num_changes
+    return system.step(system.retract(state, noise[:n]), control + noise[n:])
+
+
+def _sampled(
+    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, "N both"]
+) -> tuple[Float[Array, " state"], Float[Array, "N n"]]:
+    """Return the next state without noise, and how far from it those with noise are."""
+    ends = jax.vmap(lambda w: _perturbed(system, state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
+    return ends[0], jax.vmap(lambda end: system.difference(end, ends[0]))(ends[1:])
+
+
+def _linearised(
+    system: System,
+    state: Float[Array, " state"],
+    control: Float[Array, " m"],
+    noise: Float[Array, "N both"],
+    wrt_state: bool,
+) -> tuple[Float[Array, "N state columns"], Float[Array, "N state"]]:
+    """Return, for each sample of noise, the derivative of the next state, and that state."""
+    columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
+
+    def sample(noise: Float[Array, " both"]) -> tuple[Float[Array, "state columns"], Float[Array, " state"]]:
+        def moved(change: Float[Array, " columns"]) -> tuple[Float[Array, " state"], Float[Array, " state"]]:
+            end = _perturbed(system, state, control, noise.at[columns].add(change))
+            return end, end
+
+        return jax.jacfwd(moved, has_aux=True)(jnp.zeros(columns.size, state.dtype))
+
+    return jax.vmap(sample)(noise)
+
+
+def _changes(
+    system: System,
+    ends: Float[Array, "N state"],
+    nominal: Float[Array, " state"],
+    jacobian: Float[Array, "N state columns"],
+) -> tuple[Float[Array, "N n"], Float[Array, "N n columns"]]:
+    """Return states and their derivatives as changes of the nominal one."""
+
+    def one(end: Float[Array, " state"], jacobian: Float[Array, "state columns"]):
+        def change(end: Float[Array, " state"]) -> Float[Array, " n"]:
+            return system.difference(end, nominal)
+
+        return change(end), jax.jacfwd(change)(end) @ jacobian
+
+    return jax.vmap(one)(ends, jacobian)
+
+
+def _mean(
+    samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return mean and standard error of the samples that are used."""
+    weights = is_used.astype(samples.dtype).reshape(-1, *[1] * (samples.ndim - 1))
+    count = jnp.maximum(weights.sum(), 1)
+    mean = (weights * samples).sum(axis=0) / count
+    variance = (weights * (samples - mean) ** 2).sum(axis=0) / jnp.maximum(count - 1, 1)
+    return mean, jnp.sqrt(variance / count)
+
+
+def _model(
+    system: System,
+    nominal: Float[Array, " state"],
+    jacobian: Float[Array, "n columns"],
+    jacobian_error: Float[Array, "n columns"],
+    change: Float[Array, " n"],
+    change_error: Float[Array, " n"],
+    is_finite: Bool[Array, " N"],
+    *,
+    least: int,
+    num_controls: int,
+) -> LinearModel:
+    """Split the Jacobian, and refuse to give numbers where too few samples were finite."""
+    exists = is_finite.sum() >= least
+    jacobian, jacobian_error, change, change_error = (
+        jnp.where(exists, x, jnp.nan) for x in (jacobian, jacobian_error, change, change_error)
+    )
+    columns = jacobian.shape[1] - num_controls
+    return LinearModel(
+        A=jacobian[:, :columns],
+        B=jacobian[:, columns:],
+        c=system.retract(nominal, change),
+        A_error=jacobian_error[:, :columns],
+        B_error=jacobian_error[:, columns:],
+        c_error=change_error,
+        finite_fraction=is_finite.mean(dtype=jacobian.dtype),
+    )
+
+
+def _stddev(system: System, state: ArrayLike, control: ArrayLike, dtype: jnp.dtype) -> Float[Array, " both"]:
+    """Return the standard deviations of all coordinates of state and control."""
+    parts = []
+    for name, value, size in (("state", state, system.num_changes), ("control", control, system.num_controls)):
+        value = jnp.asarray(value, dtype)
+        if value.shape not in ((), (size,)):
+            raise ValueError(f"stddev_{name} must be a number or have shape ({size},), got shape {value.shape}")
+        if not isinstance(value, jax.core.Tracer) and not (np.asarray(value) >= 0).all():
+            raise ValueError(f"stddev_{name} must be at least 0 and finite, got {np.asarray(value)}")
+        parts.append(jnp.broadcast_to(value, (size,)))
+    return jnp.concatenate(parts)
+
+
+def _check_count(num_samples: int, least: int) -> None:
+    if num_samples < least:
+        raise ValueError(f"num_samples must be at least {least} for this system, got {num_samples}")

@@ -1,0 +1,172 @@
+"""What is to be linearised: a map from a state and a control to the next state.
+
+A state is one flat vector; a change of it has the coordinates of its tangent space, which for quaternions are fewer. Whoever
+linearises, samples or plans moves states by `retract` and compares them by `difference`, and so need not know which is which.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad._rollout import State
+from mjxgrad.dynamics import Smoothing, step
+from mjxgrad.dynamics.integrate import integrate_position, position_change
+from mjxgrad.scene import Scene
+from mjxgrad.task import as_pytree
+
+
+class System(eqx.Module):
+    """A discrete map with a control.
+
+    Attributes:
+        num_changes: dimension n of the tangent space.
+        num_positions: how many of its leading coordinates are positions; the rest are velocities and activations.
+        num_controls: dimension m of the control.
+    """
+
+    num_changes: eqx.AbstractVar[int]
+    num_positions: eqx.AbstractVar[int]
+    num_controls: eqx.AbstractVar[int]
+
+    @abstractmethod
+    def step(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, " state"]:
+        """Return the next state."""
+
+    def retract(self, state: Float[Array, " state"], change: Float[Array, " n"]) -> Float[Array, " state"]:
+        """Return the state moved by a change."""
+        return state + change
+
+    def difference(self, end: Float[Array, " state"], start: Float[Array, " state"]) -> Float[Array, " n"]:
+        """Return the change that moves `start` to `end`; the inverse of `retract`."""
+        return end - start
+
+    def with_smoothing(self, smoothing: Smoothing | None) -> "System":
+        """Give the system with another analytic smoothing of its contacts.
+
+        Raises:
+            ValueError: if the system has no contacts to smooth.
+        """
+        raise ValueError(
+            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: "
+            "take samples, by first_order or zeroth_order"
+        )
+
+
+class FunctionSystem(System):
+    """Any function of two vectors, all of whose states are positions.
+
+    Attributes:
+        function: from state and control to the next state.
+    """
+
+    function: Callable[[Float[Array, " n"], Float[Array, " m"]], Float[Array, " n"]] = eqx.field(converter=as_pytree)
+    num_changes: int = eqx.field(static=True)
+    num_controls: int = eqx.field(static=True)
+
+    @property
+    def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Give the number of all states."""
+        return self.num_changes
+
+    def step(self, state: Float[Array, " n"], control: Float[Array, " m"]) -> Float[Array, " n"]:
+        """Return the function's value."""
+        return self.function(state, control)
+
+
+class SceneSystem(System):
+    """A scene under a control that is held for one or several time steps.
+
+    The state is (qpos, qvel, act); its tangent space has the coordinates of velocities in place of positions, so that a
+    quaternion counts three. Time is not part of the state.
+
+    Attributes:
+        scene: from `load_scene`.
+        num_substeps: time steps per step of the system.
+        gradient: which derivative of contact and limit events, "discrete" or "event"; see `mjxgrad.step`.
+        smoothing: of contacts and limits in the solver, or None; see `mjxgrad.step`.
+    """
+
+    scene: Scene
+    num_substeps: int = eqx.field(static=True, default=1)
+    gradient: Literal["discrete", "event"] = eqx.field(static=True, default="discrete")
+    smoothing: Smoothing | None = None
+
+    def __check_init__(self):
+        if self.num_substeps < 1:
+            raise ValueError(f"num_substeps must be at least 1, got {self.num_substeps}")
+
+    @property
+    def num_changes(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Give twice the degrees of freedom, and the number of activations."""
+        return 2 * self.scene.model.nv + self.scene.model.na
+
+    @property
+    def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Give the degrees of freedom."""
+        return self.scene.model.nv
+
+    @property
+    def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Give the number of actuators."""
+        return self.scene.model.nu
+
+    @property
+    def duration(self) -> Float[Array, ""]:
+        """How long a step of the system takes (s)."""
+        return self.num_substeps * self.scene.model.opt.timestep
+
+    def flatten(self, state: State) -> Float[Array, " state"]:
+        """Return a rollout's state as a vector; time and warm start are left out."""
+        return jnp.concatenate([state.qpos, state.qvel, state.act])
+
+    def positions(self, state: Float[Array, "*batch state"]) -> Float[Array, "*batch nq"]:
+        """Return the qpos of states."""
+        return state[..., : self.scene.model.nq]
+
+    def step(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, " state"]:
+        """Return the state after `num_substeps` time steps under the same control."""
+        data = self._data(state, control)
+
+        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            # Only what the next step needs is carried: the rest of Data would be copied in every turn.
+            moved = self._advance(data)
+            names = ("qpos", "qvel", "act", "qacc_warmstart")
+            return data.replace(**{name: getattr(moved, name) for name in names}), None
+
+        data, _ = jax.lax.scan(advance, data, None, length=self.num_substeps)
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    def retract(self, state: Float[Array, " state"], change: Float[Array, " n"]) -> Float[Array, " state"]:
+        """Return the state moved by a change; quaternions turn in their own frame."""
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        qpos = integrate_position(self.scene.model, state[:nq], change[:nv], 1.0)
+        return jnp.concatenate([qpos, state[nq:] + change[nv:]])
+
+    def difference(self, end: Float[Array, " state"], start: Float[Array, " state"]) -> Float[Array, " n"]:
+        """Return the change that moves `start` to `end`."""
+        nq = self.scene.model.nq
+        moved = position_change(self.scene.model, start[:nq], end[:nq])
+        return jnp.concatenate([moved, end[nq:] - start[nq:]])
+
+    def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
+        """Give the system with another smoothing; None takes it away."""
+        return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
+
+    def _advance(self, data: mjx.Data) -> mjx.Data:
+        return step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
+
+    def _data(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> mjx.Data:
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        return self.scene.data.replace(
+            qpos=state[:nq],
+            qvel=state[nq : nq + nv],
+            act=state[nq + nv :],
+            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
+            ctrl=control,
+        )

@@ -1,0 +1,235 @@
+"""Force at a distance: set on the pairs asked for, and bodies rest where they should."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.contact import Softness
+from mjxgrad.scene import SceneWarning, load_scene
+
+# Friction other than 1 and impedance that still rises at rest: neither factor of the rest depth is trivial.
+BALL = """
+<mujoco>
+  <option timestep="0.002" tolerance="1e-14" cone="{cone}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1" friction="0.6" group="3"/>
+    <body name="body" pos="0 0 0.12"><freejoint/><geom name="ball" size="0.1" friction="0.6"/></body>
+  </worldbody>
+</mujoco>
+"""
+SOFT = Softness(stiffness=2000, damping_ratio=1, impedance=(0.2, 0.8), width=0.01)
+GRAVITY = 9.81
+
+# All touch the floor; two and three, 5 mm apart, touch each other besides.
+THREE = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1" margin="0.001"/>
+    <body name="a" pos="0 0 0.1"><freejoint/><geom name="one" size="0.1" group="1" conaffinity="0"/></body>
+    <body name="b" pos="1 0 0.1"><freejoint/><geom name="two" size="0.1" group="2" contype="3" conaffinity="2"/></body>
+    <body name="c" pos="1.205 0 0.1"><freejoint/><geom name="three" size="0.1" group="2" contype="3" conaffinity="2"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+pytestmark = pytest.mark.filterwarnings("ignore::mjxgrad.scene.SceneWarning")
+
+
+@pytest.fixture(scope="module")
+def pyramids():
+    return load_scene(BALL.format(cone="pyramidal"))
+
+
+@pytest.fixture(scope="module")
+def three():
+    return load_scene(THREE)
+
+
+def _with(softness, **parts):
+    return dataclasses.replace(softness, **parts)
+
+
+def _settled(scene):
+    """Let C MuJoCo come to rest; 12 s are a hundred decay times of the softest contact here."""
+    model = scene.to_mujoco()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=6000)
+    assert abs(data.qvel[2]) < 1e-10
+    return data
+
+
+def _distance(data):
+    return data.qpos[2] - 0.1
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("margin", [0.0, 0.004])
+def test_c_mujoco_rests_where_the_parameters_say(cone, margin):
+    scene = load_scene(BALL.format(cone=cone), softness=_with(SOFT, margin=margin))
+    expected = scene.contact_parameters().rest_distance(GRAVITY)[0]
+    np.testing.assert_allclose(_distance(_settled(scene)), expected, rtol=1e-8)
+
+
+def test_the_height_of_rest_is_that_without_margin(pyramids):
+    plain = _distance(_settled(pyramids.with_softness(SOFT)))
+    kept = pyramids.with_softness(_with(SOFT, margin=0.02, rest_acceleration=GRAVITY))
+    data = _settled(kept)
+    np.testing.assert_allclose(_distance(data), plain, rtol=1e-8)
+    # MJX agrees that nothing moves there; 1e-6 of gravity is what C's own rest is good for.
+    step = eqx.filter_jit(mg.step)
+    state = kept.data.replace(qpos=jnp.asarray(data.qpos), qvel=jnp.zeros(6))
+    assert np.abs(step(kept.model, state).qvel).max() < 1e-6 * GRAVITY * 0.002
+
+
+def test_constant_impedance_needs_the_stiffness_of_the_closed_form(pyramids):
+    elliptic = load_scene(BALL.format(cone="elliptic"))
+    softness = Softness(2000, 0.7, impedance=0.9, margin=0.03, rest_acceleration=5.0)
+    got = elliptic.with_softness(softness).contact_parameters()
+    # Depth ρ₀ = (1 − d) a₀ / k without margin; k' = (1 − d) a₀ / (m + ρ₀) with it.
+    depth = 0.1 * 5 / 2000
+    np.testing.assert_allclose(got.stiffness, 0.1 * 5 / (0.03 + depth), rtol=1e-10)
+    np.testing.assert_allclose(got.damping_ratio, 0.7, rtol=1e-10)
+
+
+def test_force_begins_at_the_margin(pyramids):
+    model = pyramids.with_softness(_with(SOFT, margin=0.02)).to_mujoco()
+    data = mujoco.MjData(model)
+    for distance, touches in ((0.0201, False), (0.0199, True)):
+        data.qpos[2] = 0.1 + distance
+        mujoco.mj_forward(model, data)
+        assert (data.nefc > 0) == touches
+
+
+def test_rest_depth_has_the_derivative_of_its_equation(pyramids):
+    def depth(softness, load):
+        return pyramids.with_softness(softness).contact_parameters().rest_depth(load)[0]
+
+    by_parts, by_load = jax.jit(jax.grad(depth, (0, 1)))(SOFT, GRAVITY)
+    step = 1e-6
+    central = (depth(SOFT, GRAVITY * (1 + step)) - depth(SOFT, GRAVITY * (1 - step))) / (2 * step * GRAVITY)
+    # The error of the difference is of order step² and rounding / step: 1e-9.
+    np.testing.assert_allclose(by_load, central, rtol=1e-7)
+    # The depth depends on load and stiffness through their ratio alone.
+    np.testing.assert_allclose(by_parts.stiffness * SOFT.stiffness, -by_load * GRAVITY, rtol=1e-9)
+
+
+def test_a_margin_is_shared_so_that_unselected_pairs_keep_theirs(three):
+    before = three.contact_parameters()
+    assert len(three.pairs) == 4
+    # The floor keeps its 1 mm, for it touches the others too, and the ball takes the rest.
+    after = three.with_softness(Softness(margin=0.006, pairs=(("one", "floor"),))).contact_parameters()
+    for i, pair in enumerate(three.pairs):
+        expected = 0.006 if "one" in pair.names else before.margin[i]
+        np.testing.assert_allclose(after.margin[i], expected, rtol=1e-12)
+
+
+def test_margins_that_cannot_be_shared_are_refused(three):
+    # The floor keeps 1 mm and "three" nothing, so "two" would need 5 mm for the one and 6 for the other.
+    with pytest.raises(ValueError, match=r"margin of the pair .* cannot be set .*<pair>"):
+        three.with_softness(Softness(margin=0.006, pairs=(("two", "floor"), ("two", "three"))))
+    with pytest.raises(ValueError, match=r"two – three would also change the pair .* shares the geom"):
+        three.with_softness(Softness(margin=0.006, pairs=(("two", "three"),)))
+
+
+@pytest.mark.parametrize(
+    ("subset", "names"),
+    [
+        ({"bodies": ("a",)}, {"one"}),
+        ({"groups": (2,)}, {"two", "three"}),
+        ({"groups": (1, 2)}, {"one", "two", "three"}),
+    ],
+)
+def test_bodies_and_groups_select_every_pair_of_theirs(three, subset, names):
+    selected = Softness(stiffness=1.0, **subset).selected(three.model)
+    assert set(selected) == {pair for pair in three.pairs if names & set(pair.names)}
+
+
+@pytest.mark.parametrize("subset", [{"bodies": ("d",)}, {"groups": (5,)}])
+def test_a_subset_of_nothing_is_answered_with_what_there_is(three, subset):
+    with pytest.raises(ValueError, match=r"got .*those that can: .*(a|1)"):
+        three.with_softness(Softness(margin=0.01, **subset))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [({"margin": -0.1}, "margin must be finite and at least 0"), ({"margin": np.nan}, "margin must be finite"),
+     ({"rest_acceleration": 9.81}, "must come with a margin"),
+     ({"margin": 0.1, "rest_acceleration": 0}, "rest_acceleration must be positive")],
+)  # fmt: skip
+def test_margins_without_meaning_are_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        Softness(**parts)
+
+
+def test_a_height_is_not_kept_twice_over(pyramids):
+    """The stiffness of a contact with a margin may be a compensated one; halving it again would say nothing."""
+    once = pyramids.with_softness(_with(SOFT, margin=0.02, rest_acceleration=GRAVITY))
+    with pytest.raises(ValueError, match="stiffness must be given with rest_acceleration"):
+        once.with_softness(Softness(margin=0.02, rest_acceleration=GRAVITY))
+
+
+def test_a_margin_on_a_mesh_is_refused():
+    mesh = '<asset><mesh name="m" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>'
+    source = BALL.format(cone="elliptic").replace("<worldbody>", mesh).replace('size="0.1"', 'type="mesh" mesh="m"')
+    with pytest.raises(ValueError, match=r"margin must not be set for the pair .*ball.*mesh"):
+        load_scene(source, softness=Softness(margin=0.01))
+
+
+def test_bodies_that_would_hover_are_warned_about_by_name(pyramids):
+    with pytest.warns(SceneWarning, match=r"ball.*hover 0\.01.* m.*rest_acceleration=9\.81"):
+        pyramids.with_softness(_with(SOFT, margin=0.02))
+
+
+def test_bodies_that_do_not_touch_but_push_each_other_are_warned_about_by_name(three):
+    # "two" and "three" stand 5 mm apart.
+    with pytest.warns(SceneWarning, match=r"two – three.*reference pose.*0\.005 m apart.*margin of 0\.02 m"):
+        three.with_softness(Softness(margin=0.02))
+
+
+def test_bodies_that_rest_inside_each_other_are_warned_about_by_name(pyramids):
+    softness = _with(SOFT, margin=0.1, rest_acceleration=0.1)
+    with pytest.warns(SceneWarning, match=r"floor – ball.*rest .* m inside each other.*smaller \(0\.1 m\)"):
+        pyramids.with_softness(softness)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_kept_height_needs_no_warning(pyramids):
+    pyramids.with_softness(_with(SOFT, margin=0.005, rest_acceleration=GRAVITY))
+
+
+def test_the_summary_says_where_bodies_rest(pyramids):
+    scene = pyramids.with_softness(_with(SOFT, margin=0.02, rest_acceleration=GRAVITY))
+    row = next(line for line in scene.summary().splitlines() if line.startswith("  floor – ball"))
+    expected = 1e3 * float(pyramids.with_softness(SOFT).contact_parameters().rest_distance(GRAVITY)[0])
+    assert float(row.split()[-1]) == pytest.approx(expected, rel=5e-3)  # three digits are printed
+    assert "at rest" not in pyramids.summary()
+
+
+def test_half_way_between_two_values_of_softness_lies_the_mean_of_its_kind():
+    start = Softness(100.0, 0.5, impedance=(0.0, 0.8), width=0.01, margin=0.02)
+    end = Softness(10000.0, 1.0, impedance=(0.2, 0.9), width=0.04, margin=0.0)
+    half = Softness.between(start, end, 0.5)
+    # √(100 · 10000) and √(0.01 · 0.04); the rest (start + end) / 2.
+    expected = Softness(1000.0, 0.75, impedance=(0.1, 0.85), width=0.02, margin=0.01)
+    for ours, theirs in zip(jax.tree.leaves(half), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+def test_a_schedule_ends_at_its_end_and_stays_there():
+    schedule = jax.jit(lambda step: Softness(1e2, 1.0).schedule(Softness(1e4, 1.0), 4)(step).stiffness)
+    np.testing.assert_allclose([schedule(step) for step in (0, 1, 4, 9)], [1e2, 10**2.5, 1e4, 1e4], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("end", "message"),
+    [(Softness(1.0), "both have a damping_ratio or neither"), (Softness(1.0, 1.0, geoms=("a",)), "same geoms")],
+)
+def test_softness_of_other_parts_or_pairs_has_no_between(end, message):
+    with pytest.raises(ValueError, match=message):
+        Softness.between(Softness(2.0, 1.0), end, 0.5)

@@ -1,0 +1,174 @@
+"""Effective contact parameters, against C MuJoCo."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.scene import load_scene
+from mjxgrad.scene.contact_check import largest_stable_step
+
+# Every ball touches the floor: mixing, a share of solmix, none at all, priority of either side,
+# the direct format, both formats together, and an explicit pair.
+FLOOR = (
+    'type="plane" size="1 1 .1" solref="0.04 0.8" solimp="0.8 0.9 0.003 0.4 3" friction="0.6 0.02 0.003" margin="0.001"'
+)
+GEOMS = {
+    "plain": "",
+    "mixed": 'solmix="3" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.4 0.03 0.001"',
+    "weightless": 'solmix="0" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2"',
+    "winner": 'priority="2" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.1 0 0" condim="6" margin="0.002"',
+    "loser": 'priority="-1" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="3 0 0"',
+    "direct": 'solref="-3000 -70" solimp="0.5 0.7 0.01 0.5 2"',
+    "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0 0.5 2"',
+    "explicit": 'solref="0.9 1" friction="9 9 9"',
+}
+PAIR = (
+    '<contact><pair geom1="explicit" geom2="floor" solref="0.05 0.7" solimp="0.3 0.6 0.02 0.5 2" '
+    'friction="0.5 0.4 0.01 0.001 0.002" margin="0.003" condim="4"/></contact>'
+)
+
+
+def _balls(option=""):
+    bodies = "".join(
+        f'<body pos="{i} 0 0.095"><freejoint/><geom name="{name}" size="0.1" {attributes}/></body>'
+        for i, (name, attributes) in enumerate(GEOMS.items())
+    )
+    return (
+        f'<mujoco><option timestep="0.004" {option}/><worldbody><geom name="floor" {FLOOR}/>'
+        f"{bodies}</worldbody>{PAIR}</mujoco>"
+    )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene(_balls())
+
+
+@pytest.fixture(scope="module")
+def touching(scene):
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    return data
+
+
+@pytest.mark.parametrize("name", GEOMS)
+def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, name):
+    geom = scene.mj_model.geom(name).id
+    contact = next(c for c in touching.contact if geom in c.geom)
+    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
+    ours = jax.tree.map(np.asarray, scene.contact_parameters())
+    assert scene.pairs[row].condim == contact.dim
+    np.testing.assert_allclose(ours.solref[row], contact.solref, rtol=1e-12)
+    np.testing.assert_allclose(ours.solimp[row], contact.solimp, rtol=1e-12)
+    np.testing.assert_allclose(ours.friction[row], contact.friction, rtol=1e-12)
+    np.testing.assert_allclose(ours.margin[row], contact.includemargin, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", GEOMS)
+def test_stiffness_and_damping_are_those_of_the_rows_of_c_mujoco(scene, touching, name):
+    geom = scene.mj_model.geom(name).id
+    contact = next(c for c in touching.contact if geom in c.geom)
+    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
+    ours = jax.tree.map(np.asarray, scene.contact_parameters())
+    stiffness, damping, _, _ = touching.efc_KBIP[contact.efc_address]
+    width = ours.impedance[row, 1]
+    # K = k / dw² and B = b / dw.
+    np.testing.assert_allclose(ours.stiffness[row] / width**2, stiffness, rtol=1e-12)
+    np.testing.assert_allclose(ours.damping[row] / width, damping, rtol=1e-12)
+
+
+def test_refsafe_can_be_off(touching):
+    free = load_scene(_balls().replace("/><worldbody>", '><flag refsafe="disable"/></option><worldbody>', 1))
+    row = next(i for i, pair in enumerate(free.pairs) if "clamped" in pair.names)
+    # k = 1 / (tc ζ)² with tc = 0.001 and ζ = 1.
+    np.testing.assert_allclose(free.contact_parameters().stiffness[row], 1e6, rtol=1e-12)
+
+
+def test_pairs_are_all_that_mjx_tests(scene):
+    # 8 balls among each other (28 pairs) and with the floor (8).
+    assert len(scene.pairs) == 36
+    assert len({frozenset((p.geom1, p.geom2)) for p in scene.pairs}) == 36
+
+
+def test_an_unnamed_geom_is_called_by_its_body():
+    source = (
+        '<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="cart">'
+        '<freejoint/><geom size="1"/><geom size="1"/></body></worldbody></mujoco>'
+    )
+    assert [pair.names[1] for pair in load_scene(source).pairs] == ["cart[0]", "cart[1]"]
+
+
+def test_without_contact_there_are_no_pairs():
+    for flag in ("contact", "constraint"):
+        source = _balls().replace("/><worldbody>", f'><flag {flag}="disable"/></option><worldbody>', 1)
+        assert contact_pairs(mujoco.MjModel.from_xml_string(source)) == ()
+
+
+def test_parameters_of_a_traced_model_are_those_of_the_model(scene):
+    traced = jax.jit(lambda s: s.contact_parameters())(scene)
+    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(scene.contact_parameters()), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+PRESSED = """
+<mujoco>
+  <option timestep="0.002" tolerance="1e-12" {integrator}/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1" condim="1" solref="{solref}" solimp="{d} {d} 0.01"/>
+    <body pos="0 0 0.1">
+      <joint type="slide" axis="0 0 1"/>
+      <geom size="0.1" mass="2" condim="1" solref="{solref}" solimp="{d} {d} 0.01"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_pressed_contact_rests_at_the_depth_of_the_formula():
+    scene = load_scene(PRESSED.format(solref="0.02 1", d="0.9", integrator=""))
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_step(scene.mj_model, data, nstep=1000)
+    depth = scene.contact_parameters().rest_depth(9.81)[0]
+    # (1 − d) a₀ / k = 0.1 · 9.81 / 2500.
+    np.testing.assert_allclose(depth, 0.1 * 9.81 / 2500, rtol=1e-12)
+    np.testing.assert_allclose(-data.qpos[0], depth, rtol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("damping_ratio", [0.1, 1.0, 2.0])
+@pytest.mark.parametrize(("share", "grows"), [(0.97, False), (1.03, True)])
+def test_a_contact_gains_energy_beyond_the_stability_limit(integrator, damping_ratio, share, grows):
+    """A ball pressed on a floor in C MuJoCo, displaced a little from rest."""
+    member = mujoco.mjtIntegrator.__members__[f"mjINT_{integrator.upper()}"]
+    frequency = share * largest_stable_step(damping_ratio, member) / 0.002
+    solref = f"{-(frequency**2):.12g} {-2 * damping_ratio * frequency:.12g}"
+    source = PRESSED.format(solref=solref, d="0.5", integrator=f'integrator="{integrator}"')
+    model = mujoco.MjModel.from_xml_string(source)
+    data = mujoco.MjData(model)
+    rest = -0.5 * 9.81 / frequency**2
+    data.qpos[0] = rest * (1 + 1e-3)
+    mujoco.mj_step(model, data, nstep=200)
+    assert (abs(data.qpos[0] / rest - 1) > 1e-3) == grows
+
+
+def test_the_limit_of_semi_implicit_euler_is_that_of_the_closed_form():
+    # h²k + 2hb = 4 with k = ω², b = 2ζω.
+    for ratio in (0.0, 0.3, 1.0, 30.0):
+        step = largest_stable_step(ratio, mujoco.mjtIntegrator.mjINT_EULER)
+        np.testing.assert_allclose(step**2 + 4 * ratio * step, 4, rtol=1e-12)
+
+
+def test_the_limit_of_runge_kutta_is_that_of_the_textbook():
+    # On the imaginary axis |R(iy)| = 1 at y = 2√2.
+    step = largest_stable_step(0.0, mujoco.mjtIntegrator.mjINT_RK4)
+    np.testing.assert_allclose(step, 2 * np.sqrt(2), rtol=1e-9)
+
+
+def test_a_time_constant_below_two_steps_is_warned_about():
+    source = PRESSED.format(solref="0.001 1", d="0.9", integrator="")
+    with pytest.warns(UserWarning, match=r"0\.001 s is below two time steps.*0\.004 s"):
+        scene = load_scene(source)
+    assert len(scene.warnings()) == 1
+    assert load_scene(PRESSED.format(solref="0.004 1", d="0.9", integrator="")).warnings() == []

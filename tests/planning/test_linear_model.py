@@ -1,0 +1,299 @@
+"""Smoothed linear models three ways, against closed forms and each other."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import mjxgrad as mg
+from mjxgrad.dynamics import Smoothing
+from mjxgrad.dynamics.integrate import position_change
+from mjxgrad.planning.linear_model import analytic, first_order, mean_step, zeroth_order
+from mjxgrad.planning.system import FunctionSystem, SceneSystem
+
+A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
+POINT, CONTROL, STDDEV = 0.03, jnp.zeros(1), 0.05
+STIFFNESS = 40.0
+
+
+def affine(state, control):
+    return A @ state + B @ control + OFFSET
+
+
+def wall(state, control):
+    """A wall at zero that pushes back in proportion to depth: a contact in one dimension."""
+    return state + 2 * control + STIFFNESS * jnp.maximum(0.0, -state)
+
+
+def edge(state, control):
+    return 1.0 * (state + control > 0)
+
+
+def within(value, error, expected, errors=4.0):
+    np.testing.assert_array_less(np.abs(np.asarray(value) - expected), errors * np.asarray(error) + 1e-12)
+
+
+def test_a_linear_step_is_found_without_error_by_all_three(key):
+    system = FunctionSystem(affine, 2, 1)
+    at = (system, jnp.array([0.4, -1.0]), jnp.array([0.2]))
+    noise = {"stddev_state": 0.3, "stddev_control": 0.2}
+    for model in (
+        analytic(*at),
+        first_order(*at, key, num_samples=3, **noise),
+        zeroth_order(*at, key, num_samples=6, **noise),
+    ):
+        np.testing.assert_allclose(model.A, A, atol=1e-12)
+        np.testing.assert_allclose(model.B, B, atol=1e-12)
+        np.testing.assert_allclose(model.c, affine(*at[1:]), atol=1e-12)
+        assert model.finite_fraction == 1
+    np.testing.assert_allclose(mean_step(*at, key, num_samples=1, **noise), affine(*at[1:]), atol=1e-12)
+
+
+def exact_wall():
+    """E max(0, −x − w) = σ [φ(z) − z Φ(−z)], z = x/σ, and its derivative −Φ(−z)."""
+    z = POINT / STDDEV
+    return 1 - STIFFNESS * norm.cdf(-z), POINT + STIFFNESS * STDDEV * (norm.pdf(z) - z * norm.cdf(-z))
+
+
+@pytest.mark.parametrize("estimate", [first_order, zeroth_order])
+def test_a_contact_averaged_over_noise_is_its_closed_form(key, estimate):
+    slope, mean = exact_wall()
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL, key)
+    model = estimate(*at, stddev_state=STDDEV, stddev_control=0.1, num_samples=4000)
+    within(model.A[0, 0], model.A_error[0, 0], slope)
+    within(model.B[0, 0], model.B_error[0, 0], 2.0)
+    within(model.c, model.c_error, mean)
+    assert abs(slope - 1) > 10 * model.A_error[0, 0]  # without noise the wall is not felt here
+
+
+def test_only_least_squares_sees_a_jump(key):
+    """E 1[x + w_x + u + w_u > 0] has the derivative φ(x/s)/s, s² the sum of both variances."""
+    noise = {"stddev_state": 0.04, "stddev_control": 0.03, "num_samples": 4000}
+    at = (FunctionSystem(edge, 1, 1), jnp.array([POINT]), CONTROL, key)
+    expected = norm.pdf(POINT, scale=0.05)
+    model = zeroth_order(*at, **noise)
+    within(model.A[0, 0], model.A_error[0, 0], expected)
+    within(model.B[0, 0], model.B_error[0, 0], expected)
+    assert first_order(*at, **noise).A[0, 0] == 0
+
+
+@pytest.mark.parametrize("estimate", [first_order, zeroth_order])
+def test_errors_are_those_that_repetition_shows(key, estimate):
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
+
+    @jax.jit
+    @jax.vmap
+    def repeat(key):
+        return estimate(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=60)
+
+    models = repeat(jax.random.split(key, 600))
+    for name, errors in (("A", models.A_error), ("c", models.c_error)):
+        spread = np.asarray(getattr(models, name)).std(axis=0)
+        # A standard deviation of 600 repetitions is known to 3 %; HC3 errs to the wide side by about as much as 3/60.
+        np.testing.assert_allclose(np.asarray(errors).mean(axis=0), spread, rtol=0.2)
+
+
+def test_few_samples_do_not_bias_the_mean(key):
+    """What a sample's own Jacobian explained of its end would shift c by E[J w]/N, here a third of its spread at N = 4."""
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
+
+    @jax.jit
+    @jax.vmap
+    def repeat(key):
+        return first_order(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=4).c
+
+    found = np.asarray(repeat(jax.random.split(key, 4000)))
+    within(found.mean(axis=0), found.std(axis=0) / np.sqrt(len(found)), exact_wall()[1])
+
+
+def test_errors_from_few_samples_do_not_flatter(key):
+    """Twelve samples for three coefficients: residuals are 0.57 of what repetition shows, unless leverage is taken out."""
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
+
+    @jax.jit
+    @jax.vmap
+    def repeat(key):
+        return zeroth_order(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=12)
+
+    models = repeat(jax.random.split(key, 3000))
+    for value, error in ((models.A, models.A_error), (models.c, models.c_error)):
+        ratio = np.sqrt((np.asarray(error) ** 2).mean()) / np.asarray(value).std()
+        assert 0.95 < ratio < 1.4
+
+
+def test_the_mean_step_is_the_mean_that_the_models_hold(key):
+    noise = {"stddev_state": STDDEV, "stddev_control": 0.1, "num_samples": 4000}
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL, key)
+    within(mean_step(*at, **noise), zeroth_order(*at, **noise).c_error, exact_wall()[1])
+
+
+@pytest.mark.slow
+def test_samples_that_are_not_finite_are_left_out_and_counted(key):
+    def cliff(state, control):
+        return jnp.where(state < -0.05, jnp.nan, 3 * state) + control
+
+    at = (FunctionSystem(cliff, 1, 1), jnp.array([0.0]), CONTROL, key)
+    for estimate in (first_order, zeroth_order):
+        model = estimate(*at, stddev_state=STDDEV, stddev_control=0.1, num_samples=400)
+        np.testing.assert_allclose(model.A, 3.0, atol=1e-9)
+        within(model.finite_fraction, np.sqrt(0.84 * 0.16 / 400), 1 - norm.cdf(-1))
+        lost = estimate(FunctionSystem(cliff, 1, 1), jnp.array([-1.0]), CONTROL, key, stddev_state=1e-3, stddev_control=0.1,
+                        num_samples=10)  # fmt: skip
+        assert lost.finite_fraction == 0
+        assert np.isnan(lost.A).all()
+        assert np.isnan(lost.c).all()
+
+
+def test_a_mean_step_leaves_out_what_is_not_finite(key):
+    """Beyond the cliff there are no numbers; the rest of the samples is a normal distribution cut off at one deviation."""
+
+    def cliff(state, control):
+        return jnp.where(state < -STDDEV, jnp.nan, state) + control
+
+    at = (FunctionSystem(cliff, 1, 1), jnp.zeros(1), CONTROL, key)
+    mean = mean_step(*at, stddev_state=STDDEV, num_samples=4000)
+    within(mean, STDDEV / np.sqrt(8000), STDDEV * norm.pdf(1) / norm.cdf(1))
+
+
+@pytest.mark.parametrize("samples", [{}, {"num_samples": 5, "stddev_state": 0.1, "stddev_control": 0.1}])
+def test_without_the_state_the_rest_of_the_model_is_the_same(key, samples):
+    estimate, keys = (first_order, (key,)) if samples else (analytic, ())
+    at = (FunctionSystem(affine, 2, 1), jnp.array([0.4, -1.0]), jnp.array([0.2]), *keys)
+    model = estimate(*at, **samples, wrt_state=False)
+    assert model.A.shape == (2, 0)
+    np.testing.assert_allclose(model.B, B, atol=1e-12)
+
+
+def test_without_noise_on_a_coordinate_least_squares_says_that_it_knows_nothing(key):
+    at = (FunctionSystem(affine, 2, 1), jnp.zeros(2), CONTROL, key)
+    model = zeroth_order(*at, stddev_state=jnp.array([0.1, 0.0]), stddev_control=0.1, num_samples=20)
+    np.testing.assert_allclose(model.A[:, 0], A[:, 0], atol=1e-12)
+    assert np.isinf(model.A_error[:, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"stddev_state": -1.0}, "stddev_state must be at least 0"),
+        ({"stddev_control": jnp.ones(3)}, "stddev_control must be a number or have shape"),
+        ({"num_samples": 4}, "num_samples must be at least 5"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(key, settings, sentence):
+    settings = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10} | settings
+    with pytest.raises(ValueError, match=sentence):
+        zeroth_order(FunctionSystem(affine, 2, 1), jnp.zeros(2), CONTROL, key, **settings)
+
+
+def test_a_system_without_contacts_refuses_analytic_smoothing():
+    with pytest.raises(ValueError, match="analytic smoothing must be of a SceneSystem, got FunctionSystem"):
+        FunctionSystem(affine, 2, 1).with_smoothing(Smoothing(0.1))
+
+
+SPRING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
+  <joint name="x" type="slide" axis="1 0 0" stiffness="3" damping="0.4"/><geom size="0.1" mass="0.5"/></body></worldbody>
+  <actuator><motor joint="x"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("gradient", ["discrete", pytest.param("event", marks=pytest.mark.slow)])
+def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
+    """One step: v ← (m v + h (u − k q)) / (m + h c), q ← q + h v; here two of them."""
+    h, m, k, c = 0.01, 0.5, 3.0, 0.4
+    rate = np.array([-h * k, m]) / (m + h * c)
+    one_a = np.array([[1 + h * rate[0], h * rate[1]], rate])
+    one_b = np.array([[h], [1]]) * h / (m + h * c)
+    system = SceneSystem(mg.load_scene(SPRING), num_substeps=2, gradient=gradient)
+    at, control, noise = jnp.array([0.1, -0.3]), jnp.array([0.7]), {"stddev_state": 0.1, "stddev_control": 0.1}
+
+    @eqx.filter_jit
+    def models():
+        return (
+            analytic(system, at, control),
+            first_order(system, at, control, key, num_samples=3, **noise),
+            zeroth_order(system, at, control, key, num_samples=8, **noise),
+        )
+
+    for model in models():
+        np.testing.assert_allclose(model.A, one_a @ one_a, atol=1e-10)
+        np.testing.assert_allclose(model.B, one_a @ one_b + one_b, atol=1e-10)
+        np.testing.assert_allclose(model.c, model.A @ at + (model.B @ control), atol=1e-10)
+
+
+BALL = """<mujoco><option timestep="{h}" gravity="0 0 0" tolerance="1e-12"/><worldbody>
+  <geom name="floor" type="plane" size="1 1 .1"/><body><joint name="z" type="slide" axis="0 0 1"/>
+  <geom name="ball" size="0.1" mass="1" pos="0 0 0.1"/></body></worldbody>
+  <contact><pair geom1="ball" geom2="floor" condim="1" {contact}/></contact>
+  <actuator><motor joint="z"/></actuator></mujoco>"""
+IMPEDANCE = 1e-3
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        "analytic",
+        pytest.param("first_order", marks=pytest.mark.slow),
+        pytest.param("zeroth_order", marks=pytest.mark.slow),
+    ],
+)
+def test_a_contact_in_the_solver_averaged_three_ways_is_its_closed_form(key, way):
+    """With impedance d small the force is k times depth per unit mass, so v gains h k σ [φ(z) − z Φ(−z)] on average."""
+    h, given = 0.01, 700.0
+    contact = f'solref="-{given} 0" solimp="{IMPEDANCE} {IMPEDANCE} 0.001"'
+    # MuJoCo takes a body's inverse inertia for the mean over three axes, of which one can move here: a third of it.
+    k = 3 * given
+    scene = mg.load_scene(BALL.format(h=h, contact=contact))
+    system, at = SceneSystem(scene), jnp.array([POINT, 0.0])
+    noise = {"stddev_state": jnp.array([STDDEV, 1e-3]), "stddev_control": 0.1}
+
+    if way == "analytic":
+        model = eqx.filter_jit(analytic)(system.with_smoothing(Smoothing(STDDEV)), at, CONTROL)
+    else:
+        estimate = first_order if way == "first_order" else zeroth_order
+        model = eqx.filter_jit(estimate)(system, at, CONTROL, key, num_samples=1000, **noise)
+    z = POINT / STDDEV
+    slope, gain = -h * k * norm.cdf(-z), h * k * STDDEV * (norm.pdf(z) - z * norm.cdf(-z))
+    # The share d of all acceleration into the contact is no spring's.
+    np.testing.assert_array_less(np.abs(model.A[1, 0] - slope), 4 * model.A_error[1, 0] + 4 * IMPEDANCE * h * k)
+    np.testing.assert_array_less(np.abs(model.c[1] - gain), 4 * model.c_error[1] + 4 * IMPEDANCE * h * k)
+    within(model.B[1, 0], model.B_error[1, 0] + IMPEDANCE * h, h)
+
+
+@pytest.mark.slow
+def test_through_a_bounce_mean_jacobians_agree_with_least_squares_only_with_event_gradients(key):
+    """MuJoCo's default contact, 5 mm above the floor at 1 m/s, 30 ms: all samples bounce, each at another phase."""
+    contact = 'solref="0.02 1" solimp="0.9 0.95 0.001"'
+    scene, at = mg.load_scene(BALL.format(h=5e-4, contact=contact)), jnp.array([0.01, -1.0])
+    noise = {"stddev_state": jnp.array([1e-3, 1e-3]), "stddev_control": 0.1, "num_samples": 400}
+
+    @eqx.filter_jit
+    def model(estimate, gradient):
+        return estimate(SceneSystem(scene, 120, gradient=gradient), at, CONTROL, key, **noise)
+
+    truth = model(zeroth_order, "discrete")
+    right, wrong = model(first_order, "event"), model(first_order, "discrete")
+    error = np.hypot(truth.A_error, right.A_error)
+    # Beyond sampling, the event gradient is right up to a few per cent at this time step.
+    np.testing.assert_array_less(np.abs(right.A[0] - truth.A[0]), 4 * error[0] + 0.05 * np.abs(truth.A[0]))
+    assert abs(wrong.A[0, 0] - truth.A[0, 0]) > 10 * abs(right.A[0, 0] - truth.A[0, 0])
+
+
+FREE = """<mujoco><worldbody><body><freejoint/><geom size=".1"/><body pos="0 0 1"><joint type="ball"/><geom size=".1"/>
+  <body pos="0 0 1"><joint type="hinge"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""
+
+
+def test_changes_of_position_are_those_of_c_mujoco_and_undo_the_retraction():
+    scene = mg.load_scene(FREE)
+    system, model = SceneSystem(scene), scene.mj_model
+    rng = np.random.default_rng(3)
+    start, end, expected = np.zeros(model.nq), np.zeros(model.nq), np.zeros(model.nv)
+    start[:] = end[:] = model.qpos0
+    mujoco.mj_integratePos(model, start, rng.normal(size=model.nv), 1)
+    mujoco.mj_integratePos(model, end, rng.normal(size=model.nv), 1)
+    mujoco.mj_differentiatePos(model, expected, 1, start, end)
+    np.testing.assert_allclose(position_change(scene.model, jnp.array(start), jnp.array(end)), expected, atol=1e-12)
+    state = jnp.concatenate([jnp.array(start), jnp.zeros(model.nv)])
+    change = jnp.array(rng.normal(size=2 * model.nv))
+    np.testing.assert_allclose(system.difference(system.retract(state, change), state), change, atol=1e-12)

@@ -1,0 +1,58 @@
+"""The library's parts import in one direction, and any of them can be imported first."""
+
+import ast
+import graphlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import mjxgrad
+
+ROOT = Path(mjxgrad.__file__).parent
+# Each line may import those above it; parts of one line do not know each other.
+ORDER = (
+    ("_math", "_mjx", "_static"),
+    ("contact",),
+    ("dynamics",),
+    ("scene",),
+    ("_rollout",),
+    ("task",),
+    ("objective", "policy"),
+    ("estimators",),
+    ("optimiser",),
+    ("baselines",),
+    ("devices", "diagnostics", "integration", "planning", "render"),
+    ("tasks",),
+)
+LINE = {part: i for i, line in enumerate(ORDER) for part in line}
+MODULES = {
+    ".".join(("mjxgrad", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in ROOT.rglob("*.py")
+}
+
+
+def _imported(module: str, *, only_on_loading: bool = False) -> Iterator[str]:
+    """The modules that a module names in its import lines."""
+    tree = ast.parse(MODULES[module].read_text())
+    for node in tree.body if only_on_loading else ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in MODULES else node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_each_part_imports_only_what_stands_before_it():
+    parts = [module for module in MODULES if module != "mjxgrad"]
+    lines = [(m, t) for m in parts for t in _imported(m) if t in MODULES and t.split(".")[1:2] != m.split(".")[1:2]]
+    backwards = [(m, t) for m, t in lines if t == "mjxgrad" or LINE[t.split(".")[1]] >= LINE[m.split(".")[1]]]
+    assert not backwards
+
+
+def test_any_part_can_be_imported_first():
+    """Python runs the packages around an imported module, too; only those that are already running it skips."""
+    graph = {m: {t for t in _imported(m, only_on_loading=True) if t in MODULES} - {m} for m in MODULES}
+    for module, targets in graph.items():
+        around = {t.rsplit(".", i)[0] for t in targets for i in range(1, t.count(".") + 1)}
+        targets |= {a for a in around if not f"{module}.".startswith(f"{a}.")}
+    graphlib.TopologicalSorter(graph).prepare()
