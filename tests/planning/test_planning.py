@@ -19,9 +19,9 @@ from mjxgrad.planning import (
     path,
     search,
 )
-from mjxgrad.planning.box import minimise_in_box
+from mjxgrad.planning.backward import minimise_in_box
 from mjxgrad.planning.cost import terminal_model
-from mjxgrad.planning.tree import reach
+from mjxgrad.planning.search import reach
 from mjxgrad.smoothing import Smoothing
 from mjxgrad.smoothing.linear_model import LinearModel
 
