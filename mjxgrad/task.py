@@ -81,7 +81,8 @@ def as_pytree(function: Callable) -> Callable:
     return jax.tree_util.Partial(function)
 
 
-def _optional_pytree(function: Callable | None) -> Callable | None:
+def optional_pytree(function: Callable | None) -> Callable | None:
+    """Wrap a function as `as_pytree` does, if there is one."""
     return None if function is None else as_pytree(function)
 
 
@@ -105,7 +106,7 @@ class SceneTask(Task):
     state: State
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
-    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=_optional_pytree, default=None)
+    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)

@@ -19,7 +19,7 @@ def recorded():
 
 
 def test_a_group_deletes_what_it_says_and_no_inertia(recorded):
-    found = {variant.name: variant.scene.mj_model for variant in variants(scene_path("reacher"), recorded, 0.1)}
+    found = {variant.name: variant.scene.mj_model for variant in variants(scene_path("reacher"), recorded)}
     assert {EVERYTHING, RENDERING, FUSED, NEEDED} <= found.keys()
     assert found[EVERYTHING].ngeom == 10
     assert found[RENDERING].ngeom == 0

@@ -1,4 +1,4 @@
-"""Other ways to step a scene, against closed forms."""
+"""Integration with error control, against closed forms."""
 
 import equinox as eqx
 import jax
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.integration import adaptive_rollout, substepped_rollout
+from mjxgrad.integration import adaptive_rollout
 
 pytest.importorskip("diffrax")
 
@@ -99,29 +99,8 @@ def test_steps_that_run_out_are_flagged(ball):
     assert bool(found.has_failed)
 
 
-@pytest.mark.slow
-def test_short_steps_at_events_bring_the_bounce_closer_and_flight_is_untouched(ball):
-    heights = RADIUS + jnp.linspace(0, STEP, 9)[:-1]
-
-    def ends(roll):
-        return jax.jit(jax.vmap(lambda z: roll(ball, thrown(ball, z), horizon=HORIZON).qpos[:, 0]))(heights)
-
-    coarse = np.asarray(ends(mg.rollout))
-    fine = np.asarray(ends(lambda *args, **kw: substepped_rollout(*args, num_substeps=16, **kw)))
-    assert np.array_equal(coarse[:, :20], fine[:, :20])
-    # Along the start height the outcome is a line and a tooth; the tooth of a step cut in sixteen is much smaller.
-    slope = -RESTITUTION
-
-    def tooth(values):
-        return np.ptp(values[:, -1] - slope * np.asarray(heights))
-
-    assert tooth(fine) < tooth(coarse) / 3
-
-
 def test_what_has_no_meaning_is_refused(ball):
     state = thrown(ball, 0.05)
-    with pytest.raises(ValueError, match="num_substeps must be at least 2"):
-        substepped_rollout(ball, state, num_substeps=1, horizon=2)
     with pytest.raises(ValueError, match="tolerance"):
         adaptive_rollout(ball, state, [0.1], tolerance=0.0)
     with pytest.raises(ValueError, match="times must increase"):

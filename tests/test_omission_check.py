@@ -11,7 +11,7 @@ import mjxgrad as mg
 from tests.test_scene_leave_out import SCENE
 
 H, G = 0.005, 9.81
-FLOOR = mg.LeaveOut(never_touching=False, pairs=(("floor", "ball"),))
+FLOOR = mg.LeaveOut(pairs=(("floor", "ball"),))
 
 
 def _recorded(scene, qpos, qvel, horizon):
@@ -91,7 +91,7 @@ def test_a_limit_that_acts_is_named():
 
 
 def test_omissions_that_never_act_change_neither_forces_nor_steps():
-    scene = mg.load_scene(SCENE, leave_out=mg.LeaveOut(limits=("swing",)))
+    scene = mg.load_scene(SCENE, leave_out=mg.LeaveOut(pairs=(("floor", "bob"),), limits=("swing",)))
     trajectory = _recorded(scene, [[0.0, -0.5], [0.1, 0.0]], [[-1.0, 0.0], [0.0, 1.0]], horizon=20)
     check = mg.check_omissions(scene, trajectory)
     assert check.is_sound
@@ -108,7 +108,7 @@ def test_rollouts_are_replayed_as_they_were_recorded():
     driven = SCENE.replace(
         "</mujoco>", "<actuator><general joint='swing' dyntype='filter' dynprm='0.1'/></actuator></mujoco>"
     )
-    scene = mg.load_scene(driven, leave_out=mg.LeaveOut())
+    scene = mg.load_scene(driven, leave_out=mg.LeaveOut(pairs=(("floor", "bob"),)))
     scene = scene.with_softness(mg.Softness(stiffness=900, damping_ratio=0.5))
     state = mg.initial_state(scene, qvel=jnp.array([-1.0, 0.0]), act=jnp.array([0.3]))
     controls = jnp.linspace(-1, 1, 10)[:, None]

@@ -1,14 +1,14 @@
 """What a user lets a scene do without is gone, said, and nothing else changes."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.scene import SceneWarning
+from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.scene.omissions import TooManyMasksError, keep_pairs
 
 # A ball falls on a floor, beside a pendulum that hangs too high to reach it and has limits.
 SCENE = """
@@ -26,6 +26,8 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+# What does not act in the motions here.
+APART = mg.LeaveOut(pairs=(("floor", "bob"),), limits=("swing",))
 PAIRED = SCENE.replace("</worldbody>", "</worldbody><contact><pair geom1='floor' geom2='bob'/></contact>")
 
 
@@ -38,38 +40,11 @@ def test_nothing_that_could_act_is_left_out_unless_asked_for():
     assert mg.load_scene(SCENE).omitted_pairs == ()
 
 
-def test_pairs_proven_apart_are_left_out_when_asked_for():
-    scene = mg.load_scene(SCENE, leave_out=mg.LeaveOut())
-    assert _names(scene.pairs) == {frozenset(("floor", "ball"))}
-    (omitted,) = scene.omitted_pairs
-    assert set(omitted.pair.names) == {"floor", "bob"}
-    # The bob reaches 0.45 down from 1 m; the proof need not be tight, but must not claim more.
-    assert omitted.distance is not None
-    assert 0.01 <= omitted.distance <= 0.55
-    assert int(scene.data._impl.nefc) == 2  # one contact without friction, one limit
-    assert _names(mg.load_scene(SCENE).pairs) == _names((*scene.pairs, omitted.pair))
-
-
-def test_a_clearance_beyond_the_distance_keeps_the_pair():
-    assert len(mg.load_scene(SCENE, leave_out=mg.LeaveOut(clearance=0.54)).pairs) == 1
-    assert len(mg.load_scene(SCENE, leave_out=mg.LeaveOut(clearance=0.56)).pairs) == 2
-
-
-def test_the_margin_counts_against_the_distance():
-    wide = SCENE.replace('name="bob"', 'name="bob" margin="0.5"')
-    assert len(mg.load_scene(wide, leave_out=mg.LeaveOut(clearance=0.1)).pairs) == 2
-    assert len(mg.load_scene(wide, leave_out=mg.LeaveOut(clearance=0.04)).pairs) == 1
-
-
-def test_a_pair_listed_in_the_file_is_never_left_out_by_proof():
-    assert len(mg.load_scene(PAIRED, leave_out=mg.LeaveOut()).pairs) == 2
-
-
 def test_named_pairs_and_limits_are_left_out():
-    wanted = mg.LeaveOut(never_touching=False, pairs=(("ball", "floor"),), limits=("swing",))
+    wanted = mg.LeaveOut(pairs=(("ball", "floor"),), limits=("swing",))
     scene = mg.load_scene(SCENE, leave_out=wanted)
     assert _names(scene.pairs) == {frozenset(("floor", "bob"))}
-    assert scene.omitted_pairs[0].distance is None
+    assert _names(scene.omitted_pairs) == {frozenset(("floor", "ball"))}
     assert int(scene.data._impl.nefc) == 2  # two points of the capsule
     assert scene.mj_model.jnt_limited[1], "the C model stays complete"
     assert scene.mj_model.geom_contype.all()
@@ -85,7 +60,7 @@ def test_motion_and_gradient_stay_the_same():
         return jax.jit(jax.value_and_grad(height, has_aux=True))(-1.0)
 
     (value, path), slope = outcome(mg.load_scene(SCENE))
-    (lean_value, lean_path), lean_slope = outcome(mg.load_scene(SCENE, leave_out=mg.LeaveOut(limits=("swing",))))
+    (lean_value, lean_path), lean_slope = outcome(mg.load_scene(SCENE, leave_out=APART))
     assert path[:, 0].min() < -0.005, "the ball must touch the floor"
     # XLA may order the operations of two programs differently: roundings of 1e-16, in 6 steps.
     np.testing.assert_allclose(lean_path, path, rtol=0, atol=1e-13)
@@ -99,7 +74,7 @@ def test_a_step_with_and_without_what_does_not_act_is_the_same():
         step = jax.jit(lambda model, data: mg.step(model, data).qvel)
         return step(scene.model, scene.data.replace(qpos=position, qvel=velocity))
 
-    lean = moved(mg.load_scene(SCENE, leave_out=mg.LeaveOut(limits=("swing",))))
+    lean = moved(mg.load_scene(SCENE, leave_out=APART))
     full = moved(mg.load_scene(SCENE))
     assert full[0] > -1.0, "the floor must act"
     # Rows that do not act are zero; only the order of sums may differ.
@@ -107,23 +82,12 @@ def test_a_step_with_and_without_what_does_not_act_is_the_same():
 
 
 def test_the_summary_says_what_was_left_out_why_and_how_many_rows_remain():
-    wanted = mg.LeaveOut(pairs=(("ball", "floor"),), limits=("swing",), beyond_limits=0.1)
+    wanted = mg.LeaveOut(pairs=(("ball", "floor"),), limits=("swing",))
     text = " ".join(mg.load_scene(SCENE, leave_out=wanted).summary().split())
-    assert "proven at least" in text
-    assert "while no joint leaves its range by more than 0.1: floor – bob" in text
     assert "as asked: floor – ball" in text
     assert "as asked: swing" in text
     # One point of the ball, two of the capsule, one limit.
-    assert "0 remain of 4" in text
-
-
-def test_a_margin_beyond_the_proof_is_warned_of():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        scene = mg.load_scene(SCENE, leave_out=mg.LeaveOut(clearance=0.3))
-        scene.with_softness(mg.Softness(stiffness=400, damping_ratio=1))
-    with pytest.warns(SceneWarning, match="floor – bob is left out, proven .* apart, which its margin of 350 mm"):
-        scene.with_softness(mg.Softness(margin=0.7))
+    assert "2 remain of 4" in text
 
 
 @pytest.mark.parametrize(
@@ -131,8 +95,6 @@ def test_a_margin_beyond_the_proof_is_warned_of():
     [
         ({"pairs": (("ball", "bal"),)}, "leave_out.pairs must name pairs of geoms that can touch, got 'bal – ball'"),
         ({"limits": ("fall",)}, "leave_out.limits must name joints with limits, got 'fall'; those that have: swing"),
-        ({"clearance": -0.1}, "leave_out.clearance must be finite and at least 0, got -0.1"),
-        ({"beyond_limits": float("nan")}, "leave_out.beyond_limits must be finite and at least 0, got nan"),
     ],
 )
 def test_mistakes_are_named(wanted, message):
@@ -147,4 +109,31 @@ def test_a_listed_pair_is_not_left_out_by_name():
 
 def test_keeping_everything_and_leaving_out_exclude_each_other():
     with pytest.raises(ValueError, match="leave_out must be None with keep_everything=True"):
-        mg.load_scene(SCENE, leave_out=mg.LeaveOut(), keep_everything=True)
+        mg.load_scene(SCENE, leave_out=mg.LeaveOut(limits=("swing",)), keep_everything=True)
+
+
+def _crowd(count):
+    bodies = "".join(f"<body pos='{i} 0 0'><freejoint/><geom size='.1'/></body>" for i in range(count))
+    return mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><geom type='plane' size='1 1 1'/>{bodies}</worldbody></mujoco>"
+    )
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_masks_keep_the_pairs_that_are_to_be_kept_in_their_order(share):
+    model, rng = _crowd(15), np.random.default_rng(3)
+    everything = contact_pairs(model)
+    kept = tuple(pair for pair in everything if rng.random() < share)
+    keep_pairs(model, kept)
+    assert contact_pairs(model) == kept
+
+
+def test_more_masks_than_bits_are_refused():
+    """A chain of 65 geoms, each against the next: no bit settles more than the two pairs of one geom."""
+    model = _crowd(64)
+    chain = [pair for pair in contact_pairs(model) if abs(pair.geom1 - pair.geom2) == 1]
+    with pytest.raises(TooManyMasksError, match="31 bits"):
+        keep_pairs(model, chain)
+    shorter = [pair for pair in chain if max(pair.geom1, pair.geom2) <= 62]
+    keep_pairs(model, shorter)
+    assert contact_pairs(model) == tuple(shorter)

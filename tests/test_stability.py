@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.diagnostics.stability import (
-    Derivative,
-    Motion,
-    MotionRecord,
-    UnsoundGradientError,
-    check_soundness,
-    classify_derivative,
-    classify_motion,
-    soundness,
-)
+from mjxgrad.diagnostics import UnsoundGradientError, check_soundness, soundness
 
 SCENE = """
 <mujoco>
@@ -169,59 +160,6 @@ def test_a_speed_that_is_none_is_refused(speed):
         _report(speed=speed)
 
 
-def _record(**changes):
-    fine = {
-        "is_sound": True, "residual": 1e-9, "gain": 0.9, "rest": 0.5, "has_crossed": False,
-        "restitution": np.nan, "expected": np.nan,
-    }  # fmt: skip
-    return MotionRecord(**{name: np.array([value]) for name, value in (fine | changes).items()})
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({}, Motion.MOVES),
-        ({"rest": 1e-4}, Motion.SETTLES),
-        # e⁻² is the restitution at critical damping.
-        ({"restitution": 0.14, "expected": np.exp(-2)}, Motion.BOUNCES_RIGHT),
-        ({"restitution": 0.30, "expected": np.exp(-2)}, Motion.BOUNCES_OTHERWISE),
-        ({"gain": 1.2, "restitution": 1.1, "expected": 1.1}, Motion.GAINS_ENERGY),
-        ({"gain": np.nan}, Motion.GAINS_ENERGY),
-        ({"has_crossed": True, "gain": 2.0}, Motion.TUNNELS),
-        ({"residual": 0.5, "has_crossed": True}, Motion.UNSOLVED),
-        ({"residual": np.nan}, Motion.UNSOLVED),
-        ({"is_sound": False, "residual": np.nan, "gain": np.inf}, Motion.DIVERGES),
-    ],
-)
-def test_a_motion_is_called_by_the_worst_of_what_it_did(changes, expected):
-    assert classify_motion(_record(**changes))[0] == expected
-
-
-@pytest.mark.parametrize(
-    ("derivative", "is_finite", "is_sound", "error", "expected"),
-    [
-        (-np.exp(-2), True, True, 0.0, Derivative.RIGHT),
-        (-3.0, True, True, 0.0, Derivative.WRONG),
-        (-3.0, True, True, 1.0, Derivative.UNJUDGED),
-        (1e9, True, True, 0.0, Derivative.EXPLODES),
-        (-np.exp(-2), False, True, 0.0, Derivative.NON_FINITE),
-        (np.inf, True, True, 0.0, Derivative.NON_FINITE),
-        (-np.exp(-2), True, False, 0.0, Derivative.NONE),
-    ],
-)
-def test_a_derivative_is_held_against_the_restitution(derivative, is_finite, is_sound, error, expected):
-    found = classify_derivative(
-        np.array([derivative]),
-        np.array([is_finite]),
-        np.array([is_sound]),
-        np.array([-np.exp(-2)]),
-        np.array([error]),
-        largest=1e4,
-        tolerance=1e-3,
-    )
-    assert found[0] == expected
-
-
 def test_a_gradient_is_unsound_for_each_of_its_reasons():
     good = {"a": jnp.ones(3), "b": jnp.array(2.0)}
     assert bool(soundness(good).is_sound)
@@ -234,8 +172,6 @@ def test_a_gradient_is_unsound_for_each_of_its_reasons():
 
 
 def test_unsound_gradients_are_raised_with_their_counts():
-    import jax
-
     batch = jnp.array([[1.0, 2.0], [jnp.nan, 1.0], [jnp.inf, jnp.nan]])
     found = jax.vmap(soundness)(batch)
     with pytest.raises(UnsoundGradientError, match=r"2 of 3 gradients must not be used: 2 are not finite"):

@@ -74,7 +74,7 @@ def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> Scene
         )
         for i in range(2)
     )
-    found = variants(path, recorded, settings.beyond_limits)
+    found = variants(path, recorded)
     starts = segments(recorded, batch=sizes.batch, horizon=sizes.horizon, seed=settings.seed)
     # Compile times are measured, so Python keeps a core to itself.
     with ThreadPoolExecutor(num_compilers(besides=1)) as pool:

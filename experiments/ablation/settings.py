@@ -58,8 +58,6 @@ class AblationSettings(RunSettings):
     """Of each recorded rollout (s)."""
     control_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Of the range of the controls, over which they are drawn for the recorded rollouts."""
-    beyond_limits: Annotated[float, Field(ge=0)] = 0.1
-    """How far joints may leave their ranges in a proof that geoms never touch (rad or m)."""
 
     @property
     def sizes(self) -> Sizes:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -10,13 +10,12 @@ import numpy as np
 
 import mjxgrad as mg
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.scene.leave_out import omit
-from mjxgrad.scene.omissions import switch_off
+from mjxgrad.scene.omissions import omit, switch_off
 
 EVERYTHING, NEEDED, REACHED = "everything", "all that is not needed", "all not needed or not reached"
 RENDERING, SENSORS, TENDONS = "rendering elements", "sensors", "unused tendons"
 FUSED, DAMPING = "fixed bodies", "implicit damping of zero"
-PROVEN, PAIRS, LIMITS = "contacts proven apart", "contacts not reached", "limits not reached"
+PAIRS, LIMITS = "contacts not reached", "limits not reached"
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,12 @@ class Variant:
     changes_rows: bool
 
 
-def variants(path: Path, recorded: mg.Trajectory, beyond_limits: float) -> list[Variant]:
+def variants(path: Path, recorded: mg.Trajectory) -> list[Variant]:
     """Build a scene with everything, without each group that it has, and without all that it does not need.
 
     Args:
         path: of its MJCF.
         recorded: its motions, for what they reach.
-        beyond_limits: in a proof (rad or m).
 
     Returns:
         The one with everything first; last the one without all that no motion needs, and where the recorded motions
@@ -59,11 +57,10 @@ def variants(path: Path, recorded: mg.Trajectory, beyond_limits: float) -> list[
             if edited is not None:
                 scene = mg.load_scene(edited[0], keep_everything=True)
                 found.append(Variant(name, scene, edited[1], name == FUSED))
-        found += _constraints(everything, unused, beyond_limits)
-        proven = mg.LeaveOut(beyond_limits=beyond_limits)
-        found.append(_lean(NEEDED, path, proven))
+        found += _constraints(everything, unused)
+        found.append(_lean(NEEDED, path, mg.LeaveOut()))
         if unused.pairs or unused.limits:
-            found.append(_lean(REACHED, path, replace(proven, pairs=unused.pairs, limits=unused.limits)))
+            found.append(_lean(REACHED, path, unused))
     return found
 
 
@@ -74,13 +71,8 @@ def _lean(name: str, path: Path, wanted: mg.LeaveOut) -> Variant:
     return Variant(name, scene, ", ".join(["as load_scene does", *listed]), bool(listed))
 
 
-def _constraints(everything: mg.Scene, unused: mg.LeaveOut, beyond_limits: float) -> Iterator[Variant]:
-    proven = mg.LeaveOut(beyond_limits=beyond_limits)
-    for name, wanted in (
-        (PROVEN, proven),
-        (PAIRS, mg.LeaveOut(never_touching=False, pairs=unused.pairs)),
-        (LIMITS, mg.LeaveOut(never_touching=False, limits=unused.limits)),
-    ):
+def _constraints(everything: mg.Scene, unused: mg.LeaveOut) -> Iterator[Variant]:
+    for name, wanted in ((PAIRS, mg.LeaveOut(pairs=unused.pairs)), (LIMITS, mg.LeaveOut(limits=unused.limits))):
         model = everything.to_mujoco()
         omitted, omissions = omit(model, wanted)
         if omissions:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import mjxgrad as mg
 from experiments.cube_toss.outcome import Course, Outcome, Point
@@ -17,7 +17,9 @@ from experiments.failure import ExperimentError
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import data_of
-from mjxgrad.integration import adaptive_rollout, substepped_step
+from mjxgrad.dynamics import Gradient, assembly
+from mjxgrad.dynamics.events import contacts_of
+from mjxgrad.integration import adaptive_rollout
 from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
@@ -167,3 +169,43 @@ def _adaptive_quotient(task: CubeToss, speed: Array, tolerance: Array):
         lambda at: _adaptive_end(task, at, tolerance), jnp.stack([speed - _STEP, speed + _STEP])
     )
     return (ends[1] - ends[0]) / (2 * _STEP), jnp.sum(num_steps).astype(float), jnp.any(failed)
+
+
+def substepped_step(
+    model: mjx.Model, data: mjx.Data, *, num_substeps: int, gradient: Gradient = "discrete"
+) -> mjx.Data:
+    """Advance by one time step, in short steps if a contact or limit begins or ends in it.
+
+    A step holds an event if a distance changes its sign, judged by the distances at its beginning and the velocities at its
+    end. Under `jax.vmap` every member takes the short steps in every step and throws them away.
+
+    Args:
+        model: as for `step`.
+        data: the present state.
+        num_substeps: short steps in a step that holds an event.
+        gradient: as for `step`.
+
+    Returns:
+        Data whose state is one time step later. Its other fields are those of the last step taken, long or short.
+    """
+    after = mg.step(model, data, gradient=gradient)
+    short = model.tree_replace({"opt.timestep": model.opt.timestep / num_substeps})
+
+    def refine(data: mjx.Data) -> mjx.Data:
+        def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            return mg.step(short, data, gradient=gradient), None  # pyright: ignore[reportArgumentType]
+
+        return jax.lax.scan(substep, data, length=num_substeps)[0]
+
+    return jax.lax.cond(_holds_event(model, data, after), refine, lambda _: after, data)
+
+
+def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:
+    """Whether some distance changes its sign in a step."""
+    # Contacts and kinematics of a stepped data are those of the state before; its position is not.
+    blocks = assembly.gather(model, after.replace(qpos=before.qpos))
+    if not any(block.rows_each for block in blocks):
+        return jnp.zeros((), bool)
+    distance, normal = contacts_of(blocks)
+    later = distance + model.opt.timestep * normal @ after.qvel
+    return jnp.any((distance < 0) != (later < 0))

@@ -68,8 +68,7 @@ def estimator(method: MethodSettings, task: Published) -> Callable[..., Gradient
             "concavity": rules.Concavity,
             "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
         }[method.rule]()
-    library = mg.baselines if method.name == "reinforce" else mg.estimators
-    return functools.partial(getattr(library, method.name), **options)
+    return functools.partial(getattr(mg.estimators, method.name), **options)
 
 
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Run:

@@ -14,10 +14,9 @@ from experiments.policy_gradient.outcome import GRADIENTS, Cell, Course, Estimat
 from experiments.policy_gradient.problems import Descent, Problem, problem
 from experiments.policy_gradient.settings import PolicyGradientSettings
 from experiments.workspace import Workspace
-from mjxgrad.estimators.alpha import weigh
-from mjxgrad.estimators.by_noise import plan_by_noise
-from mjxgrad.estimators.control_variate import stream_parts
+from mjxgrad.estimators.mixture import stream_parts, weigh
 from mjxgrad.estimators.rules import Consistent
+from mjxgrad.estimators.samples import plan_by_noise
 
 
 class Estimated(eqx.Module):

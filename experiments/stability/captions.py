@@ -1,7 +1,7 @@
 """What each figure shows and how to read it."""
 
+from experiments.stability.classes import BOUNCE, GAIN
 from experiments.stability.outcome import Outcome, SceneOutcome
-from mjxgrad.diagnostics.stability.classes import BOUNCE, GAIN
 
 _LIMITS = {
     "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
 from experiments.report import Figure
+from experiments.stability.classes import Derivative, Motion
 from experiments.stability.grid import AXES
 from experiments.stability.limits import limit_curve
 from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
 from experiments.theme import REFERENCE, power, save, subplots
-from mjxgrad.diagnostics.stability import Derivative, Motion
 
 MOTION_COLOURS = {
     Motion.SETTLES: "#c9e3f4",

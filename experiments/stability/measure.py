@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
+from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import Points, points
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along, errors_of_solves
@@ -17,14 +18,7 @@ from experiments.stability.reference import WIDTHS, Course, Reference, direction
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
 from experiments.stability.settings import SIZES, Size, StabilitySettings
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics.stability import (
-    UNSOLVED,
-    Motion,
-    MotionRecord,
-    classify_derivative,
-    classify_motion,
-    soundness,
-)
+from mjxgrad.diagnostics import soundness
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
 
 _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")

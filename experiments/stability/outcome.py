@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.stability.classes import Derivative, Motion
 from experiments.stability.grid import RANDOM, Points
 from experiments.stability.scenes import StabilityScene
 from experiments.stability.settings import StabilitySettings
-from mjxgrad.diagnostics.stability import Derivative, Motion
 
 C_MUJOCO = "C MuJoCo"
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from experiments.stability.classes import Derivative, Motion
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, SceneOutcome
-from mjxgrad.diagnostics.stability import Derivative, Motion
 
 UNEXPLAINED = "unexplained"
 _SAME_MOTION = 1e-3

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from experiments.report import Table
+from experiments.stability.classes import Derivative, Motion
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.reasons import UNEXPLAINED, reasons
-from mjxgrad.diagnostics.stability import Derivative, Motion
 
 _FAILS = Motion.GAINS_ENERGY
 

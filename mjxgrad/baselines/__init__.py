@@ -5,6 +5,5 @@ They are written here, for each is short, and a library of them would bring in a
 
 from mjxgrad.baselines.cross_entropy import cross_entropy
 from mjxgrad.baselines.path_integral import mppi, predictive_sampling
-from mjxgrad.baselines.reinforce import reinforce
 
-__all__ = ["cross_entropy", "mppi", "predictive_sampling", "reinforce"]
+__all__ = ["cross_entropy", "mppi", "predictive_sampling"]

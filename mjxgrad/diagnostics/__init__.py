@@ -10,15 +10,10 @@ from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
-from mjxgrad.diagnostics.stability import (
-    Soundness,
-    StabilityReport,
-    UnsoundGradientError,
-    check_soundness,
-    check_stability,
-    soundness,
-)
+from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
+from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.diagnostics.statistics import (
+    VarianceInterval,
     bias_interval,
     binomial_bound,
     binomial_interval,
@@ -26,8 +21,8 @@ from mjxgrad.diagnostics.statistics import (
     chi_square_variance_interval,
     mean_interval,
     root_mean_square_interval,
+    variance_interval,
 )
-from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
 
 __all__ = [
     "BiasVariance",

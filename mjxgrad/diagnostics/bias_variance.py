@@ -12,9 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad.diagnostics.reference import REACH, Landscape, cell_points, map_in_chunks
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
-from mjxgrad.estimators.sampling import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
-from mjxgrad.estimators.shared import both_plan, both_results, both_summary
-from mjxgrad.estimators.zeroth import zeroth_order
+from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
+from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
 from mjxgrad.objective import Objective, ParameterNoise
 
 
@@ -118,7 +117,8 @@ def bias_variance(
         raise ValueError(f"num_reference must be at least 4, got {num_reference}")
     params = jnp.asarray(params)
     stacked, count = _stacked(softness)
-    plan = both_plan(num_samples, chunk_size, with_zero_noise=baseline == "zero_noise")
+    has_zero_noise = baseline == "zero_noise"
+    plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)
     measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
     rows = []
     for i in range(count):

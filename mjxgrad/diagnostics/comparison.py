@@ -11,8 +11,13 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.diagnostics.budget import Affordable, Estimator, Rollouts, Seconds, affordable
 from mjxgrad.diagnostics.reference import map_in_chunks
-from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval
-from mjxgrad.diagnostics.variances import VarianceInterval, variance_interval
+from mjxgrad.diagnostics.statistics import (
+    VarianceInterval,
+    bias_interval,
+    checked,
+    root_mean_square_interval,
+    variance_interval,
+)
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.objective import Objective
 

@@ -1,8 +1,8 @@
 """Whether recorded motions needed what their scene leaves out, asked of the full model in C MuJoCo.
 
-A proof that two geoms never touch holds for the lengths in the file and for limits that hold, and what is left out on a user's
-word has no proof at all. A rollout cannot notice by itself: what is left out is never looked at. So every recorded state
-is put into the full C model, where an omitted contact or limit shows, and stepped with and without the omissions.
+What is left out on a user's word has no proof, and a rollout cannot notice by itself: what is left out is never looked at.
+So every recorded state is put into the full C model, where an omitted contact or limit shows, and stepped with and
+without the omissions.
 """
 
 import copy
@@ -146,7 +146,7 @@ def unused(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01, lim
         limit_clearance: a limit counts as near within this distance beyond its margin (m or rad).
 
     Returns:
-        What to pass as `leave_out`, proofs included that trust no limits.
+        What to pass as `leave_out`.
 
     Raises:
         ValueError: as `check_omissions`.
@@ -166,7 +166,7 @@ def unused(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01, lim
         if pair.explicit < 0 and frozenset((pair.geom1, pair.geom2)) not in near
     )
     joints = [full.joint(j).name for j in np.flatnonzero(full.jnt_limited.astype(bool) & ~reached)]
-    return LeaveOut(clearance=clearance, pairs=pairs, limits=tuple(filter(None, joints)))
+    return LeaveOut(pairs=pairs, limits=tuple(filter(None, joints)))
 
 
 def without_omissions(scene: Scene, full: mujoco.MjModel) -> mujoco.MjModel:
@@ -182,7 +182,7 @@ class _Ledger:
 
     def __init__(self, scene: Scene, full: mujoco.MjModel, lean: mujoco.MjModel):
         self._model = full
-        self._pairs = {frozenset((o.pair.geom1, o.pair.geom2)): str(o.pair) for o in scene.omitted_pairs}
+        self._pairs = {frozenset((pair.geom1, pair.geom2)): str(pair) for pair in scene.omitted_pairs}
         self._joints = np.flatnonzero(full.jnt_limited.astype(bool) & ~lean.jnt_limited.astype(bool))
         self._found: dict[str, list[tuple[int, float]]] = {}
 

@@ -1,16 +1,21 @@
 """Intervals for means, biases, variances, errors and probabilities; on the host, in NumPy."""
 
 from collections.abc import Iterator
+from typing import Literal, get_args
 
+import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 from scipy import stats
 
 Interval = Float[np.ndarray, "2 *shape"]
+Method = Literal["chi_square", "bootstrap"]
 
 # Counts of 50 resamples of 1e5 samples are 40 MB.
 _RESAMPLES_AT_A_TIME = 50
+# Below this number a bootstrap knows too little of the tails, and a test of normality finds nothing.
+_FEWEST_FOR_BOOTSTRAP = 20
 
 
 def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
@@ -145,9 +150,7 @@ def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float
         Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
         26, 1934.
     """
-    tail = (1 - checked(confidence)) / 2
-    low = 0.0 if count == 0 else stats.beta.ppf(tail, count, total - count + 1)
-    return np.array([low, binomial_bound(count, total, 1 - tail)])
+    return np.array(_binomial_test(count, total).proportion_ci(checked(confidence)))
 
 
 def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
@@ -164,9 +167,13 @@ def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
     Raises:
         ValueError: if `confidence` is not between 0 and 1, or `count` not between 0 and `total`.
     """
+    return float(_binomial_test(count, total, "less").proportion_ci(checked(confidence)).high)
+
+
+def _binomial_test(count: int, total: int, alternative: str = "two-sided"):
     if not 0 <= count <= total or total < 1:
         raise ValueError(f"count must be between 0 and total, which is at least 1, got {count} of {total}")
-    return 1.0 if count == total else float(stats.beta.ppf(checked(confidence), count + 1, total - count))
+    return stats.binomtest(count, total, alternative=alternative)
 
 
 def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
@@ -238,6 +245,73 @@ def _resampling_counts(count: int, num_resamples: int, seed: int) -> Iterator[In
     sizes = [min(_RESAMPLES_AT_A_TIME, num_resamples - i) for i in range(0, num_resamples, _RESAMPLES_AT_A_TIME)]
     for size in sizes:
         yield rng.multinomial(count, np.full(count, 1 / count), size)
+
+
+class VarianceInterval(eqx.Module):
+    """A variance with its interval, and how that was found.
+
+    Attributes:
+        value: the trace of the covariance, with N − 1.
+        ends: lower and upper.
+        method: "chi_square" or "bootstrap".
+    """
+
+    value: float
+    ends: Float[np.ndarray, " 2"]
+    method: Method = eqx.field(static=True)
+
+
+def variance_interval(
+    samples: Float[np.ndarray, "samples dim"],
+    confidence: float = 0.95,
+    *,
+    method: Method | None = None,
+    num_resamples: int = 1000,
+    seed: int = 0,
+) -> VarianceInterval:
+    """Give the interval of a total variance by the method that the samples deserve, and say which.
+
+    Chi-square is exact for normal samples of one coordinate (with several the degrees of freedom follow from the
+    eigenvalues of the covariance) and wrong for any others; the bootstrap assumes no distribution but needs samples.
+
+    Args:
+        samples: independent; those that are not finite are left out.
+        confidence: chance to cover the truth.
+        method: None takes the bootstrap where there are at least 20 samples and a test of their kurtosis refuses the
+            normal distribution in some coordinate (5 % over all of them), else chi-square.
+        num_resamples: of the bootstrap.
+        seed: of the bootstrap.
+
+    Returns:
+        The variance, its interval and the method; NaN for fewer than two finite samples.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1, or `method` is none of the choices.
+    """
+    checked(confidence)
+    if method not in (None, *get_args(Method)):
+        raise ValueError(f"method must be one of {', '.join(map(repr, get_args(Method)))} or None, got {method!r}")
+    samples = np.asarray(samples, float)
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    if len(samples) < 2:
+        return VarianceInterval(np.nan, np.full(2, np.nan), method or "chi_square")
+    method = method or ("bootstrap" if _has_other_tails(samples) else "chi_square")
+    covariance = np.atleast_2d(np.cov(samples, rowvar=False))
+    total = float(np.trace(covariance))
+    if method == "bootstrap":
+        ends = bootstrap_variance_interval(samples, confidence, num_resamples=num_resamples, seed=seed)
+        return VarianceInterval(total, ends, method)
+    squares = (covariance**2).sum()
+    freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
+    return VarianceInterval(total, chi_square_variance_interval(total, freedom + 1, confidence), method)
+
+
+def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
+    """Tell whether the kurtosis of some coordinate is not that of a normal distribution."""
+    varied = samples[:, np.ptp(samples, axis=0) > 0]
+    if len(samples) < _FEWEST_FOR_BOOTSTRAP or varied.shape[1] == 0:
+        return False
+    return bool(stats.kurtosistest(varied).pvalue.min() < 0.05 / varied.shape[1])
 
 
 def checked(confidence: float) -> float:

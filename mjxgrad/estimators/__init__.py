@@ -1,14 +1,11 @@
 """Estimates of the gradient of a smoothed objective, all with the same call."""
 
 from mjxgrad.estimators import rules
-from mjxgrad.estimators.alpha import alpha_order
-from mjxgrad.estimators.control_variate import control_variate
 from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason
-from mjxgrad.estimators.first import first_order
+from mjxgrad.estimators.first_and_zeroth import first_and_zeroth_order, first_order, zeroth_order
 from mjxgrad.estimators.least_squares import least_squares
-from mjxgrad.estimators.per_step import per_step
-from mjxgrad.estimators.shared import first_and_zeroth_order
-from mjxgrad.estimators.zeroth import zeroth_order
+from mjxgrad.estimators.mixture import alpha_order, control_variate, per_step
+from mjxgrad.estimators.reinforce import reinforce
 
 __all__ = [
     "Diagnosis",
@@ -20,6 +17,7 @@ __all__ = [
     "first_order",
     "least_squares",
     "per_step",
+    "reinforce",
     "rules",
     "zeroth_order",
 ]

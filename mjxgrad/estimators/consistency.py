@@ -24,7 +24,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.estimators.by_noise import Group
+from mjxgrad.estimators.samples import Group
 
 # Differences of costs are rounded; what is within this many units in the last place of the largest cost is no residual.
 _ROUNDING = 32.0

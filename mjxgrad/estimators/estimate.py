@@ -6,7 +6,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.estimators.moments import Moments
-from mjxgrad.estimators.sampling import Plan
+from mjxgrad.estimators.samples import Plan
 
 
 class Diagnosis(eqx.Enumeration):

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments
-from mjxgrad.estimators.sampling import Plan, sample
+from mjxgrad.estimators.samples import Plan, sample
 from mjxgrad.objective import Objective, ParameterNoise
 from mjxgrad.objective.actions import OpenLoop
 

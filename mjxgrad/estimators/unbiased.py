@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.estimators.by_noise import Group
+from mjxgrad.estimators.samples import Group
 
 
 class UnbiasedTerms(eqx.Module):

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from mjxgrad.planning.linear_model import LinearModel
 from mjxgrad.planning.models import Smoother
 from mjxgrad.planning.system import System
-from mjxgrad.task import as_pytree
+from mjxgrad.task import optional_pytree
 
 # Kinds of samples: a pose of what the goal is about, wherever the rest may be; or all positions.
 _POSE, _EVERYTHING = 0, 1
@@ -90,13 +90,6 @@ class Nodes(eqx.Module):
         """The node nearest to the goal."""
         return jnp.argmin(jnp.where(self.is_node, self.errors, jnp.inf))
 
-    def nearest(
-        self, system: System, sample: Float[Array, " state"], weights: Float[Array, "kinds p"], kind: Int[Array, ""]
-    ) -> Int[Array, ""]:
-        """Return the node from whose reach a sample is least far."""
-        distances, _ = jax.vmap(lambda one: one.distance(system, sample, weights, kind))(self.reaches)
-        return jnp.argmin(jnp.where(self.is_node & jnp.isfinite(distances), distances, jnp.inf))
-
     def add(self, new: "Nodes", is_valid: Bool[Array, "*many"]) -> "Nodes":
         """Append nodes, in their order; those beyond the capacity are lost.
 
@@ -121,29 +114,6 @@ class Nodes(eqx.Module):
             reaches=jax.tree.map(put, self.reaches, new.reaches),
             size=jnp.minimum(self.size + valid.sum(), len(self.parents)),
         )
-
-
-def _planted(root: Nodes, capacity: int) -> Nodes:
-    """Return a tree of one node with room for others.
-
-    Args:
-        root: the node, without leading axes.
-        capacity: how many nodes there will be room for.
-    """
-
-    def spread(x: Array) -> Array:
-        return jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x)
-
-    rows = jax.tree.map(spread, root)
-    return eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
-
-
-def _lineage(parents: Int[np.ndarray, " capacity"], node: int) -> list[int]:
-    """Return the nodes from the root to a node, both included; on the host."""
-    line = [node]
-    while parents[line[-1]] >= 0:
-        line.append(int(parents[line[-1]]))
-    return line[::-1]
 
 
 class Search(eqx.Module):
@@ -174,10 +144,6 @@ class Path(eqx.Module):
     controls: Float[np.ndarray, "horizon m"]
 
 
-def _optional_pytree(function: Callable | None) -> Callable | None:
-    return None if function is None else as_pytree(function)
-
-
 class Sampling(eqx.Module):
     """Where samples fall, and how the tree grows towards them.
 
@@ -200,7 +166,7 @@ class Sampling(eqx.Module):
     goal_share: float = 0.2
     transit_share: float = 0.3
     transit: Callable[[PRNGKeyArray, Float[Array, " state"]], Float[Array, " state"]] | None = eqx.field(
-        converter=_optional_pytree, default=None
+        converter=optional_pytree, default=None
     )
     batch: int = eqx.field(static=True, default=16)
     max_extension: int = eqx.field(static=True, default=8)
@@ -278,7 +244,10 @@ def search(
 
 def path(found: Search) -> Path:
     """Return the way to the node nearest to the goal, whether it is near enough or not; on the host."""
-    line = np.asarray(_lineage(np.asarray(found.nodes.parents), int(found.nodes.best)))
+    parents, line = np.asarray(found.nodes.parents), [int(found.nodes.best)]
+    while parents[line[-1]] >= 0:
+        line.append(int(parents[line[-1]]))
+    line = np.asarray(line[::-1])
     return Path(line, np.asarray(found.nodes.states)[line], np.asarray(found.nodes.controls)[line[1:]])
 
 
@@ -299,10 +268,23 @@ class _Grower(eqx.Module):
         self, state: Float[Array, " state"], control: Float[Array, " m"], parent: Int[Array, ""], key: PRNGKeyArray
     ) -> Nodes:
         """Return a node, with what it can reach."""
-        middle, radius = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        model = self.smoother.linear_model(self.system, state, middle, key, wrt_state=False)
-        error = jnp.max(jnp.abs(self.system.difference(state, self.goal)) / self.tolerance)
-        return Nodes(state, control, parent, error, reach(model, radius, self.weights), jnp.asarray(1))
+        model = self.smoother.linear_model(self.system, state, self.middle, key, wrt_state=False)
+        here = reach(model, self.radius, self.weights)
+        return Nodes(state, control, parent, self.error(state), here, jnp.asarray(1))
+
+    @property
+    def middle(self) -> Float[Array, " m"]:
+        """The controls at which models are made."""
+        return 0.5 * (self.lower + self.upper)
+
+    @property
+    def radius(self) -> Float[Array, " m"]:
+        """How far the controls go from there."""
+        return 0.5 * (self.upper - self.lower)
+
+    def error(self, state: Float[Array, " state"]) -> Float[Array, ""]:
+        """Return the distance from the goal in units of its tolerance."""
+        return jnp.max(jnp.abs(self.system.difference(state, self.goal)) / self.tolerance)
 
     def root(self) -> Nodes:
         """Return the start as a node that reaches nothing but itself.
@@ -312,19 +294,23 @@ class _Grower(eqx.Module):
         p, m, kinds = self.system.num_positions, self.lower.size, len(self.weights)
         dtype = self.start.dtype
         here = Reach(self.start, jnp.zeros((p, m), dtype), jnp.broadcast_to(jnp.eye(m, dtype=dtype), (kinds, m, m)))
-        error = jnp.max(jnp.abs(self.system.difference(self.start, self.goal)) / self.tolerance)
-        return Nodes(self.start, jnp.zeros(m, dtype), jnp.asarray(-1), error, here, jnp.asarray(1))
+        return Nodes(self.start, jnp.zeros(m, dtype), jnp.asarray(-1), self.error(self.start), here, jnp.asarray(1))
 
     def grow(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Nodes, Int[Array, ""]]:
         """Extend the tree towards a batch of samples; return it and the number of steps tried."""
         draw_key, model_key = jax.random.split(key)
         keys = jax.random.split(draw_key, self.sampling.batch)
         samples, kinds = jax.vmap(functools.partial(self.draw, nodes))(keys)
-        nearest = jax.vmap(lambda sample, kind: nodes.nearest(self.system, sample, self.weights, kind))(samples, kinds)
+        nearest = jax.vmap(functools.partial(self.nearest, nodes))(samples, kinds)
         new, is_valid = jax.vmap(functools.partial(self.extend, nodes, model_key))(
             jnp.arange(self.sampling.batch), nearest, samples, kinds
         )
         return nodes.add(new, is_valid), jnp.asarray(self.sampling.batch * self.sampling.max_extension)
+
+    def nearest(self, nodes: Nodes, sample: Float[Array, " state"], kind: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the node from whose reach a sample is least far."""
+        distances, _ = jax.vmap(lambda one: one.distance(self.system, sample, self.weights, kind))(nodes.reaches)
+        return jnp.argmin(jnp.where(nodes.is_node & jnp.isfinite(distances), distances, jnp.inf))
 
     def draw(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Float[Array, " state"], Int[Array, ""]]:
         """Return a sample and its kind."""
@@ -360,13 +346,12 @@ class _Grower(eqx.Module):
         kind: Int[Array, ""],
     ) -> tuple[Nodes, Bool[Array, " steps"]]:
         """Go from a node towards a sample as long as it comes nearer."""
-        middle, radius = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
         most = self.sampling.max_extension
 
         def advance(carry, step: Int[Array, ""]):
             state, here, is_on = carry
             distance, control = here.distance(self.system, sample, self.weights, kind)
-            control = middle + radius * control / jnp.maximum(1, jnp.max(jnp.abs(control)))
+            control = self.middle + self.radius * control / jnp.maximum(1, jnp.max(jnp.abs(control)))
             moved = self.system.step(state, control)
             # Beyond −1 a parent is another new node, by its number among them all.
             parent = jnp.where(step == 0, nearest, -2 - (number * most + step - 1))
@@ -379,6 +364,21 @@ class _Grower(eqx.Module):
         at = jax.tree.map(lambda x: x[nearest], (nodes.states, nodes.reaches))
         _, (new, is_valid) = jax.lax.scan(advance, (*at, jnp.asarray(True)), jnp.arange(most))
         return new, is_valid
+
+
+def _planted(root: Nodes, capacity: int) -> Nodes:
+    """Return a tree of one node with room for others.
+
+    Args:
+        root: the node, without leading axes.
+        capacity: how many nodes there will be room for.
+    """
+
+    def spread(x: Array) -> Array:
+        return jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x)
+
+    rows = jax.tree.map(spread, root)
+    return eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
 
 
 def _check(

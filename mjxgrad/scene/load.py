@@ -16,8 +16,7 @@ from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
-from mjxgrad.scene.leave_out import LeaveOut, omit
-from mjxgrad.scene.omissions import switch_off
+from mjxgrad.scene.omissions import LeaveOut, omit, switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneWarning
 

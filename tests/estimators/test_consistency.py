@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxgrad.estimators.by_noise import plan_by_noise, sample_by_noise
 from mjxgrad.estimators.consistency import secant_sums
+from mjxgrad.estimators.samples import plan_by_noise, sample_by_noise
 from mjxgrad.estimators.unbiased import gram
 from mjxgrad.objective import parameter_noise
 

@@ -107,7 +107,7 @@ def test_two_samples_are_unbiased_at_a_step():
 
 
 def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():
-    """facts.md section 5: 0.195 without it, 0.0975 with it, at N = 1000 and θ = 0."""
+    """0.195 without it, 0.0975 with it, at N = 1000 and θ = 0."""
     objective = parameter_noise(textbook.step, textbook.STDDEV)
 
     def error(baseline):

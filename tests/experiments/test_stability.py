@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import PLANES, Points, points
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
@@ -15,7 +16,6 @@ from experiments.stability.reference import simulate, unbalanced
 from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
 from experiments.stability.settings import SIZES, StabilitySettings
 from experiments.stability.verdict import findings
-from mjxgrad.diagnostics.stability import Derivative, Motion
 
 SCENES = {scene.name: scene for scene in catalogue()}
 
@@ -179,3 +179,56 @@ def test_a_workspace_notes_what_a_scene_s_time_step_does_not_follow(tmp_path):
         loaded = mg.load_scene(scene)
     workspace.check(loaded)
     assert any("refsafe replaces it by 0.1 s" in text for text in workspace.warnings)
+
+
+def _record(**changes):
+    fine = {
+        "is_sound": True, "residual": 1e-9, "gain": 0.9, "rest": 0.5, "has_crossed": False,
+        "restitution": np.nan, "expected": np.nan,
+    }  # fmt: skip
+    return MotionRecord(**{name: np.array([value]) for name, value in (fine | changes).items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, Motion.MOVES),
+        ({"rest": 1e-4}, Motion.SETTLES),
+        # e⁻² is the restitution at critical damping.
+        ({"restitution": 0.14, "expected": np.exp(-2)}, Motion.BOUNCES_RIGHT),
+        ({"restitution": 0.30, "expected": np.exp(-2)}, Motion.BOUNCES_OTHERWISE),
+        ({"gain": 1.2, "restitution": 1.1, "expected": 1.1}, Motion.GAINS_ENERGY),
+        ({"gain": np.nan}, Motion.GAINS_ENERGY),
+        ({"has_crossed": True, "gain": 2.0}, Motion.TUNNELS),
+        ({"residual": 0.5, "has_crossed": True}, Motion.UNSOLVED),
+        ({"residual": np.nan}, Motion.UNSOLVED),
+        ({"is_sound": False, "residual": np.nan, "gain": np.inf}, Motion.DIVERGES),
+    ],
+)
+def test_a_motion_is_called_by_the_worst_of_what_it_did(changes, expected):
+    assert classify_motion(_record(**changes))[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("derivative", "is_finite", "is_sound", "error", "expected"),
+    [
+        (-np.exp(-2), True, True, 0.0, Derivative.RIGHT),
+        (-3.0, True, True, 0.0, Derivative.WRONG),
+        (-3.0, True, True, 1.0, Derivative.UNJUDGED),
+        (1e9, True, True, 0.0, Derivative.EXPLODES),
+        (-np.exp(-2), False, True, 0.0, Derivative.NON_FINITE),
+        (np.inf, True, True, 0.0, Derivative.NON_FINITE),
+        (-np.exp(-2), True, False, 0.0, Derivative.NONE),
+    ],
+)
+def test_a_derivative_is_held_against_the_restitution(derivative, is_finite, is_sound, error, expected):
+    found = classify_derivative(
+        np.array([derivative]),
+        np.array([is_finite]),
+        np.array([is_sound]),
+        np.array([-np.exp(-2)]),
+        np.array([error]),
+        largest=1e4,
+        tolerance=1e-3,
+    )
+    assert found[0] == expected

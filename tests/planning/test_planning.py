@@ -20,7 +20,7 @@ from mjxgrad.planning import (
     path,
     search,
 )
-from mjxgrad.planning.box import minimise_in_box
+from mjxgrad.planning.backward import minimise_in_box
 from mjxgrad.planning.cost import terminal_model
 from mjxgrad.planning.linear_model import LinearModel
 from mjxgrad.planning.tree import reach

@@ -1,4 +1,4 @@
-"""The zeroth-order estimate: the covariance of cost and score."""
+"""First order, the mean of the derivatives of samples; zeroth order, the covariance of cost and score; both at once."""
 
 from typing import Any
 
@@ -7,8 +7,46 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, Total, as_real
-from mjxgrad.estimators.sampling import Plan, Samples, check_baseline, stream
+from mjxgrad.estimators.samples import Plan, Samples, check_baseline, stream
 from mjxgrad.objective import Objective
+
+
+def first_order(
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    num_samples: int,
+    chunk_size: int | None = None,
+) -> GradientEstimate:
+    r"""Estimate the gradient of a smoothed objective by differentiating each sample.
+
+    $\hat g = \mathrm{mean}_i \nabla_\theta f(\theta, w_i)$. Unbiased where $f$ is continuous;
+    where it jumps the derivative misses the jump, and where it is stiff the variance is huge.
+
+    Args:
+        objective: differentiated once per sample, under `jax.vmap`.
+        params: the point $\theta$.
+        key: consumed here; do not use it again.
+        num_samples: rollouts to spend. At least 2.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
+            rounding.
+
+    Returns:
+        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
+
+    Raises:
+        ValueError: if `num_samples` is below 2, `chunk_size` below 1, or `params` is not a
+            vector of the objective's dimension.
+
+    References:
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy
+        Gradients? ICML 2022, arXiv:2202.00817, definition 2.2.
+    """
+    plan = Plan(num_samples, chunk_size, with_gradient=True)
+    params = jnp.asarray(params)
+    summary = stream(objective.sized_for(params), params, key, plan, first_order_summary)
+    return first_order_result(summary, plan)
 
 
 def zeroth_order(
@@ -68,6 +106,72 @@ def zeroth_order(
     return zeroth_order_result(summary, plan, baseline)
 
 
+def first_and_zeroth_order(
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    *,
+    num_samples: int,
+    baseline: str = "leave_one_out",
+    antithetic: bool = False,
+    chunk_size: int | None = None,
+) -> tuple[GradientEstimate, GradientEstimate]:
+    """Estimate the gradient both ways, with one differentiated rollout per sample for both.
+
+    Each is what `first_order` and `zeroth_order` give from the same key. They are dependent,
+    and each reports what was spent on both: do not add the two.
+
+    Args:
+        objective: differentiated once per sample, under `jax.vmap`.
+        params: the point.
+        key: consumed here; do not use it again.
+        num_samples: as in `zeroth_order`.
+        baseline: as in `zeroth_order`.
+        antithetic: as in `zeroth_order`; the first-order estimate then uses pairs, too.
+        chunk_size: as in `zeroth_order`.
+
+    Returns:
+        The first-order and the zeroth-order estimate. A sample with a finite cost whose
+        derivative is not finite counts in the second only.
+
+    Raises:
+        ValueError: as in `zeroth_order`.
+    """
+    check_baseline(baseline)
+    plan = Plan(
+        num_samples,
+        chunk_size,
+        antithetic,
+        with_gradient=True,
+        with_score=True,
+        **noise_free_rollouts(objective, baseline),
+    )
+    params = jnp.asarray(params)
+    kept = stream(objective.sized_for(params), params, key, plan, both_summary)
+    return both_results(kept, plan, baseline)
+
+
+def first_order_summary(samples: Samples) -> tuple[Moments, Moments]:
+    """Keep of samples what the estimate needs: moments of gradients and of costs."""
+    mask = samples.first_order_mask()
+    gradients = Moments.of(samples.gradients.mean(axis=1), mask)
+    return gradients, Moments.of(samples.costs.mean(axis=1), mask)
+
+
+def first_order_result(summary: tuple[Any, ...], plan: Plan) -> GradientEstimate:
+    """Turn what `first_order_summary` kept into the estimate."""
+    gradients, costs = summary
+    return assemble(
+        gradients.mean,
+        gradients.squared_error(),
+        costs,
+        plan,
+        count=gradients.count,
+        alpha=1.0,
+        bias_bound=jnp.nan,
+    )
+
+
 def noise_free_rollouts(objective: Objective, baseline: str) -> dict[str, bool]:
     """Say which rollouts without noise a plan needs for a baseline."""
     is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
@@ -98,6 +202,16 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> 
         count=moments.costs.count,
         has_baseline=jnp.isfinite(noise_free.value),
     )
+
+
+def both_summary(samples: Samples) -> tuple:
+    """Keep of samples what both estimates need."""
+    return *first_order_summary(samples), *zeroth_order_summary(samples)
+
+
+def both_results(kept: tuple, plan: Plan, baseline: str) -> tuple[GradientEstimate, GradientEstimate]:
+    """Turn what was kept into both estimates."""
+    return first_order_result(kept[:2], plan), zeroth_order_result(kept[2:], plan, baseline)
 
 
 def _fixed_baseline(

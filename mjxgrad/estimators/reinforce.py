@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.estimators import GradientEstimate
-from mjxgrad.estimators.estimate import assemble
+from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.sampling import Plan
+from mjxgrad.estimators.samples import Plan
 from mjxgrad.objective import ActionNoise, Objective
 
 ReinforceBaseline = Literal["leave_one_out", "none"]
@@ -68,7 +67,7 @@ def reinforce(
     if outcomes.step_costs is None:
         raise ValueError(
             f"reinforce must be given a task with step_costs, got {type(objective.task).__name__}, which knows only "
-            "the total; use estimators.zeroth_order, or let its cost be one number per step"
+            "the total; use zeroth_order, or let its cost be one number per step"
         )
     to_go = _costs_to_go(outcomes.step_costs, objective.task.horizon)
     actions = jax.vmap(lambda noise: objective.split(noise)[0])(noises)
@@ -102,7 +101,7 @@ def _checked(objective: Objective, baseline: str) -> ActionNoise:
     if not isinstance(objective, ActionNoise):
         raise ValueError(
             f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
-            "use estimators.zeroth_order where there are no steps"
+            "use zeroth_order where there are no steps"
         )
     choices = get_args(ReinforceBaseline)
     if baseline not in choices:

@@ -1,0 +1,476 @@
+r"""What a scene's time step makes of its contacts, limits and equalities, each seen as a spring and damper.
+
+Contacts, limits and equalities have one law: at full impedance $\ddot r = -k r - b \dot r$, $k$ and $b$ per unit of the
+row's effective mass. Semi-implicit Euler follows it without gaining energy while $h^2 k + 2 h b < 4$, which in MuJoCo's
+standard format is $h / t_c < 2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$, $t_c = 2 / b$.
+
+That is one row alone, at the impedance $d_w$; where the impedance falls with depth, stiffness and damping are largest at
+first touch. The n contacts of a box that lands flat add up to the impedance
+$n d / (1 + (n - 1) d)$, and pull with $n / (1 + (n - 1) d_w)$ times $k$ and $b$; contacts with other bodies add to it, up to
+$1 / d_w$ times, where a row gets the whole of the acceleration that it asks for.
+"""
+
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from mjxgrad._mjx import COLLISION_FUNCTIONS
+from mjxgrad.contact.bounce import Bounce
+from mjxgrad.contact.law import stiffness_damping
+from mjxgrad.contact.parameters import ContactPair
+from mjxgrad.diagnostics.onset import LARGEST_JUMP, STEPS_NEEDED
+from mjxgrad.scene import Scene
+from mjxgrad.scene.contact_check import (
+    altered_by_refsafe,
+    beyond_stability,
+    format_number,
+    largest_stable_step,
+    name_pairs,
+    steepest,
+)
+
+LEAST_FRICTION = 0.01
+"""Of pyramids, in single precision."""
+STEPS_IN_CONTACT = 6.0
+"""Time steps below which a bounce is too short for the event gradient, by the experiment `bounce`."""
+_WIDTH = 118  # characters; what a laptop's terminal shows
+_COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
+_LEGEND = (
+    "load: time step over the largest that gains no energy, unstable from 1 on. coupled: the same where all contacts "
+    "of the pair act at once. steps: that a bounce lasts. asked: time constant in the file, where refsafe replaces it."
+)
+_SPEED_COLUMNS = ("depth", "rise, steps")
+
+
+@dataclass(frozen=True)
+class Spring:
+    r"""A contact pair, joint limit, tendon limit or equality as a spring and damper.
+
+    Attributes:
+        kind: "contact", "joint limit", "tendon limit" or "equality".
+        name: of the pair, joint, tendon or equality.
+        stiffness: $k$ in effect, in 1/s².
+        damping: $b$ in effect, in 1/s.
+        impedance: $d_0$ and $d_w$.
+        width: over which the impedance rises, in m (rad for hinges).
+        given: the time constant that the file asks for, in s; None in the direct format.
+        timestep: $h$, in s.
+        integrator: of the model.
+        size: by how much it may be passed in one step and still be found: what a ball may move through another body, or
+            the range of a limit, in m (rad); infinite for planes and equalities.
+        num_rows: contacts that the pair can make at once.
+        pyramid: sliding friction μ of a pyramidal contact; None for all others.
+    """
+
+    kind: str
+    name: str
+    stiffness: float
+    damping: float
+    impedance: tuple[float, float]
+    width: float
+    given: float | None
+    timestep: float
+    integrator: mujoco.mjtIntegrator
+    size: float
+    num_rows: int = 1
+    pyramid: float | None = None
+
+    def __str__(self) -> str:
+        """The name, as messages print it."""
+        return self.name
+
+    @property
+    def damping_ratio(self) -> float:
+        r"""$b / (2 \sqrt k)$; infinite without stiffness."""
+        return self.damping / (2 * np.sqrt(self.stiffness)) if self.stiffness > 0 else np.inf
+
+    @property
+    def time_constant(self) -> float:
+        """$2 / b$, in s; infinite without damping."""
+        return 2 / self.damping if self.damping > 0 else np.inf
+
+    @property
+    def load(self) -> float:
+        """The time step as a share of the largest stable one: unstable from 1 on."""
+        return self._load(1.0)
+
+    @property
+    def coupled_load(self) -> float:
+        """The same where all contacts of the pair hold the body at once; never below `load`."""
+        return self._load(self.num_rows / (1 + (self.num_rows - 1) * max(self.impedance)))
+
+    @property
+    def steepest(self) -> tuple[float, float]:
+        """Stiffness (1/s²) and damping (1/s) where the impedance is largest."""
+        return steepest(self.stiffness, self.damping, self.impedance, self.width)
+
+    def _load(self, factor: float) -> float:
+        stiffness, damping = (factor * value for value in self.steepest)
+        if stiffness <= 0:
+            # A damper alone: h b < 2 for Euler, the real axis of RK4's region of stability.
+            limit = 2.785 if self.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 2.0
+            return self.timestep * damping / limit
+        frequency = np.sqrt(stiffness)
+        return self.timestep * frequency / largest_stable_step(damping / (2 * frequency), self.integrator)
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether `refsafe` replaces the time constant that was asked for."""
+        # A relative margin, because float32 rounds a time constant of exactly two steps.
+        return self.given is not None and self.time_constant > self.given * (1 + 1e-5)
+
+    @property
+    def num_steps(self) -> float:
+        """Time steps that a single bounce off it lasts, at any speed; infinite without stiffness."""
+        if self.stiffness <= 0 or self.damping <= 0:
+            return np.pi / np.sqrt(self.stiffness) / self.timestep if self.stiffness > 0 else np.inf
+        return float(self._bounce.duration) / self.timestep
+
+    def depth(self, speed: float) -> float:
+        r"""Give how deep a bounce at a speed goes, $v \sqrt e / \omega_0$, $e$ the restitution (m, or rad).
+
+        Args:
+            speed: of approach, in m/s (rad/s).
+        """
+        if self.stiffness <= 0:
+            return np.inf
+        restitution = 1.0 if self.damping <= 0 else float(self._bounce.restitution)
+        return speed * np.sqrt(restitution / self.stiffness)
+
+    def rise_steps(self, speed: float) -> float:
+        """Give the time steps in which the impedance rises at a speed of approach; infinite if it does not rise.
+
+        Args:
+            speed: of approach, in m/s (rad/s).
+        """
+        first, last = self.impedance
+        return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
+
+    @property
+    def _bounce(self) -> Bounce:
+        # Bounce writes ω₀ = 1 / (t_c ζ), which is √k by the definitions above.
+        return Bounce(self.time_constant, self.damping_ratio)
+
+
+@dataclass(frozen=True)
+class StabilityReport:
+    """Every spring of a scene beside its time step.
+
+    Attributes:
+        name: of the scene.
+        springs: contact pairs, then joint limits, tendon limits and equalities.
+        timestep: in s.
+        speed: of approach that was asked about, in m/s, or None.
+        joint_speed: the same for joints and tendons, in rad/s or m/s.
+        precision: "float32" or "float64".
+    """
+
+    name: str
+    springs: tuple[Spring, ...]
+    timestep: float
+    speed: float | None = None
+    joint_speed: float | None = None
+    precision: str = "float64"
+
+    @property
+    def largest_load(self) -> float:
+        """Time step over the largest stable one, of the worst spring; unstable from 1 on, 0 without springs."""
+        return max((spring.load for spring in self.springs), default=0.0)
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether no spring gains energy, even where all contacts of a pair act at once."""
+        return all(spring.coupled_load < 1 for spring in self.springs)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One sentence per finding, for all springs alike; none if the time step follows everything."""
+        rules: tuple[Callable[[Spring], str | None], ...] = (
+            _hidden,
+            _unstable,
+            _unstable_together,
+            _short,
+            self._passed,
+            self._deep,
+            self._unresolved,
+            self._steep,
+        )
+        found: dict[tuple[str, str], list[Spring]] = {}
+        for spring in self.springs:
+            for text in filter(None, (rule(spring) for rule in rules)):
+                found.setdefault((spring.kind, text), []).append(spring)
+        return tuple(f"{kind} of {name_pairs(same)}: {text}" for (kind, text), same in found.items())
+
+    def summary(self) -> str:
+        """Describe it for a human: a line for all springs alike, then the warnings.
+
+        Returns:
+            Text of several lines, fit for a terminal about 120 characters wide.
+        """
+        speeds = "".join(
+            f", at {value:g} {unit}"
+            for value, unit in ((self.speed, "m/s"), (self.joint_speed, "rad/s at limits"))
+            if value is not None
+        )
+        lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speeds}"]
+        if not self.springs:
+            return "\n".join([*lines, "  nothing to be followed: no contact, limit or equality"])
+        lines += _aligned([self._columns, *self._rows()])
+        lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
+        sentences = self.warnings or ("the time step follows every spring",)
+        return "\n".join(
+            lines + [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
+        )
+
+    def __str__(self) -> str:
+        """The summary."""
+        return self.summary()
+
+    @property
+    def _columns(self) -> tuple[str, ...]:
+        return _COLUMNS + _SPEED_COLUMNS * (self.speed is not None or self.joint_speed is not None)
+
+    def _rows(self) -> Iterator[tuple[str, ...]]:
+        groups: dict[tuple[str, ...], list[Spring]] = {}
+        for spring in self.springs:
+            groups.setdefault((spring.kind, *self._cells(spring)), []).append(spring)
+        for (kind, *cells), same in groups.items():
+            yield (f"{kind} {name_pairs(same)}", *cells)
+
+    def _cells(self, spring: Spring) -> tuple[str, ...]:
+        low, high = (f"{x:.4g}" for x in spring.impedance)
+        cells = (
+            *map(format_number, (spring.stiffness, spring.damping, np.sqrt(max(spring.stiffness, 0.0)))),
+            *map(format_number, (spring.damping_ratio, 1e3 * spring.time_constant)),
+            format_number(1e3 * spring.given) if spring.is_hidden and spring.given is not None else "",
+            low if low == high else f"{low}–{high}",
+            *map(format_number, (spring.load, spring.coupled_load, spring.num_steps)),
+        )
+        if len(self._columns) == len(_COLUMNS):
+            return cells
+        speed = self._speed_of(spring)
+        if speed is None:
+            return (*cells, "", "")
+        unit, scale = ("mm", 1e3) if spring.kind == "contact" else ("", 1.0)
+        depth = f"{format_number(scale * spring.depth(speed))} {unit}".strip()
+        return (*cells, depth, format_number(spring.rise_steps(speed)))
+
+    def _speed_of(self, spring: Spring) -> float | None:
+        if spring.kind == "equality":
+            return None
+        return self.speed if spring.kind == "contact" else self.joint_speed
+
+    def _passed(self, spring: Spring) -> str | None:
+        speed = self._speed_of(spring)
+        if speed is None or speed * self.timestep < spring.size:
+            return None
+        return (
+            f"at {speed:g} the bodies move {speed * self.timestep:.3g} in one step, more than the {spring.size:.3g} within "
+            f"which they are found, and can pass through; use a time step below {spring.size / speed:.2g} s"
+        )
+
+    def _deep(self, spring: Spring) -> str | None:
+        speed = self._speed_of(spring)
+        if speed is None or spring.depth(speed) < spring.size or speed * self.timestep >= spring.size:
+            return None
+        return (
+            f"at {speed:g} a bounce goes {spring.depth(speed):.3g} deep, more than the {spring.size:.3g} from which bodies "
+            f"are pushed back the way they came; take a stiffness of at least {format_number(self._needed(spring, speed))} 1/s²"
+        )
+
+    def _needed(self, spring: Spring, speed: float) -> float:
+        # At the same damping ratio the depth goes as one over the root of the stiffness.
+        return spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
+
+    def _steep(self, spring: Spring) -> str | None:
+        if self.precision == "float64" or spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:
+            return None
+        return (
+            f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does not "
+            f'resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
+        )
+
+    def _unresolved(self, spring: Spring) -> str | None:
+        speed = self._speed_of(spring)
+        if speed is None:
+            return None
+        steps, jump = spring.rise_steps(speed), spring.impedance[0]
+        reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
+        if steps < STEPS_NEEDED:
+            reasons.append(f"rises within {steps:.2g} time steps")
+        if not reasons:
+            return None
+        return (
+            f"at {speed:g} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
+            "onset=mg.Onset(), as tasks do by default, or an impedance from 0 over a width of at least "
+            f"{STEPS_NEEDED * speed * self.timestep:.2g}"
+        )
+
+
+def _hidden(spring: Spring) -> str | None:
+    if not spring.is_hidden or spring.given is None:
+        return None
+    softness = "Softness, which writes the format that refsafe leaves alone"
+    direct = "the direct format, a negative solref, which refsafe leaves alone"
+    remedy = softness if spring.kind == "contact" else direct
+    return altered_by_refsafe(spring.given, spring.damping, spring.timestep, remedy)
+
+
+def _unstable(spring: Spring) -> str | None:
+    if spring.stiffness <= 0:
+        return None
+    return beyond_stability(*spring.steepest, spring.timestep, spring.integrator)
+
+
+def _unstable_together(spring: Spring) -> str | None:
+    if spring.load >= 1 or spring.coupled_load < 1:
+        return None
+    return (
+        f"stable alone, at {spring.load:.2g} of the largest time step, but not where {spring.num_rows} contacts act at once, "
+        f"at {spring.coupled_load:.2g} of it; use a time step below "
+        f"{format_number(spring.timestep / spring.coupled_load)} s, or an impedance nearer to 1"
+    )
+
+
+def _short(spring: Spring) -> str | None:
+    if spring.kind == "equality" or spring.num_steps >= STEPS_IN_CONTACT or spring.load >= 1:
+        return None
+    return (
+        f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the event gradient, which needs about "
+        f"{STEPS_IN_CONTACT:g}; use a time step below {format_number(spring.timestep * spring.num_steps / STEPS_IN_CONTACT)} s, "
+        "or a softer contact"
+    )
+
+
+def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
+    rows = list(rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+
+
+def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: float | None = None) -> StabilityReport:
+    """Compare the contacts, limits and equalities of a scene with what its time step can follow.
+
+    Nothing is simulated. The limits are those of one spring and damper, see this module.
+
+    Args:
+        scene: with known values.
+        speed: at which geoms approach each other, in m/s; without it nothing is said about what only a speed decides:
+            passing through, depth, and onsets.
+        joint_speed: the same for joints and tendons at their limits, in rad/s or m/s.
+
+    Returns:
+        The report: `print` it, or take its `warnings`.
+
+    Raises:
+        ValueError: if a speed is not positive, or the scene is batched or traced.
+    """
+    for name, value in (("speed", speed), ("joint_speed", joint_speed)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive, got {value}; leave it out to ask about no speed")
+    model = scene.model
+    leaves = (model.geom_solref, model.jnt_solref, model.opt.timestep)
+    is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+    if is_traced or np.ndim(model.geom_solref) != 2 or np.ndim(model.opt.timestep) != 0:
+        raise ValueError("check_stability needs one scene with known values, got a batched or traced one")
+    # Inside jit, operations on known values would be traced, too.
+    with jax.ensure_compile_time_eval():
+        springs = (*_contacts(scene), *_others(scene))
+    return StabilityReport(
+        scene.name, springs, float(model.opt.timestep), speed, joint_speed, str(scene.data.qpos.dtype)
+    )
+
+
+def _contacts(scene: Scene) -> Iterator[Spring]:
+    if not scene.pairs:
+        return
+    parameters = scene.contact_parameters()
+    columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
+    stiffness, damping, impedance, width, solref = (np.asarray(column, float) for column in columns)
+    friction = np.asarray(parameters.friction[:, 0], float)
+    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    for i, pair in enumerate(scene.pairs):
+        kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
+        yield Spring(
+            kind="contact",
+            name=str(pair),
+            stiffness=float(stiffness[i]),
+            damping=float(damping[i]),
+            size=_thickness(scene, pair),
+            num_rows=COLLISION_FUNCTIONS[kinds].ncon,
+            pyramid=float(friction[i]) if is_pyramidal and pair.condim > 1 else None,
+            **_given(scene, solref[i], impedance[i], width[i]),
+        )
+
+
+def _others(scene: Scene) -> Iterator[Spring]:
+    """Joint limits, tendon limits and equalities that are switched on."""
+    model, c_model = scene.model, scene.mj_model
+    disabled = int(model.opt.disableflags)
+    flag = mujoco.mjtDisableBit
+    if disabled & flag.mjDSBL_CONSTRAINT:
+        return
+    is_on = {
+        "joint limit": not disabled & flag.mjDSBL_LIMIT,
+        "tendon limit": not disabled & flag.mjDSBL_LIMIT,
+        "equality": not disabled & flag.mjDSBL_EQUALITY,
+    }
+    kinds = (
+        ("joint limit", c_model.jnt_limited, model.jnt_solref, model.jnt_solimp, model.jnt_range),
+        ("tendon limit", c_model.tendon_limited, model.tendon_solref_lim, model.tendon_solimp_lim, model.tendon_range),
+        ("equality", c_model.eq_active0, model.eq_solref, model.eq_solimp, None),
+    )
+    objects = (mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_TENDON, mujoco.mjtObj.mjOBJ_EQUALITY)
+    for (kind, active, solref, solimp, ranges), which in zip(kinds, objects, strict=True):
+        chosen = np.flatnonzero(active) if is_on[kind] else np.zeros(0, int)
+        if not chosen.size:
+            continue
+        stiffness, damping = (np.asarray(x, float) for x in stiffness_damping(model, solref))
+        for i in chosen:
+            name = mujoco.mj_id2name(c_model, which, i) or f"{kind} {i}"
+            size = np.inf if ranges is None else float(np.ptp(np.asarray(ranges[i], float)))
+            impedance = np.clip(np.asarray(solimp[i, :2], float), mujoco.mjMINIMP, mujoco.mjMAXIMP)
+            yield Spring(
+                kind=kind,
+                name=name,
+                stiffness=float(stiffness[i]),
+                damping=float(damping[i]),
+                size=size,
+                **_given(scene, np.asarray(solref[i], float), impedance, solimp[i, 2]),
+            )
+
+
+def _given(scene: Scene, solref, impedance, width) -> dict[str, Any]:
+    """What all kinds of springs are given alike."""
+    return {
+        "impedance": (float(impedance[0]), float(impedance[1])),
+        "width": max(float(width), mujoco.mjMINVAL),
+        "given": float(solref[0]) if solref[0] > 0 else None,
+        "timestep": float(scene.model.opt.timestep),
+        "integrator": mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
+    }
+
+
+def _thickness(scene: Scene, pair: ContactPair) -> float:
+    """Least thickness of two geoms together, by which they may interpenetrate and still part the way they came (m)."""
+    kinds = [mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2)]
+    # Behind a plane or under a height field everything is inside, however far.
+    if {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD} & set(kinds):
+        return np.inf
+    return sum(_half_thickness(scene, geom, kind) for geom, kind in zip((pair.geom1, pair.geom2), kinds, strict=True))
+
+
+def _half_thickness(scene: Scene, geom: int, kind: mujoco.mjtGeom) -> float:
+    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        return float(scene.model.geom_size[geom, 0])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        # Half extents of the box around it, in its own axes.
+        return float(scene.mj_model.geom_aabb[geom, 3:].min())
+    sizes = np.asarray(scene.model.geom_size[geom], float)
+    return float(sizes[sizes > 0].min(initial=np.inf))
