@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.estimators import GradientEstimate, Reason
 
@@ -161,7 +161,7 @@ class Optimisation(eqx.Module):
     """The result of a run, or of one per seed: all but the seconds then have a leading axis.
 
     Attributes:
-        params: after the last step.
+        params: after the last step, in the form of the start.
         best_params: with the lowest cost seen. With `evaluate` that is the noise-free cost at the steps where it was
             due, or at the end; without, the mean cost under noise, where less smoothing comes before lower cost and a
             larger share of finite rollouts before both. The lowest of many noisy means is lower than it should be: prefer
@@ -178,8 +178,8 @@ class Optimisation(eqx.Module):
         compile_seconds: of tracing and compilation in this session.
     """
 
-    params: Float[Array, "..."]
-    best_params: Float[Array, "..."]
+    params: PyTree
+    best_params: PyTree
     best_cost: Float[Array, "..."]
     final_cost: Float[Array, "..."]
     history: History
@@ -199,7 +199,7 @@ class Progress:
     Attributes:
         step: steps done by the run that has done the most.
         num_steps: asked for.
-        params: now.
+        params: now, in the form of the start.
         best_cost: so far; see `Optimisation`.
         history: so far.
         seconds: so far, without compilation.
@@ -208,7 +208,7 @@ class Progress:
 
     step: int
     num_steps: int
-    params: Float[Array, "..."]
+    params: PyTree
     best_cost: Float[Array, "..."]
     history: History
     seconds: float

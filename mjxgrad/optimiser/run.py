@@ -1,5 +1,6 @@
 """The loop that every method runs in: segments of steps on the device; budgets, callbacks and checkpoints between them."""
 
+import dataclasses
 import functools
 import math
 import time
@@ -19,7 +20,16 @@ from mjxgrad.objective import Objective
 from mjxgrad.optimiser import checkpoint
 from mjxgrad.optimiser.annealing import Annealing
 from mjxgrad.optimiser.result import History, Optimisation, Progress, Record, Stopped
-from mjxgrad.optimiser.step import AnnealedObjective, Estimator, GradientStep, Method, TrustRegion
+from mjxgrad.optimiser.step import (
+    AnnealedObjective,
+    Estimator,
+    GradientStep,
+    Method,
+    Restored,
+    TrustRegion,
+    flattened,
+    of_vector,
+)
 from mjxgrad.optimiser.stopping import Convergence, Recent, has_converged
 
 # Progress shows in steps of five per cent; each costs one return from the device.
@@ -166,7 +176,7 @@ class Saved(NamedTuple):
 
 def optimise(
     objective: Objective | AnnealedObjective,
-    params: Float[Array, "..."],
+    params: PyTree,
     key: Key[Array, "..."],
     *,
     estimator: Estimator,
@@ -213,7 +223,9 @@ def optimise(
 
     Args:
         objective: what to minimise, or with `annealing` a function from a scale to it.
-        params: the start, a vector; with many seeds also one per seed.
+        params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
+            dict or an equinox module. The function of `parameter_noise`, `evaluate` and `callback` then take its form,
+            and the result has it. Estimators and trust regions see all its arrays as one vector.
         key: consumed here; with a leading axis, one per seed.
         estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
             `functools.partial`, or your own.
@@ -232,8 +244,18 @@ def optimise(
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
             a trust region does not know its unit, or a checkpoint is damaged or of another run.
     """
-    rule = GradientStep(objective, estimator, optimiser, annealing, trust_region, clip_norm)
-    return run(rule, params, key, RunOptions(num_steps, **options))
+    vector, restore = flattened(params)
+    rule = GradientStep(of_vector(objective, restore), estimator, optimiser, annealing, trust_region, clip_norm)
+    chosen = RunOptions(num_steps, **options)
+    if restore is None:
+        return run(rule, vector, key, chosen)
+    if chosen.evaluate is not None:
+        chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
+    if (callback := chosen.callback) is not None:
+        seen = lambda progress: dataclasses.replace(progress, params=restore(progress.params))  # noqa: E731
+        chosen = dataclasses.replace(chosen, callback=lambda progress: callback(seen(progress)))
+    result = run(rule, vector, key, chosen)
+    return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
 
 
 def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], options: RunOptions) -> Optimisation:
@@ -476,6 +498,6 @@ def _matched(params: Float[Array, "..."], key: Key[Array, "..."]) -> tuple[Float
     if params.ndim not in (1, 2):
         raise ValueError(
             f"params must be a vector of shape (dim,), or one per seed, got shape {params.shape}; "
-            "use jnp.atleast_1d for one number, objective.ravel for a pytree"
+            "use jnp.atleast_1d for one number, objective.ravel for controls"
         )
     return jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key

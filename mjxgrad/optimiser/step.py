@@ -1,5 +1,6 @@
 """One step along an estimated gradient, how far it may go, and the same as an optax transformation."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
@@ -212,6 +214,54 @@ class GradientStep(Method):
         return jnp.where(is_taken, change, 0).astype(params.dtype), moved, is_taken
 
 
+class Restored(eqx.Module):
+    """A function of a pytree of parameters, as a function of the vector of them."""
+
+    function: Callable[[PyTree], Any]
+    restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
+
+    def __call__(self, vector: Float[Array, " dim"]) -> Any:
+        """Call the function."""
+        return self.function(self.restore(vector))
+
+
+def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
+    """Return parameters as a vector.
+
+    Args:
+        params: a pytree whose floating-point arrays are the parameters, such as a dict or an equinox module; or an array.
+
+    Returns:
+        The vector, and the way back, also for one vector per seed; an array as it is, with None.
+
+    Raises:
+        ValueError: if there are no floating-point arrays.
+    """
+    if eqx.is_array_like(params):
+        return jnp.asarray(params), None
+    arrays, others = eqx.partition(params, eqx.is_inexact_array_like)
+    vector, unravel = ravel_pytree(arrays)
+    if vector.size == 0:
+        raise ValueError(f"params must have floating-point arrays, got none in {params}; write 1.0 in place of 1")
+
+    def restore(vector: Float[Array, "..."]) -> PyTree:
+        return eqx.combine(jax.vmap(unravel)(vector) if vector.ndim == 2 else unravel(vector), others)
+
+    return vector, restore
+
+
+def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] | None) -> Any:
+    """Return an objective, or a function from a scale to one, that takes parameters as `flattened` does.
+
+    Noise on actions leaves it as it is: it takes a vector in any case, and its policy has its own way back.
+    """
+    if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
+        return objective
+    if isinstance(objective, ParameterNoise):
+        return dataclasses.replace(objective, function=Restored(objective.function, restore))
+    return lambda scale: of_vector(objective(scale), restore)
+
+
 class EstimatedGradientState(eqx.Module):
     """The state of `estimated_gradient`.
 
@@ -262,9 +312,10 @@ def estimated_gradient(
         clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
 
     Returns:
-        A transformation of flat vectors. What it is given as updates is added to the estimate: the gradient of anything
-        else in the cost, or None. Its `update` takes two further arguments, `key` and `objective`, in place of its own
-        for that update. Where the estimate is not finite the update is zero, and `num_skipped` counts it.
+        A transformation of a vector, or of a pytree as in `optimise`. What it is given as updates is added to the
+        estimate: the gradient of anything else in the cost, or None. Its `update` takes two further arguments, `key` and
+        `objective`, in place of its own for that update. Where the estimate is not finite the update is zero, and
+        `num_skipped` counts it.
 
     Raises:
         ValueError: if `objective` and `annealing` do not belong together, or a trust region comes without an optimiser.
@@ -273,34 +324,38 @@ def estimated_gradient(
         raise ValueError("trust_region must come with an optimiser, got None; it limits steps, not gradients")
     rule = GradientStep(objective, estimator, optimiser or optax.identity(), annealing, trust_region, clip_norm)
 
-    def init(params: Float[Array, " dim"]) -> EstimatedGradientState:
-        def first(
-            params: Float[Array, " dim"], inner: StepState, key: PRNGKeyArray, step: Int[Array, ""]
-        ) -> tuple[Float[Array, ""], GradientEstimate]:
-            scale, annealed = rule.annealed(objective, params, inner, step)
-            return scale, estimator(annealed, params, key)
+    def init(params: PyTree) -> EstimatedGradientState:
+        vector, restore = flattened(params)
 
-        inner, zero = rule.init(params), jnp.zeros((), jnp.int32)
-        scale, estimate = jax.tree.map(_nothing, jax.eval_shape(first, params, inner, key, zero))
+        def first(
+            vector: Float[Array, " dim"], inner: StepState, key: PRNGKeyArray, step: Int[Array, ""]
+        ) -> tuple[Float[Array, ""], GradientEstimate]:
+            scale, annealed = rule.annealed(of_vector(objective, restore), vector, inner, step)
+            return scale, estimator(annealed, vector, key)
+
+        inner, zero = rule.init(vector), jnp.zeros((), jnp.int32)
+        scale, estimate = jax.tree.map(_nothing, jax.eval_shape(first, vector, inner, key, zero))
         return EstimatedGradientState(zero, zero, scale, estimate, inner)
 
     def update(
-        updates: Float[Array, " dim"] | None,
+        updates: PyTree,
         state: EstimatedGradientState,
-        params: Float[Array, " dim"] | None = None,
+        params: PyTree = None,
         *,
         key: PRNGKeyArray = key,
         objective: Objective | AnnealedObjective = objective,
         **unused: Any,
-    ) -> tuple[Float[Array, " dim"], EstimatedGradientState]:
+    ) -> tuple[PyTree, EstimatedGradientState]:
         del unused  # extra arguments of others in a chain
         if params is None:
             raise ValueError("params must be given to update, got None: the gradient is estimated there")
-        scale, annealed = rule.annealed(objective, params, state.inner, state.step)
-        estimate = jax.tree.map(jnp.asarray, estimator(annealed, params, jax.random.fold_in(key, state.step)))
-        gradient = estimate.value if updates is None else estimate.value + updates
-        change, inner, is_taken = rule.change(params, state.inner, annealed, estimate, gradient)
-        return change, EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)
+        vector, restore = flattened(params)
+        scale, annealed = rule.annealed(of_vector(objective, restore), vector, state.inner, state.step)
+        estimate = jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, state.step)))
+        gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
+        change, inner, is_taken = rule.change(vector, state.inner, annealed, estimate, gradient)
+        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)
+        return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
