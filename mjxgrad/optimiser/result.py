@@ -92,6 +92,43 @@ class Record(eqx.Module):
         )
 
 
+class Best(eqx.Module):
+    """The best parameters seen, and by what.
+
+    Attributes:
+        params: of the lowest cost.
+        cost: that cost, NaN before there is one.
+        scale: of the annealing that it was measured under.
+        finite_fraction: of the rollouts that it is the mean of.
+    """
+
+    params: Float[Array, " dim"]
+    cost: Float[Array, ""]
+    scale: Float[Array, ""]
+    finite_fraction: Float[Array, ""]
+
+    @classmethod
+    def measured(cls, params: Float[Array, " dim"], cost: Float[Array, ""]) -> "Best":
+        """Return a point with the cost that `evaluate` gave for it, to be compared with its like alone."""
+        return cls(params, cost, jnp.zeros_like(cost), jnp.ones_like(cost))
+
+    def against(self, other: "Best") -> "Best":
+        """Return the better of both, itself if they are equal.
+
+        Less smoothing wins first, for costs under different noise are not comparable; then the larger share of finite
+        rollouts, lest leaving out the ones that diverged pay; then the lower cost.
+        """
+        is_better = (other.scale < self.scale) | (
+            (other.scale == self.scale)
+            & (
+                (other.finite_fraction > self.finite_fraction)
+                | ((other.finite_fraction == self.finite_fraction) & (other.cost < self.cost))
+            )
+        )
+        is_better = jnp.isfinite(other.cost) & (is_better | jnp.isnan(self.cost))
+        return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
+
+
 class History(eqx.Module):
     """A run step by step; leaves have the seeds on their first axis if there are many, and steps on their last.
 

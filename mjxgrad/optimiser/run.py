@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 from mjxgrad.objective import Objective
 from mjxgrad.optimiser import checkpoint
 from mjxgrad.optimiser.annealing import Annealing
-from mjxgrad.optimiser.result import History, Optimisation, Progress, Record, Stopped
+from mjxgrad.optimiser.result import Best, History, Optimisation, Progress, Record, Stopped
 from mjxgrad.optimiser.step import (
     AnnealedObjective,
     Estimator,
@@ -97,43 +97,6 @@ class RunOptions(eqx.Module):
     def segment_size(self) -> int:
         """Return the number of steps in one program."""
         return self.segment or math.ceil(self.num_steps / DEFAULT_NUM_SEGMENTS)
-
-
-class Best(eqx.Module):
-    """The best parameters seen, and by what.
-
-    Attributes:
-        params: of the lowest cost.
-        cost: that cost, NaN before there is one.
-        scale: of the annealing that it was measured under.
-        finite_fraction: of the rollouts that it is the mean of.
-    """
-
-    params: Float[Array, " dim"]
-    cost: Float[Array, ""]
-    scale: Float[Array, ""]
-    finite_fraction: Float[Array, ""]
-
-    @classmethod
-    def measured(cls, params: Float[Array, " dim"], cost: Float[Array, ""]) -> "Best":
-        """Return a point with the cost that `evaluate` gave for it, to be compared with its like alone."""
-        return cls(params, cost, jnp.zeros_like(cost), jnp.ones_like(cost))
-
-    def against(self, other: "Best") -> "Best":
-        """Return the better of both, itself if they are equal.
-
-        Less smoothing wins first, for costs under different noise are not comparable; then the larger share of finite
-        rollouts, lest leaving out the ones that diverged pay; then the lower cost.
-        """
-        is_better = (other.scale < self.scale) | (
-            (other.scale == self.scale)
-            & (
-                (other.finite_fraction > self.finite_fraction)
-                | ((other.finite_fraction == self.finite_fraction) & (other.cost < self.cost))
-            )
-        )
-        is_better = jnp.isfinite(other.cost) & (is_better | jnp.isnan(self.cost))
-        return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 
 
 class Carry(eqx.Module):

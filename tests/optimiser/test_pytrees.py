@@ -81,6 +81,18 @@ def test_a_transformation_takes_and_gives_the_form(key, form):
     np.testing.assert_allclose(back(params), result.params, rtol=1e-12)
 
 
+def test_a_run_is_resumed(key, form, tmp_path):
+    there, back, cost = form
+    options = {"num_steps": 4, "segment": 2, "evaluate": cost, **SETTINGS}
+    objective = mg.parameter_noise(cost, 0.1)
+    whole = mg.optimise(objective, there(START), key, **options)
+    path = tmp_path / "run.npz"
+    begun = mg.optimise(objective, there(START), key, checkpoint=path, callback=lambda _: True, **options)
+    resumed = mg.optimise(objective, there(START), key, checkpoint=path, **options)
+    assert begun.num_steps == 2
+    np.testing.assert_array_equal(back(resumed.params), back(whole.params))
+
+
 def test_parameters_without_a_number_to_move_are_refused(key):
     with pytest.raises(ValueError, match="params must have floating-point arrays"):
         mg.optimise(problems.objective, {"a": 1}, key, num_steps=1, **SETTINGS)
