@@ -54,7 +54,7 @@ def _run(
         estimator=functools.partial(getattr(mg.estimators, method.estimator), num_samples=method.num_samples),
         optimiser=optax.adam(rate),
         num_steps=settings.num_steps,
-        smoothing=decay,
+        annealing=decay,
         evaluate=task.cost,
         evaluate_every=every,
     )

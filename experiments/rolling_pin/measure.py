@@ -133,10 +133,10 @@ def _descend(task: RollingPin, group: Group, settings: RollingPinSettings, key: 
     def run(variant: Variant, key: Array) -> tuple[Array, Array, Array]:
         descent = mg.estimated_gradient(
             lambda scale: _seen(task, variant, scale, group.mode, settings).objective(variant.stddev),
-            group.estimator,
-            key=key,
+            key,
+            estimator=group.estimator,
             optimiser=optax.adam(settings.learning_rate),
-            smoothing=shrink,
+            annealing=shrink,
         )
 
         def step(carry, _):

@@ -1,6 +1,6 @@
 """The cross-entropy method: fit a Gaussian to the best candidates, and draw the next ones from it."""
 
-from typing import Unpack
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, Key
 
 from mjxgrad.baselines.population import Candidates, Population, search_stddev
 from mjxgrad.objective import Objective
-from mjxgrad.optimiser.loop import RunOptions, run
 from mjxgrad.optimiser.result import Optimisation
+from mjxgrad.optimiser.run import RunOptions, run
 
 
 class CrossEntropy(Population):
@@ -49,7 +49,7 @@ def cross_entropy(
     stddev: ArrayLike | None = None,
     keep: float = 0.0,
     min_stddev: float = 0.0,
-    **options: Unpack[RunOptions],
+    **options: Any,
 ) -> Optimisation:
     r"""Minimise a cost by the cross-entropy method.
 
@@ -93,4 +93,4 @@ def cross_entropy(
     if not min_stddev >= 0:
         raise ValueError(f"min_stddev must be at least 0, got {min_stddev}")
     method = CrossEntropy(objective, width, num_samples, num_elite, keep, min_stddev)
-    return run(method, params, key, num_steps=num_steps, **options)
+    return run(method, params, key, RunOptions(num_steps, **options))

@@ -1,6 +1,6 @@
 """Model-predictive path integral control, and predictive sampling: weigh candidates by cost, or take the best."""
 
-from typing import Any, Unpack
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from mjxgrad.baselines.population import Candidates, Population, search_stddev
 from mjxgrad.objective import Objective
-from mjxgrad.optimiser.loop import RunOptions, run
 from mjxgrad.optimiser.result import Optimisation
+from mjxgrad.optimiser.run import RunOptions, run
 
 
 class PathIntegral(Population):
@@ -72,7 +72,7 @@ def mppi(
     temperature: float = 0.1,
     is_relative: bool = True,
     stddev: ArrayLike | None = None,
-    **options: Unpack[RunOptions],
+    **options: Any,
 ) -> Optimisation:
     r"""Minimise a cost by the update of model-predictive path integral control.
 
@@ -111,7 +111,7 @@ def mppi(
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, got {temperature}; predictive_sampling takes the best alone")
     method = PathIntegral(objective, width, num_samples, temperature, is_relative)
-    return run(method, params, key, num_steps=num_steps, **options)
+    return run(method, params, key, RunOptions(num_steps, **options))
 
 
 def predictive_sampling(
@@ -122,7 +122,7 @@ def predictive_sampling(
     num_samples: int,
     num_steps: int,
     stddev: ArrayLike | None = None,
-    **options: Unpack[RunOptions],
+    **options: Any,
 ) -> Optimisation:
     r"""Minimise a cost by going to the best candidate, the present point among them.
 
@@ -150,4 +150,4 @@ def predictive_sampling(
     """
     width = search_stddev(objective, params, stddev, num_samples)
     method = PredictiveSampling(objective, width, num_samples)
-    return run(method, params, key, num_steps=num_steps, **options)
+    return run(method, params, key, RunOptions(num_steps, **options))

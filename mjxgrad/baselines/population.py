@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators import Reason
 from mjxgrad.objective import ActionNoise, Objective
-from mjxgrad.optimiser.gradient import as_objective
-from mjxgrad.optimiser.method import Method, Record
-from mjxgrad.optimiser.trust_region import parameter_stddev
+from mjxgrad.optimiser.result import Record
+from mjxgrad.optimiser.step import Method, as_objective, parameter_stddev
 
 
 class Candidates(eqx.Module):

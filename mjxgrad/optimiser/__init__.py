@@ -1,13 +1,10 @@
-"""The loop around an estimator: optimisers, budgets, smoothing that decreases, runs that can be resumed."""
+"""The loop around an estimator: optimisers, budgets, annealing, runs that can be resumed."""
 
-from mjxgrad.optimiser.convergence import Convergence
-from mjxgrad.optimiser.descent import optimise
-from mjxgrad.optimiser.gradient import EstimatedGradientState, estimated_gradient
-from mjxgrad.optimiser.loop import RunOptions, run
-from mjxgrad.optimiser.method import Method, Record
-from mjxgrad.optimiser.result import History, Optimisation, Progress, Stopped
-from mjxgrad.optimiser.smoothing import Plateau
-from mjxgrad.optimiser.trust_region import TrustRegion
+from mjxgrad.optimiser.annealing import Plateau
+from mjxgrad.optimiser.result import History, Optimisation, Progress, Record, Stopped
+from mjxgrad.optimiser.run import RunOptions, optimise, run
+from mjxgrad.optimiser.step import EstimatedGradientState, Method, TrustRegion, estimated_gradient
+from mjxgrad.optimiser.stopping import Convergence
 
 __all__ = [
     "Convergence",

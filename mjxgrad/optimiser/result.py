@@ -4,11 +4,12 @@ import dataclasses
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad.estimators import Reason
-from mjxgrad.optimiser.method import Record
+from mjxgrad.estimators import GradientEstimate, Reason
 
 
 class Stopped(eqx.Enumeration):
@@ -21,6 +22,111 @@ class Stopped(eqx.Enumeration):
     max_rollouts = "another step would have exceeded the budget of rollouts"
     max_seconds = "the budget of seconds was spent"
     interrupted = "the callback asked for it"
+
+
+class Record(eqx.Module):
+    """What one step of one run did; NaN where a method has no such thing.
+
+    Attributes:
+        cost: mean cost under noise at the parameters before the step.
+        cost_error: its standard error.
+        gradient_norm: norm of the estimate.
+        gradient_error: norm of its standard error.
+        alpha: weight of the first-order part, the mean over blocks.
+        reason: why, for the block with the least weight.
+        bias_bound: on the norm of the bias of the estimate.
+        scale: of the annealing; 1 without any.
+        step_norm: norm of the change of the parameters.
+        finite_fraction: share of the samples that were finite.
+        num_rollouts: spent.
+        num_gradient_rollouts: of those, the ones differentiated.
+        is_taken: False if the estimate was not finite, so that nothing was changed.
+    """
+
+    cost: Float[Array, ""]
+    cost_error: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
+    gradient_error: Float[Array, ""]
+    alpha: Float[Array, ""]
+    reason: Reason
+    bias_bound: Float[Array, ""]
+    scale: Float[Array, ""]
+    step_norm: Float[Array, ""]
+    finite_fraction: Float[Array, ""]
+    num_rollouts: Int[Array, ""]
+    num_gradient_rollouts: Int[Array, ""]
+    is_taken: Bool[Array, ""]
+
+    @classmethod
+    def blank(cls, dtype: jnp.dtype) -> "Record":
+        """Give the record of a step that did not happen."""
+        nan, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), jnp.int32)
+        # A reason that is an array, as those of steps are.
+        reason = jax.tree.map(jnp.asarray, Reason.fixed)
+        return cls(nan, nan, nan, nan, nan, reason, nan, nan, nan, nan, none, none, jnp.zeros((), bool))
+
+    @classmethod
+    def of_estimate(
+        cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
+    ) -> "Record":
+        """Summarise a step along an estimated gradient."""
+        dtype = estimate.value.dtype
+        alpha = jnp.ravel(estimate.alpha)
+        reason = jax.tree.map(
+            lambda item: jnp.ravel(jnp.broadcast_to(item, estimate.alpha.shape))[jnp.argmin(alpha)], estimate.reason
+        )
+        return cls(
+            cost=estimate.objective_mean.astype(dtype),
+            cost_error=estimate.objective_standard_error.astype(dtype),
+            gradient_norm=jnp.linalg.norm(estimate.value),
+            gradient_error=jnp.linalg.norm(estimate.standard_error),
+            alpha=alpha.mean().astype(dtype),
+            reason=reason,
+            bias_bound=estimate.bias_bound.astype(dtype),
+            scale=jnp.asarray(scale, dtype),
+            step_norm=jnp.asarray(step_norm, dtype),
+            finite_fraction=jnp.asarray(estimate.finite_fraction, dtype),
+            num_rollouts=estimate.num_rollouts.astype(jnp.int32),
+            num_gradient_rollouts=estimate.num_gradient_rollouts.astype(jnp.int32),
+            is_taken=jnp.asarray(is_taken),
+        )
+
+
+class Best(eqx.Module):
+    """The best parameters seen, and by what.
+
+    Attributes:
+        params: of the lowest cost.
+        cost: that cost, NaN before there is one.
+        scale: of the annealing that it was measured under.
+        finite_fraction: of the rollouts that it is the mean of.
+    """
+
+    params: Float[Array, " dim"]
+    cost: Float[Array, ""]
+    scale: Float[Array, ""]
+    finite_fraction: Float[Array, ""]
+
+    @classmethod
+    def measured(cls, params: Float[Array, " dim"], cost: Float[Array, ""]) -> "Best":
+        """Return a point with the cost that `evaluate` gave for it, to be compared with its like alone."""
+        return cls(params, cost, jnp.zeros_like(cost), jnp.ones_like(cost))
+
+    def against(self, other: "Best") -> "Best":
+        """Return the better of both, itself if they are equal.
+
+        Less smoothing wins first, for costs under different noise are not comparable; then the larger share of finite
+        rollouts, lest leaving out the ones that diverged pay; then the lower cost.
+        """
+        is_better = (other.scale < self.scale) | (
+            (other.scale == self.scale)
+            & (
+                (other.finite_fraction > self.finite_fraction)
+                | ((other.finite_fraction == self.finite_fraction) & (other.cost < self.cost))
+            )
+        )
+        is_better = jnp.isfinite(other.cost) & (is_better | jnp.isnan(self.cost))
+        return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 
 
 class History(eqx.Module):
@@ -37,7 +143,7 @@ class History(eqx.Module):
         alpha: weight of the first-order part, the mean over blocks.
         reason: why, for the block with the least weight.
         bias_bound: on the norm of the bias; NaN where nothing is known.
-        scale: of the smoothing; 1 without any.
+        scale: of the annealing; 1 without any.
         step_norm: norm of the change of the parameters.
         finite_fraction: share of the samples that were finite.
         num_rollouts: spent up to and including the step.
@@ -92,7 +198,7 @@ class Optimisation(eqx.Module):
     """The result of a run, or of one per seed: all but the seconds then have a leading axis.
 
     Attributes:
-        params: after the last step.
+        params: after the last step, in the form of the start.
         best_params: with the lowest cost seen. With `evaluate` that is the noise-free cost at the steps where it was
             due, or at the end; without, the mean cost under noise, where less smoothing comes before lower cost and a
             larger share of finite rollouts before both. The lowest of many noisy means is lower than it should be: prefer
@@ -109,8 +215,8 @@ class Optimisation(eqx.Module):
         compile_seconds: of tracing and compilation in this session.
     """
 
-    params: Float[Array, "..."]
-    best_params: Float[Array, "..."]
+    params: PyTree
+    best_params: PyTree
     best_cost: Float[Array, "..."]
     final_cost: Float[Array, "..."]
     history: History
@@ -130,7 +236,7 @@ class Progress:
     Attributes:
         step: steps done by the run that has done the most.
         num_steps: asked for.
-        params: now.
+        params: now, in the form of the start.
         best_cost: so far; see `Optimisation`.
         history: so far.
         seconds: so far, without compilation.
@@ -139,7 +245,7 @@ class Progress:
 
     step: int
     num_steps: int
-    params: Float[Array, "..."]
+    params: PyTree
     best_cost: Float[Array, "..."]
     history: History
     seconds: float

@@ -24,7 +24,7 @@ def run(path=None, *, rate=0.05, num_steps=40, **settings):
         START,
         settings.pop("key", KEY),
         estimator=problems.noisy,
-        smoothing=mg.Plateau(patience=3),
+        annealing=mg.Plateau(patience=3),
         convergence=mg.Convergence(cost=0.0, window=15),
         evaluate=problems.bowl,
         checkpoint=path,

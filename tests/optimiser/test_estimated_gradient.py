@@ -25,7 +25,7 @@ def loop(transformation, num_steps, **extra):
 def test_the_trajectory_is_that_of_optimise(key):
     settings = {
         "optimiser": optax.adam(0.05),
-        "smoothing": mg.Plateau(patience=3),
+        "annealing": mg.Plateau(patience=3),
         "trust_region": mg.TrustRegion(0.7),
         "clip_norm": 0.9,
     }
@@ -34,7 +34,7 @@ def test_the_trajectory_is_that_of_optimise(key):
         return problems.objective.with_stddev(0.1 * scale)
 
     result = mg.optimise(smoothed, START, key, estimator=problems.first_order, num_steps=25, **settings)
-    params, state = loop(mg.estimated_gradient(smoothed, problems.first_order, key=key, **settings), 25)
+    params, state = loop(mg.estimated_gradient(smoothed, key, estimator=problems.first_order, **settings), 25)
     # Two programs may be compiled to different rounding.
     np.testing.assert_allclose(params, result.params, rtol=1e-12)
     np.testing.assert_allclose(jnp.linalg.norm(state.estimate.value), result.history.gradient_norm[-1], rtol=1e-9)
@@ -43,14 +43,16 @@ def test_the_trajectory_is_that_of_optimise(key):
 
 
 def test_without_an_optimiser_it_is_the_gradient_for_a_chain(key):
-    transformation = optax.chain(mg.estimated_gradient(problems.objective, problems.exact, key=key), optax.sgd(0.1))
+    transformation = optax.chain(
+        mg.estimated_gradient(problems.objective, key, estimator=problems.exact), optax.sgd(0.1)
+    )
     params, _ = loop(transformation, 30)
     np.testing.assert_allclose(params, CENTRE + (START - CENTRE) * (1 - 0.1 * CURVATURE) ** 30, rtol=1e-12)
 
 
 def test_another_objective_and_key_can_be_given_for_an_update(key):
     other_key, shifted = jax.random.key(1), mg.parameter_noise(lambda x: problems.bowl(x - 1), 0.3, dim=2)
-    transformation = mg.estimated_gradient(problems.objective, problems.first_order, key=key)
+    transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.first_order)
     state = transformation.init(START)
     change, _ = transformation.update(None, state, START, key=other_key, objective=shifted)
     expected = problems.first_order(shifted, START, jax.random.fold_in(other_key, 0)).value
@@ -58,13 +60,13 @@ def test_another_objective_and_key_can_be_given_for_an_update(key):
 
 
 def test_the_gradient_of_anything_else_is_added(key):
-    transformation = mg.estimated_gradient(problems.objective, problems.exact, key=key)
+    transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.exact)
     change, _ = transformation.update(jnp.array([0.25, 0.5]), transformation.init(START), START)
     np.testing.assert_allclose(change, CURVATURE * (START - CENTRE) + jnp.array([0.25, 0.5]), rtol=1e-12)
 
 
 def test_an_estimate_that_is_not_finite_is_a_zero_update_and_counted(key):
-    transformation = mg.estimated_gradient(problems.objective, lambda *_: made_up([jnp.nan, 1.0]), key=key)
+    transformation = mg.estimated_gradient(problems.objective, key, estimator=lambda *_: made_up([jnp.nan, 1.0]))
     change, state = transformation.update(None, transformation.init(START), START)
     np.testing.assert_array_equal(change, 0)
     assert state.num_skipped == 1
@@ -73,7 +75,7 @@ def test_an_estimate_that_is_not_finite_is_a_zero_update_and_counted(key):
 
 def test_what_cannot_be_is_refused(key):
     with pytest.raises(ValueError, match="trust_region must come with an optimiser"):
-        mg.estimated_gradient(problems.objective, problems.exact, key=key, trust_region=mg.TrustRegion(1.0))
-    transformation = mg.estimated_gradient(problems.objective, problems.exact, key=key)
+        mg.estimated_gradient(problems.objective, key, estimator=problems.exact, trust_region=mg.TrustRegion(1.0))
+    transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.exact)
     with pytest.raises(ValueError, match="params must be given to update"):
         transformation.update(None, transformation.init(START))

@@ -202,7 +202,7 @@ def test_the_optimiser_is_told_the_cost(key):
         ({"max_seconds": 0.0}, "max_seconds must be positive, got 0.0"),
         ({"max_rollouts": 2**31}, r"max_rollouts must be below 2\*\*30"),
         ({"clip_norm": 0.0}, "clip_norm must be positive, got 0.0"),
-        ({"smoothing": optax.constant_schedule(1.0)}, "objective must be a function from a scale"),
+        ({"annealing": optax.constant_schedule(1.0)}, "objective must be a function from a scale"),
         ({"checkpoint": "/nowhere/at/all.npz"}, "checkpoint must be in a folder that exists"),
     ],
 )

@@ -73,7 +73,7 @@ def test_a_gradient_lost_in_its_error_is_convergence(key, norm, is_over):
     assert result.num_steps == (5 if is_over else 60)
 
 
-def test_convergence_waits_until_smoothing_stands_still(key):
+def test_convergence_waits_until_annealing_stands_still(key):
     """The scale changes at step 12, so the windows begin anew: 2 * 5 steps later the cost is judged."""
     result = mg.optimise(
         problems.objective.with_stddev,
@@ -82,7 +82,7 @@ def test_convergence_waits_until_smoothing_stands_still(key):
         estimator=lambda *_: made_up([1.0, 0.0], cost=1.0),
         optimiser=optax.sgd(0.1),
         num_steps=60,
-        smoothing=lambda step: jnp.where(step < 12, 1.0 / (step + 1), 0.01),
+        annealing=lambda step: jnp.where(step < 12, 1.0 / (step + 1), 0.01),
         convergence=mg.Convergence(window=5, cost=0.0),
     )
     assert result.num_steps == 22

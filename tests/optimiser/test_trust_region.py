@@ -17,8 +17,8 @@ def step(key, gradient, bias_bound, region, *, rate=100.0, objective=problems.ob
     size = len(gradient)
     transformation = mg.estimated_gradient(
         objective,
-        lambda *_: made_up(gradient, bias_bound=bias_bound),
-        key=key,
+        key,
+        estimator=lambda *_: made_up(gradient, bias_bound=bias_bound),
         optimiser=optax.sgd(rate),
         trust_region=region,
     )

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad.optimiser.method import Record
+from mjxgrad.optimiser.result import Record
 
 
 class Convergence(eqx.Module):
@@ -54,7 +54,7 @@ class Recent(eqx.Module):
         costs: mean cost under noise.
         squares: squared norm of the gradient.
         errors: squared norm of its standard error.
-        scale: of the smoothing.
+        scale: of the annealing.
     """
 
     costs: Float[Array, " both"]
@@ -69,7 +69,7 @@ class Recent(eqx.Module):
         return cls(nothing, nothing, nothing, jnp.full((), jnp.nan, dtype))
 
     def push(self, record: Record) -> "Recent":
-        """Add a step if it was taken, forgetting all before if the smoothing is another."""
+        """Add a step if it was taken, forgetting all before if the scale is another."""
         is_same = record.scale == self.scale
 
         def pushed(old: Float[Array, " both"], new: Float[Array, ""]) -> Float[Array, " both"]:

@@ -1,4 +1,4 @@
-"""How much the cost is smoothed while it is being optimised: less and less."""
+"""How much the cost is smoothed by noise or contact while it is being optimised: less and less."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 
-class Smoothing(eqx.Module):
+class Annealing(eqx.Module):
     """A scale in (0, 1] that an objective follows."""
 
     @abstractmethod
@@ -26,7 +26,7 @@ class Smoothing(eqx.Module):
         """Take note of the mean cost under noise, and its standard error, at a step."""
 
 
-class Schedule(Smoothing):
+class Schedule(Annealing):
     """A scale that follows the number of the step, such as an optax schedule."""
 
     function: Callable[[ArrayLike], ArrayLike]
@@ -64,7 +64,7 @@ class PlateauState(eqx.Module):
     previous_square: Float[Array, ""]
 
 
-class Plateau(Smoothing):
+class Plateau(Annealing):
     r"""Lower the scale when the mean cost under noise stops improving.
 
     Steps are taken in blocks of `patience`. With $c$ the mean cost of a block, $c'$ that of the block before and $e$ the
@@ -135,23 +135,23 @@ class Plateau(Smoothing):
         return jax.tree.map(lambda full, not_yet: jnp.where(count == self.patience, full, not_yet), judged, gathering)
 
 
-def as_smoothing(smoothing: Smoothing | Callable[[ArrayLike], ArrayLike] | None) -> Smoothing | None:
+def as_annealing(annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None) -> Annealing | None:
     """Wrap a schedule.
 
     Args:
-        smoothing: as given to `optimise`.
+        annealing: as given to `optimise`.
 
     Returns:
-        One of the kinds of `Smoothing`, or None.
+        One of the kinds of `Annealing`, or None.
 
     Raises:
-        ValueError: if it is neither a smoothing nor callable.
+        ValueError: if it is neither an annealing nor callable.
     """
-    if smoothing is None or isinstance(smoothing, Smoothing):
-        return smoothing
-    if not callable(smoothing):
+    if annealing is None or isinstance(annealing, Annealing):
+        return annealing
+    if not callable(annealing):
         raise ValueError(
-            f"smoothing must be a Plateau or a schedule from step to scale, got {smoothing!r}; "
+            f"annealing must be a Plateau or a schedule from step to scale, got {annealing!r}; "
             "for a fixed scale give the objective that scale"
         )
-    return Schedule(smoothing)
+    return Schedule(annealing)

@@ -60,7 +60,7 @@ def test_a_schedule_of_noise_is_followed(key):
         estimator=functools.partial(estimators.zeroth_order, num_samples=4096),
         optimiser=optax.sgd(0.0),
         num_steps=4,
-        smoothing=schedule,
+        annealing=schedule,
     )
     history, expected = result.history, 0.5 ** np.arange(4)
     np.testing.assert_allclose(history.scale, expected, rtol=1e-6)
@@ -86,7 +86,7 @@ def test_smoothing_that_decreases_finds_what_none_and_much_do_not(key):
         lambda scale: noisy.with_stddev(0.5 * scale),
         jnp.array([1.6]),
         key,
-        smoothing=mg.Plateau(factor=0.7, patience=20, minimum=0.05),
+        annealing=mg.Plateau(factor=0.7, patience=20, minimum=0.05),
         **settings,
     )
     plain = mg.optimise(noisy.with_stddev(1e-3), jnp.array([1.6]), key, **settings)
@@ -109,7 +109,7 @@ def test_the_best_is_sought_where_smoothing_was_least(key):
         estimator=estimator,
         optimiser=optax.sgd(0.1),
         num_steps=6,
-        smoothing=lambda step: jnp.where(step < 3, 1.0, 0.5),
+        annealing=lambda step: jnp.where(step < 3, 1.0, 0.5),
     )
     np.testing.assert_allclose(result.best_params, -0.5)
     np.testing.assert_allclose(result.best_cost, -1.0)

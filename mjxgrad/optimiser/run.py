@@ -1,0 +1,466 @@
+"""The loop that every method runs in: segments of steps on the device; budgets, callbacks and checkpoints between them."""
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
+
+from mjxgrad.objective import Objective
+from mjxgrad.optimiser import checkpoint
+from mjxgrad.optimiser.annealing import Annealing
+from mjxgrad.optimiser.result import Best, History, Optimisation, Progress, Record, Stopped
+from mjxgrad.optimiser.step import (
+    AnnealedObjective,
+    Estimator,
+    GradientStep,
+    Method,
+    Restored,
+    TrustRegion,
+    flattened,
+    of_vector,
+)
+from mjxgrad.optimiser.stopping import Convergence, Recent, has_converged
+
+# Progress shows in steps of five per cent; each costs one return from the device.
+DEFAULT_NUM_SEGMENTS = 20
+
+
+class RunOptions(eqx.Module):
+    """What every run can be told besides its method.
+
+    Attributes:
+        num_steps: at most.
+        evaluate: cost of a point without noise, or any other measure of it; traceable. It is measurement: the rollouts
+            in it are not counted, and nothing but the choice of the best parameters depends on it.
+        evaluate_every: steps between two evaluations. The last point is always evaluated.
+        patience: steps in a row whose estimate is not finite before the run gives up.
+        convergence: when to stop early.
+        max_rollouts: budget, per run. A step begins if one as dear as the last fits in, so it is kept by methods whose
+            steps cost the same, from the second step on: the first is always done.
+        max_seconds: budget of wall-clock time for all seeds together, without compilation; looked at after every
+            segment.
+        segment: steps in one program; a twentieth of all if not given.
+        callback: called after every segment; True stops.
+        checkpoint: file to save the run in after segments and to resume it from. A resumed run gives, on the same
+            device, bit for bit what the uninterrupted one would have given, its seconds apart.
+        checkpoint_every: segments between two saves. An interrupted run is saved in any case.
+    """
+
+    num_steps: int
+    evaluate: Callable[[Float[Array, " dim"]], Float[Array, ""]] | None = None
+    evaluate_every: int = 10
+    patience: int = 10
+    convergence: Convergence | None = None
+    max_rollouts: int | None = None
+    max_seconds: float | None = None
+    segment: int | None = None
+    callback: Callable[[Progress], bool | None] | None = None
+    checkpoint: str | Path | None = None
+    checkpoint_every: int = 1
+
+    def __check_init__(self):
+        """Refuse settings without meaning.
+
+        Raises:
+            ValueError: if a number is out of range, or the folder of the checkpoint does not exist.
+        """
+        for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every", "segment", "max_rollouts"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        # Rollouts are counted on the device in 32 bits, where a step beyond the budget must still fit in.
+        if self.max_rollouts is not None and self.max_rollouts >= 2**30:
+            raise ValueError(f"max_rollouts must be below 2**30, got {self.max_rollouts}; leave it out for no limit")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise ValueError(f"max_seconds must be positive, got {self.max_seconds}")
+        if self.path is not None and not self.path.parent.is_dir():
+            folder = self.path.parent
+            raise ValueError(f"checkpoint must be in a folder that exists, got {self.path}; make {folder} first")
+
+    @property
+    def path(self) -> Path | None:
+        """Return the file of the checkpoint."""
+        return None if self.checkpoint is None else Path(self.checkpoint)
+
+    @property
+    def segment_size(self) -> int:
+        """Return the number of steps in one program."""
+        return self.segment or math.ceil(self.num_steps / DEFAULT_NUM_SEGMENTS)
+
+
+class Carry(eqx.Module):
+    """One run between two steps.
+
+    Attributes:
+        params: the point.
+        state: of the method.
+        best: the best point so far.
+        recent: by which convergence is judged.
+        num_steps: steps done, those not taken included.
+        num_skipped: of those, the ones not taken.
+        num_in_a_row: of those, the last ones without one taken between.
+        num_rollouts: spent.
+        stopped: whether and why.
+    """
+
+    params: Float[Array, " dim"]
+    state: PyTree
+    best: Best
+    recent: Recent
+    num_steps: Int[Array, ""]
+    num_skipped: Int[Array, ""]
+    num_in_a_row: Int[Array, ""]
+    num_rollouts: Int[Array, ""]
+    stopped: Stopped
+
+
+class Saved(NamedTuple):
+    """All that an interrupted run needs to go on; `trace` has the steps of all segments so far on its last axis."""
+
+    carry: Carry
+    trace: tuple[Record, Float[np.ndarray, "..."]]
+    seconds: Float[np.ndarray, " steps"]
+
+    def history(self) -> History:
+        """Put the history together, as far as any run has come."""
+        return History.of(*self.trace, self.seconds)[: int(np.max(self.carry.num_steps))]
+
+
+def optimise(
+    objective: Objective | AnnealedObjective,
+    params: PyTree,
+    key: Key[Array, "..."],
+    *,
+    estimator: Estimator,
+    optimiser: optax.GradientTransformation,
+    num_steps: int,
+    annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None = None,
+    trust_region: TrustRegion | None = None,
+    clip_norm: float | None = None,
+    **options: Any,
+) -> Optimisation:
+    r"""Minimise a cost under noise by descent along estimated gradients.
+
+        estimator = functools.partial(mg.estimators.zeroth_order, num_samples=64)
+        result = mg.optimise(
+            objective, params, jax.random.key(0),
+            estimator=estimator, optimiser=optax.adam(1e-2), num_steps=300,
+        )
+        result.best_params, result.history.cost, mg.Stopped[result.stopped]
+
+    One compilation, however many steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
+    five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
+
+    A step whose estimate is not finite is not taken: parameters and optimiser stay as they were, the step is counted in
+    `num_skipped`, and the next one draws other noise.
+
+    With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
+    (0, 1], and `annealing` sets the scale, either as a schedule or by itself where the cost no longer improves.
+
+        noisy = mg.parameter_noise(function, stddev=0.3)
+        mg.optimise(
+            lambda scale: noisy.with_stddev(0.3 * scale), params, key,
+            annealing=optax.exponential_decay(1.0, 100, 0.5, end_value=0.05), ...
+        )
+        # Contact from soft to stiff, by itself:
+        mg.optimise(
+            lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
+            annealing=mg.Plateau(factor=0.5, patience=10, minimum=0.01), ...
+        )
+
+    With tqdm:
+
+        with tqdm.tqdm(total=300) as bar:
+            mg.optimise(..., callback=lambda progress: bar.update(progress.step - bar.n) and None)
+
+    Args:
+        objective: what to minimise, or with `annealing` a function from a scale to it.
+        params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
+            dict or an equinox module. The function of `parameter_noise`, `evaluate` and `callback` then take its form,
+            and the result has it. Estimators and trust regions see all its arrays as one vector.
+        key: consumed here; with a leading axis, one per seed.
+        estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
+            `functools.partial`, or your own.
+        optimiser: from optax; it is handed the mean cost under noise as `value`, too.
+        num_steps: at most.
+        annealing: a schedule from step to scale, or a `Plateau`.
+        trust_region: how far a step may go.
+        clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
+        **options: `evaluate`, `evaluate_every`, `patience`, `convergence`, `max_rollouts`, `max_seconds`, `segment`,
+            `callback`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
+
+    Returns:
+        The last and the best parameters, the history, why it stopped and what was spent.
+
+    Raises:
+        ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
+            a trust region does not know its unit, or a checkpoint is damaged or of another run.
+    """
+    vector, restore = flattened(params)
+    rule = GradientStep(of_vector(objective, restore), estimator, optimiser, annealing, trust_region, clip_norm)
+    chosen = RunOptions(num_steps, **options)
+    if restore is None:
+        return run(rule, vector, key, chosen)
+    if chosen.evaluate is not None:
+        chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
+    if (callback := chosen.callback) is not None:
+        seen = lambda progress: dataclasses.replace(progress, params=restore(progress.params))  # noqa: E731
+        chosen = dataclasses.replace(chosen, callback=lambda progress: callback(seen(progress)))
+    result = run(rule, vector, key, chosen)
+    return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
+
+
+def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], options: RunOptions) -> Optimisation:
+    """Run a method, from one start or from many at once.
+
+    Args:
+        method: takes the steps.
+        params: the start, a vector; or one per seed.
+        key: of the run; with a leading axis, one per seed, and all of them run in one program.
+        options: when to stop, and what to do on the way.
+
+    Returns:
+        The result; its leaves have a leading axis if `key` has one.
+
+    Raises:
+        ValueError: if the shapes of `params` and `key` do not fit, or the checkpoint is damaged or of another run.
+    """
+    params, key = _matched(params, key)
+    arrays, static = eqx.partition((method, options), eqx.is_array)
+
+    def over_seeds(function: Callable, *in_axes: int | None) -> Any:
+        function = functools.partial(function, static)
+        return jax.jit(jax.vmap(function, in_axes) if key.ndim else function)
+
+    carry = over_seeds(_start, None, 0)(arrays, params)
+    began = time.perf_counter()
+    lowered = over_seeds(_segment, None, 0, 0, None).lower(arrays, key, carry, jnp.zeros((), jnp.int32))
+    program = _Program(lowered, time.perf_counter() - began)
+    nothing = Record.blank(params.dtype), jnp.zeros((), params.dtype)
+    saved = Saved(carry, jax.tree.map(lambda x: np.zeros((*key.shape, 0), x.dtype), nothing), np.zeros(0))
+    fingerprint = {}
+    if options.path is not None:
+        fingerprint = _fingerprint(options, params, key, arrays, lowered)
+        if options.path.exists():
+            saved = checkpoint.load(options.path, saved, fingerprint)
+
+    saved, stopped = _loop(functools.partial(program.advance, arrays, key), saved, options, fingerprint)
+    final_cost, best = over_seeds(_finish, None, 0)(arrays, saved.carry)
+    history = saved.history()
+    return Optimisation(
+        params=saved.carry.params,
+        best_params=best.params,
+        best_cost=best.cost,
+        final_cost=final_cost,
+        history=history,
+        stopped=stopped,
+        num_steps=np.asarray(saved.carry.num_steps),
+        num_skipped=np.asarray(saved.carry.num_skipped),
+        num_rollouts=history.num_rollouts[..., -1],
+        num_gradient_rollouts=history.num_gradient_rollouts[..., -1],
+        seconds=float(saved.seconds.sum()),
+        compile_seconds=program.compile_seconds,
+    )
+
+
+def _loop(
+    advance: Callable[[Saved], Saved], saved: Saved, options: RunOptions, fingerprint: dict[str, Any]
+) -> tuple[Saved, Stopped]:
+    """Run segments until every run has stopped, and say why each did."""
+    on_disk, reason = saved.seconds.size, None
+    try:
+        while reason is None and np.any(saved.carry.stopped == Stopped.running):
+            if options.max_seconds is not None and saved.seconds.sum() >= options.max_seconds:
+                reason = Stopped.max_seconds
+                break
+            saved = advance(saved)
+            is_due = saved.seconds.size - on_disk >= options.checkpoint_every * options.segment_size
+            if options.path is not None and is_due:
+                checkpoint.save(options.path, saved, fingerprint)
+                on_disk = saved.seconds.size
+            if options.callback is not None and options.callback(_progress(saved, options)):
+                reason = Stopped.interrupted
+    finally:
+        # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
+        if options.path is not None and saved.seconds.size > on_disk:
+            checkpoint.save(options.path, saved, fingerprint)
+    stopped = saved.carry.stopped
+    if reason is not None:
+        stopped = Stopped.where(stopped == Stopped.running, reason, stopped)
+    return saved, stopped
+
+
+class _Program:
+    """A segment of steps, compiled once, when it is first run; and what tracing and compiling it took."""
+
+    def __init__(self, lowered: Any, seconds: float):
+        self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
+
+    def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
+        """Run one segment more."""
+        if self.compiled is None:
+            began = time.perf_counter()
+            self.compiled = self.lowered.compile()
+            self.compile_seconds += time.perf_counter() - began
+        began = time.perf_counter()
+        start = jnp.asarray(saved.seconds.size, jnp.int32)
+        carry, trace = jax.block_until_ready(self.compiled(arrays, key, saved.carry, start))
+        seconds = time.perf_counter() - began
+        done = int(np.max(carry.num_steps)) - int(np.max(saved.carry.num_steps))
+        joined = jax.tree.map(lambda old, new: np.concatenate([old, np.asarray(new)], axis=-1), saved.trace, trace)
+        # Steps after a stop take no time worth the name.
+        spent = np.where(np.arange(trace[1].shape[-1]) < done, seconds / max(done, 1), 0.0)
+        return Saved(carry, joined, np.concatenate([saved.seconds, spent]))
+
+
+def _start(static: PyTree, arrays: PyTree, params: Float[Array, " dim"]) -> Carry:
+    method, options = eqx.combine(arrays, static)
+    zero, nan = jnp.zeros((), jnp.int32), jnp.full((), jnp.nan, params.dtype)
+    best = Best(params, nan, nan + jnp.inf, nan)
+    recent = Recent.empty(options.convergence, params.dtype)
+    stopped = jax.tree.map(jnp.asarray, Stopped.running)
+    return Carry(params, method.init(params), best, recent, zero, zero, zero, zero, stopped)
+
+
+def _segment(
+    static: PyTree, arrays: PyTree, key: PRNGKeyArray, carry: Carry, start: Int[Array, ""]
+) -> tuple[Carry, tuple[Record, Float[Array, " segment"]]]:
+    """Take the steps from `start` on; those after the end or after a stop change nothing.
+
+    A segment always has the same length, so that it is compiled once. The number of a step is not part of the carry:
+    over many seeds it is then one number, and what happens only at some steps is skipped at the others for all of them.
+    """
+    method, options = eqx.combine(arrays, static)
+    nan = jnp.full((), jnp.nan, carry.params.dtype)
+    nothing = Record.blank(carry.params.dtype), nan
+    step = functools.partial(_step, method, options, key)
+
+    def idle(carry: Carry, _: Int[Array, ""]) -> tuple[Carry, Any]:
+        return carry, nothing
+
+    def body(carry: Carry, index: Int[Array, ""]) -> tuple[Carry, Any]:
+        # Apart, for over many seeds the end is the same for all, whereas some may have stopped.
+        while_running = functools.partial(jax.lax.cond, carry.stopped == Stopped.running, step, idle)
+        return jax.lax.cond(index < options.num_steps, while_running, idle, carry, index)
+
+    return jax.lax.scan(body, carry, start + jnp.arange(options.segment_size, dtype=jnp.int32))
+
+
+def _step(
+    method: Method, options: RunOptions, key: PRNGKeyArray, carry: Carry, index: Int[Array, ""]
+) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+    at = carry.params
+    noise_free = _evaluated(options, at, index)
+    params, state, record = method.advance(at, carry.state, jax.random.fold_in(key, index), index)
+    under_noise = Best(at, record.cost, record.scale, record.finite_fraction)
+    recent = carry.recent.push(record)
+    num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
+    num_rollouts = carry.num_rollouts + record.num_rollouts
+    # The weightiest reason to stop comes last.
+    stopped = Stopped.running
+    if options.max_rollouts is not None:
+        # The next step is taken to cost what this one did.
+        is_spent = num_rollouts + record.num_rollouts > options.max_rollouts
+        stopped = Stopped.where(is_spent, Stopped.max_rollouts, stopped)
+    stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, stopped)
+    stopped = Stopped.where(has_converged(options.convergence, recent), Stopped.converged, stopped)
+    stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
+    moved = Carry(
+        params=params.astype(at.dtype),
+        state=state,
+        best=carry.best.against(under_noise if options.evaluate is None else Best.measured(at, noise_free)),
+        recent=recent,
+        num_steps=carry.num_steps + 1,
+        num_skipped=carry.num_skipped + ~record.is_taken,
+        num_in_a_row=num_in_a_row,
+        num_rollouts=num_rollouts,
+        stopped=stopped,
+    )
+    return moved, (record, noise_free)
+
+
+def _evaluated(options: RunOptions, params: Float[Array, " dim"], index: Int[Array, ""]) -> Float[Array, ""]:
+    nothing, evaluate = jnp.full((), jnp.nan, params.dtype), options.evaluate
+    if evaluate is None:
+        return nothing
+    return jax.lax.cond(
+        index % options.evaluate_every == 0,
+        lambda at: jnp.asarray(evaluate(at), params.dtype),
+        lambda _: nothing,
+        params,
+    )
+
+
+def _finish(static: PyTree, arrays: PyTree, carry: Carry) -> tuple[Float[Array, ""], Best]:
+    """Evaluate the last point, and let it compete with the best before."""
+    evaluate, params = eqx.combine(arrays, static)[1].evaluate, carry.params
+    if evaluate is None:
+        return jnp.full((), jnp.nan, params.dtype), carry.best
+    cost = jnp.asarray(evaluate(params), params.dtype)
+    return cost, carry.best.against(Best.measured(params, cost))
+
+
+def _progress(saved: Saved, options: RunOptions) -> Progress:
+    return Progress(
+        step=int(np.max(saved.carry.num_steps)),
+        num_steps=options.num_steps,
+        params=saved.carry.params,
+        best_cost=saved.carry.best.cost,
+        history=saved.history(),
+        seconds=float(saved.seconds.sum()),
+        num_running=int(np.sum(saved.carry.stopped == Stopped.running)),
+    )
+
+
+def _fingerprint(
+    options: RunOptions, params: Float[Array, "..."], key: Key[Array, "..."], arrays: PyTree, lowered: Any
+) -> dict[str, Any]:
+    """Say what a resumed run must have in common with this one: the program itself, and all that it is given."""
+    return {
+        "num_steps": options.num_steps,
+        "segment": options.segment_size,
+        "evaluate_every": options.evaluate_every,
+        "patience": options.patience,
+        "max_rollouts": options.max_rollouts,
+        "convergence": repr(options.convergence),
+        "shape": list(params.shape),
+        "dtype": str(params.dtype),
+        "start": checkpoint.digest((params, key)),
+        "arrays": checkpoint.digest(arrays),
+        # The lowered program has every number in it that is not an argument, such as a learning rate.
+        "program": checkpoint.digest(np.frombuffer(lowered.as_text().encode(), np.uint8)),
+    }
+
+
+def _matched(params: Float[Array, "..."], key: Key[Array, "..."]) -> tuple[Float[Array, "..."], Key[Array, "..."]]:
+    """Give parameters a leading axis where the key has one."""
+    key, params = jnp.asarray(key), jnp.asarray(params)
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim > 1:
+        raise ValueError(
+            f"key must come from jax.random.key, with at most one leading axis, got {key.dtype} of shape {key.shape}; "
+            "jax.random.split(jax.random.key(0), num_seeds) gives one per seed"
+        )
+    if not jnp.issubdtype(params.dtype, jnp.floating):
+        raise ValueError(f"params must be floating-point, got {params.dtype}; write 1.0 in place of 1")
+    if params.ndim == 2 and key.shape != params.shape[:1]:
+        raise ValueError(
+            f"params must have a leading axis only where key has the same, got shapes {params.shape} and {key.shape}; "
+            "jax.random.split(key, len(params)) gives a key for each"
+        )
+    if params.ndim not in (1, 2):
+        raise ValueError(
+            f"params must be a vector of shape (dim,), or one per seed, got shape {params.shape}; "
+            "use jnp.atleast_1d for one number, objective.ravel for controls"
+        )
+    return jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key

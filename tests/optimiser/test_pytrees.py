@@ -1,0 +1,108 @@
+"""Parameters that are a dict or an equinox module come back as one, and the numbers are those of the vector."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import mjxgrad as mg
+from tests.estimators import textbook
+from tests.optimiser import problems
+
+
+class Gains(eqx.Module):
+    """Parameters beside what is none: a function and a count."""
+
+    stiff: jax.Array
+    loose: jax.Array
+    activation: object
+    count: int
+
+
+FORMS = {
+    "dict": (lambda x: {"a": x[:1], "b": x[1]}, lambda form: jnp.append(form["a"], form["b"])),
+    "module": (
+        lambda x: Gains(x[:1], x[1], jnp.tanh, 3),
+        lambda form: jnp.append(form.stiff, form.loose) if form.activation is jnp.tanh and form.count == 3 else None,
+    ),
+}
+START = jnp.array([0.0, 0.5])
+SETTINGS = {"estimator": problems.first_order, "optimiser": optax.adam(0.05)}
+
+
+@pytest.fixture(params=FORMS)
+def form(request):
+    """The way to a form and back, and the cost of it."""
+    there, back = FORMS[request.param]
+    return there, back, lambda tree: problems.bowl(back(tree))
+
+
+@pytest.mark.parametrize("is_annealed", [False, True])
+def test_the_run_is_that_of_the_vector(key, form, is_annealed):
+    there, back, cost = form
+    seen = []
+    options = {"num_steps": 12, "annealing": mg.Plateau(patience=3) if is_annealed else None, **SETTINGS}
+
+    def smoothed(function):
+        noisy = mg.parameter_noise(function, 0.1, dim=2)
+        return (lambda scale: noisy.with_stddev(0.1 * scale)) if is_annealed else noisy
+
+    vector = mg.optimise(smoothed(problems.bowl), START, key, evaluate=problems.bowl, **options)
+    callback = lambda progress: seen.append(back(progress.params)) and None  # noqa: E731
+    tree = mg.optimise(smoothed(cost), there(START), key, evaluate=cost, callback=callback, **options)
+    assert jax.tree.structure(tree.params) == jax.tree.structure(there(START))
+    # Two programs may be compiled to different rounding.
+    np.testing.assert_allclose(back(tree.params), vector.params, rtol=1e-12)
+    np.testing.assert_allclose(back(tree.best_params), vector.best_params, rtol=1e-12)
+    np.testing.assert_allclose(tree.history.noise_free_cost, vector.history.noise_free_cost, rtol=1e-10)
+    np.testing.assert_array_equal(seen[-1], back(tree.params))
+
+
+def test_many_seeds_have_their_axis_first(key, form):
+    there, back, cost = form
+    keys = jax.random.split(key, 3)
+    result = mg.optimise(mg.parameter_noise(cost, 0.1), there(START), keys, num_steps=3, **SETTINGS)
+    vector = mg.optimise(mg.parameter_noise(problems.bowl, 0.1), START, keys, num_steps=3, **SETTINGS)
+    stacked = eqx.filter_vmap(back)(result.params)
+    np.testing.assert_allclose(stacked, vector.params, rtol=1e-12)
+
+
+def test_a_transformation_takes_and_gives_the_form(key, form):
+    there, back, cost = form
+    transformation = mg.estimated_gradient(mg.parameter_noise(cost, 0.1, dim=2), key, **SETTINGS)
+    result = mg.optimise(problems.objective, START, key, num_steps=3, **SETTINGS)
+    params = there(START)
+    state = transformation.init(params)
+    for _ in range(3):
+        change, state = transformation.update(None, state, params)
+        params = eqx.apply_updates(params, change)
+    np.testing.assert_allclose(back(params), result.params, rtol=1e-12)
+
+
+def test_a_run_is_resumed(key, form, tmp_path):
+    there, back, cost = form
+    options = {"num_steps": 4, "segment": 2, "evaluate": cost, **SETTINGS}
+    objective = mg.parameter_noise(cost, 0.1)
+    whole = mg.optimise(objective, there(START), key, **options)
+    path = tmp_path / "run.npz"
+    begun = mg.optimise(objective, there(START), key, checkpoint=path, callback=lambda _: True, **options)
+    resumed = mg.optimise(objective, there(START), key, checkpoint=path, **options)
+    assert begun.num_steps == 2
+    np.testing.assert_array_equal(back(resumed.params), back(whole.params))
+
+
+def test_parameters_without_a_number_to_move_are_refused(key):
+    with pytest.raises(ValueError, match="params must have floating-point arrays"):
+        mg.optimise(problems.objective, {"a": 1}, key, num_steps=1, **SETTINGS)
+
+
+def test_a_policy_comes_back_in_its_own_form(key):
+    """The objective has a way of its own from the vector to the policy's parameters; both agree."""
+    policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}
+    objective = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.1, params=policy)
+    result = mg.optimise(objective, policy, key, num_steps=3, **SETTINGS)
+    vector = mg.optimise(objective, objective.ravel(policy), key, num_steps=3, **SETTINGS)
+    assert result.params["gain"].shape == (1, 2)
+    np.testing.assert_array_equal(objective.ravel(result.params), vector.params)
