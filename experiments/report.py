@@ -49,7 +49,7 @@ class Report:
 
     Attributes:
         verdict: the answer in a sentence or two, computed from the data.
-        details: further sentences, one finding each.
+        findings: further sentences, one each.
         figures: in order of reading.
         tables: after the figures.
         metrics: rows for metrics.csv, in SI units.
@@ -63,7 +63,7 @@ class Report:
     figures: Sequence[Figure]
     tables: Sequence[Table]
     metrics: Sequence[dict[str, Any]]
-    details: Sequence[str] = ()
+    findings: Sequence[str] = ()
     video: str | None = None
     video_caption: str = ""
     warnings: Sequence[str] = field(default_factory=tuple)
@@ -119,7 +119,7 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
     body = [
         f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
         f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
-        _items(report.details),
+        _items(report.findings),
         "</section>",
         f'<p class="expected"><b>Expected beforehand.</b> {_text(expected[:1].upper() + expected[1:])}</p>'
         if expected

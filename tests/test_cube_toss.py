@@ -7,8 +7,8 @@ import pytest
 
 import mjxgrad as mg
 from experiments.cube_toss.outcome import Course, Outcome, Point
-from experiments.cube_toss.settings import CubeTossSettings
-from experiments.cube_toss.verdict import findings, verdict
+from experiments.cube_toss.report import findings, verdict
+from experiments.cube_toss.settings import Settings
 from mjxgrad.tasks.cube_toss import cube_toss
 
 REFERENCE = np.array([0.5, 0.5, 0.5])
@@ -36,9 +36,7 @@ def test_a_lucky_coarse_step_is_not_the_fastest(course):
 
 
 def test_the_verdict_names_the_fastest_and_what_never_is_right(course):
-    settings = CubeTossSettings(
-        experiment="cube_toss", timesteps=(2e-3, 1e-3), refined_timesteps=(1e-3,), tolerances=(1e-3,)
-    )
+    settings = Settings(experiment="cube_toss", timesteps=(2e-3, 1e-3), refined_timesteps=(1e-3,), tolerances=(1e-3,))
     outcome = Outcome(settings, (course,))
     assert verdict(outcome) == (
         "With MuJoCo's default contact the first below 2% is event (time step 0.001 s): 1.5 % in 0.3 s of processor time; "

@@ -14,7 +14,7 @@ import numpy as np
 import mjxgrad as mg
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.recording import record, scene_path, segments
-from experiments.ablation.settings import AblationSettings
+from experiments.ablation.settings import Settings
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, REACHED, Variant, variants
 from experiments.parallel import num_compilers
 from experiments.workspace import Workspace
@@ -33,7 +33,7 @@ class _Program:
     flops: float
 
 
-def measure(settings: AblationSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Time every variant of every scene, and compare motions and gradients.
 
     Args:
@@ -57,7 +57,7 @@ def measure(settings: AblationSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, scenes)
 
 
-def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> SceneOutcome:
+def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
     sizes, path = settings.sizes, scene_path(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from experiments.config import RunSettings
+from experiments.settings import RunSettings
 
 SceneName = Literal[
     "ball_wall", "billiards", "cube_toss", "friction", "motion_planning", "planar_pusher", "push", "rolling_pin",
@@ -47,7 +47,7 @@ SIZES = {
 }
 
 
-class AblationSettings(RunSettings):
+class Settings(RunSettings):
     """What a step costs with everything, without each group of what it may not need, and without all of them."""
 
     size: Literal["quick", "default", "full"] = "default"

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import RunSettings
+from experiments.settings import RunSettings
 
 ShapeName = Literal["box", "mesh", "edges", "balls", "ball", "rounded_lattice"]
 GeometryName = Literal["boxes", "points on the peg", "points on both"]
@@ -56,7 +56,7 @@ SIZES = {
 }
 
 
-class ArtificialDiscontinuitySettings(RunSettings):
+class Settings(RunSettings):
     """Jumps of contact force along paths of a body over a cube, and what gradients say across them."""
 
     size: Literal["quick", "default", "full"] = "default"

@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 import mjxgrad as mg
 from experiments.billiards import hard
 from experiments.billiards.outcome import Outcome, Run
-from experiments.billiards.settings import BilliardsSettings, MethodSettings
+from experiments.billiards.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad.smoothing.smoothing import Smoothing
 from mjxgrad.tasks.billiards import Billiards, billiards
 
 
-def measure(settings: BilliardsSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Descend by every method.
 
     Args:
@@ -41,7 +41,7 @@ def measure(settings: BilliardsSettings, workspace: Workspace) -> Outcome:
 
 
 def _run(
-    method: MethodSettings, task: Billiards, settings: BilliardsSettings, key: Array, play: Callable[[Array], Array]
+    method: MethodSettings, task: Billiards, settings: Settings, key: Array, play: Callable[[Array], Array]
 ) -> Run:
     every = -(-settings.num_steps // settings.evaluations)
     start = task.start(method.start)
@@ -76,7 +76,7 @@ def _run(
 
 
 def _objective(
-    method: MethodSettings, task: Billiards, settings: BilliardsSettings
+    method: MethodSettings, task: Billiards, settings: Settings
 ) -> Callable[[Float[Array, ""]], mg.Objective]:
     """From the scale of the smoothing to what is minimised at it."""
     own = task.scene.model.pair_margin[0]

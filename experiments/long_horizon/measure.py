@@ -12,7 +12,7 @@ from experiments.long_horizon.adaptive import adaptive
 from experiments.long_horizon.estimates import reference_gradient, zeroth
 from experiments.long_horizon.outcome import BEYOND_CHANCE, ZEROTH, Errors, Found, Outcome, Windows
 from experiments.long_horizon.problems import Problem, problem
-from experiments.long_horizon.settings import LongHorizonSettings, Sizes
+from experiments.long_horizon.settings import Settings, Sizes
 from experiments.long_horizon.windows import cut
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
@@ -33,7 +33,7 @@ class Rollouts(eqx.Module):
     tangents: Float[np.ndarray, "samples times n dim"] | None
 
 
-def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure every problem.
 
     Args:
@@ -55,7 +55,7 @@ def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, found, reference)
 
 
-def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generator, workspace: Workspace) -> Found:
+def _measure(settings: Settings, one: Problem, rng: np.random.Generator, workspace: Workspace) -> Found:
     sizes, dim = settings.sizes, len(one.params)
     whole, count, batch = sizes.num_times, sizes.num_repeats * sizes.num_samples, sizes.batch
     noise = one.stddev * rng.normal(size=(count, dim))
@@ -181,7 +181,7 @@ def _costs(one: Problem, rollouts: Rollouts) -> tuple[np.ndarray, Float[np.ndarr
 
 
 def _errors(
-    settings: LongHorizonSettings,
+    settings: Settings,
     sizes: Sizes,
     label: str,
     samples: np.ndarray,

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import RunSettings
+from experiments.settings import RunSettings
 
 ProblemName = Literal["double_pendulum", "hopper"]
 _PROBLEMS: tuple[ProblemName, ...] = ("double_pendulum", "hopper")
@@ -43,7 +43,7 @@ SIZES = {
 }
 
 
-class LongHorizonSettings(RunSettings):
+class Settings(RunSettings):
     """Error of first- and zeroth-order estimates against the horizon, its cause, and windows."""
 
     size: Literal["quick", "default", "full"] = "default"

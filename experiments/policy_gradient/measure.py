@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 import mjxgrad as mg
 from experiments.policy_gradient.outcome import GRADIENTS, Cell, Course, Estimates, Outcome
 from experiments.policy_gradient.problems import Descent, Problem, problem
-from experiments.policy_gradient.settings import PolicyGradientSettings
+from experiments.policy_gradient.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.estimators.alpha import weigh
 from mjxgrad.estimators.by_noise import plan_by_noise
@@ -70,7 +70,7 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha[0], reason, parts.costs.mean)
 
 
-def measure(settings: PolicyGradientSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Compare both gradients on all tasks.
 
     Args:
@@ -92,7 +92,7 @@ def measure(settings: PolicyGradientSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, cells, courses)
 
 
-def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: PolicyGradientSettings) -> Cell:
+def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Cell:
     point = one.points[index]
     own, other = jax.random.split(key)
     keys = jax.random.split(own, settings.num_estimates)

@@ -15,7 +15,7 @@ from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOut
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
-from experiments.stability.settings import SIZES, Size, StabilitySettings
+from experiments.stability.settings import SIZES, Settings, Size
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics.stability import (
     UNSOLVED,
@@ -62,7 +62,7 @@ def largest(num_steps: int) -> float:
     return 100.0 * 2 * num_steps
 
 
-def measure(settings: StabilitySettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Run every scene in every precision, and C MuJoCo beside it.
 
     Args:
@@ -109,9 +109,7 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(
-    cases: list[_Case], precision: str, size: Size, settings: StabilitySettings, workspace: Workspace
-) -> list[_Runs]:
+def _run_all(cases: list[_Case], precision: str, size: Size, settings: Settings, workspace: Workspace) -> list[_Runs]:
     """Run the programs of all scenes, some at a time: most of it is compilation."""
 
     def run(case: _Case) -> _Runs:
@@ -237,9 +235,7 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(
-    scene: StabilityScene, grid: Points, reference: Reference, expected, settings: StabilitySettings
-) -> Behaviour:
+def _of_c(scene: StabilityScene, grid: Points, reference: Reference, expected, settings: Settings) -> Behaviour:
     record = _record(scene, grid, reference.qpos, reference.course, expected)
     coarse, fine = reference.differences
     is_finite = np.isfinite(fine)
@@ -264,7 +260,7 @@ def _of_mjxgrad(
     runs: _Runs,
     truth: np.ndarray,
     precision: str,
-    settings: StabilitySettings,
+    settings: Settings,
 ) -> Behaviour:
     run, event = runs.discrete, runs.event
     record = _record(scene, grid, reference.qpos, run.course, expected)

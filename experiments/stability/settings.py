@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import RunSettings
+from experiments.settings import RunSettings
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ SIZES = {
 }
 
 
-class StabilitySettings(RunSettings):
+class Settings(RunSettings):
     """Rollouts and their gradients over a grid of stiff and extreme cases, beside C MuJoCo."""
 
     size: Literal["quick", "default", "full"] = "default"
@@ -69,7 +69,7 @@ class StabilitySettings(RunSettings):
     """In which mjxgrad runs; C MuJoCo runs in float64."""
 
     @model_validator(mode="after")
-    def _check(self) -> "StabilitySettings":
+    def _check(self) -> "Settings":
         if self.precision != "float64" or self.precisions[0] != "float64":
             raise ValueError(
                 f"precisions must begin with float64, whose finite differences judge all, got {', '.join(self.precisions)}"

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.work_precision.front import pareto_front
-from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.work_precision.settings import Settings
 
 C = "C MuJoCo"
 MG, MJX, ONSET = "mg.step", "mjx.step", "mg.step, onset"
@@ -230,7 +230,7 @@ class Outcome:
         courses: one per scene.
     """
 
-    settings: WorkPrecisionSettings
+    settings: Settings
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:

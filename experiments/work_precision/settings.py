@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings
 from experiments.parallel import num_cores
+from experiments.settings import Positive, RunSettings
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
@@ -65,7 +65,7 @@ SIZES = {
 }  # fmt: skip
 
 
-class WorkPrecisionSettings(RunSettings):
+class Settings(RunSettings):
     """Error of motions and gradients against the time that they take, by scene."""
 
     size: Literal["quick", "default", "full"] = "default"
@@ -102,7 +102,7 @@ class WorkPrecisionSettings(RunSettings):
         return self.sizes.with_asides is None or name in self.sizes.with_asides
 
     @model_validator(mode="after")
-    def _check(self) -> "WorkPrecisionSettings":
+    def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
         if self.scenes is not None and not self.scenes:

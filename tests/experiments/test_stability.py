@@ -12,9 +12,9 @@ from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOut
 from experiments.stability.program import Steps, errors_of_solves
 from experiments.stability.reasons import UNEXPLAINED, reasons
 from experiments.stability.reference import simulate, unbalanced
+from experiments.stability.report import findings
 from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
-from experiments.stability.settings import SIZES, StabilitySettings
-from experiments.stability.verdict import findings
+from experiments.stability.settings import SIZES, Settings
 from mjxgrad.diagnostics.stability import Derivative, Motion
 
 SCENES = {scene.name: scene for scene in catalogue()}
@@ -136,7 +136,7 @@ def test_what_gains_energy_is_counted_on_either_side_of_the_explicit_limit(count
     grid = _points(3, timestep=[0.002, 0.01, 0.05], time_constant=0.02, damping_ratio=1.0)
     motions = [Motion.GAINS_ENERGY] * count + [Motion.BOUNCES_RIGHT] * (2 - count) + [Motion.GAINS_ENERGY]
     one = _outcome("ball", grid, motions, motions, [0.0, 0.0, 0.0])
-    settings = StabilitySettings(experiment="stability", precisions=("float64",))
+    settings = Settings(experiment="stability", precisions=("float64",))
     sentence = findings(Outcome(settings, [one]))[0]
     assert f"Of 2 single bounces within the explicit limit {said}" in sentence
     assert "of 1 beyond it all do" in sentence

@@ -16,7 +16,7 @@ import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.work_precision import figures, native, verdict
+from experiments.work_precision import figures, native, report
 from experiments.work_precision.cases import case
 from experiments.work_precision.choice import cheapest, fastest
 from experiments.work_precision.front import pareto_front
@@ -32,7 +32,7 @@ from experiments.work_precision.outcome import (
     relative_errors,
 )
 from experiments.work_precision.programs import Knobs, softened
-from experiments.work_precision.settings import SIZES, WorkPrecisionSettings
+from experiments.work_precision.settings import SIZES, Settings
 
 STDDEV = 0.3
 
@@ -90,13 +90,13 @@ def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendatio
     known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01, 1e-4)
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
     course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known, 3, 1.0)
-    outcome = Outcome(WorkPrecisionSettings(experiment="work_precision"), (course,))
+    outcome = Outcome(Settings(experiment="work_precision"), (course,))
     for draw in (figures.motion, figures.gradient):
         figure = draw(course, outcome)
         figure.canvas.draw()
         plt.close(figure)
-    assert "for 5 % no setting that was tried is enough" in verdict.findings(outcome)[0]
-    assert "Gradient: for 5 % none is known to get there (reference known to 1 %)" in verdict.findings(outcome)[0]
+    assert "for 5 % no setting that was tried is enough" in report.findings(outcome)[0]
+    assert "Gradient: for 5 % none is known to get there (reference known to 1 %)" in report.findings(outcome)[0]
 
 
 def test_the_smoothed_gradient_is_exact_where_the_cost_is_linear():
@@ -178,7 +178,7 @@ def test_distances_of_free_bodies_are_metres_and_radians():
 
 
 def test_only_what_makes_a_difference_is_compiled():
-    settings = WorkPrecisionSettings(experiment="work_precision")
+    settings = Settings(experiment="work_precision")
     compiled = {name: variants(case(name), settings, True) for name in ("pendulum", "push", "bounce", "arm")}
     assert all(len(found) == len(set(found)) for found in compiled.values())
     assert [v.derivative for v in compiled["pendulum"] if v.derivative] == ["discrete"]  # no contact, no event

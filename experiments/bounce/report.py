@@ -4,24 +4,30 @@ import itertools
 
 import numpy as np
 
+from experiments.bounce.figures import draw
 from experiments.bounce.outcome import Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.report import Table
+from experiments.report import Report, Table
+from experiments.workspace import Workspace
 
 # Steps in contact by which the outcome is told apart.
 _MANY_STEPS = 10
 _STEPS = (0, 3, 6, 10, 20, np.inf)
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say how often each derivative is the slope.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say how often each derivative is the slope."""
     settings = outcome.settings
     fine = outcome.timesteps <= settings.fine_timestep
     judged = outcome.can_judge[fine]
@@ -38,14 +44,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support.
-    """
+    """Single findings, one sentence each."""
     return [
         sentence
         for sentence in (_failures(outcome), _jump(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))

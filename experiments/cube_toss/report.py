@@ -2,34 +2,33 @@
 
 import numpy as np
 
+from experiments.cube_toss.figures import draw
 from experiments.cube_toss.outcome import METHODS, Course, Outcome, Point
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
+from experiments.workspace import Workspace
 from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE
 
 _CONTACTS = {"published": "With a contact that begins continuously", "default": "With MuJoCo's default contact"}
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say what reaches the wanted error soonest, and what never does.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A sentence or two per contact.
-    """
+    """Say what reaches the wanted error soonest, and what never does."""
     return " ".join(_verdict(course, outcome.settings.target_error) for course in outcome.courses)
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support.
-    """
+    """Single findings, one sentence each."""
     found = [sentence for course in outcome.courses for sentence in (_event(course), _choice(course)) if sentence]
     published = [course for course in outcome.courses if course.contact == "published"]
     if published:
@@ -51,7 +50,7 @@ def findings(outcome: Outcome) -> list[str]:
     return found
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all points."""
     rows, emphasised = [], set()
     for course in outcome.courses:
@@ -76,7 +75,7 @@ def table(outcome: Outcome) -> Table:
         "Reference: difference quotient of adaptive rollouts at tolerance 1e-10. Short steps at events are not counted. In bold "
         f"the fastest whose method stays below {outcome.settings.target_error:.0%} from there on."
     )
-    return Table(columns, rows, caption, frozenset(emphasised))
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def _verdict(course: Course, target: float) -> str:

@@ -5,33 +5,35 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from experiments.bias_variance.figures import draw, video
 from experiments.bias_variance.outcome import Outcome
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
 from experiments.theme import power
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    file, caption = video(outcome, workspace)
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        video=file,
+        video_caption=caption,
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say where each estimate is to be used.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        One to three sentences.
-    """
-    choice = f"With {outcome.budget} rollouts per gradient {_choice(outcome)}."
+    """Say where each estimate is to be used."""
+    choice = f"With {outcome.settings.rollouts_per_gradient} rollouts per gradient {_choice(outcome)}."
     return " ".join([choice, _bias(outcome), *_default(outcome)])
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support; there may be none.
-    """
+    """Single findings, one sentence each."""
     return [
         sentence
         for sentence in (_worst_bias(outcome), _wrong_signs(outcome), _variance(outcome))
@@ -39,7 +41,7 @@ def findings(outcome: Outcome) -> list[str]:
     ]
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate both estimates, the reference and which estimate to use."""
     rows, emphasised = [], set()
     for i, j in np.ndindex(outcome.bias.value.shape):
@@ -66,15 +68,15 @@ def table(outcome: Outcome) -> Table:
         "variance ratio",
         "use",
     )
-    percent = f"{outcome.confidence:.0%}"
+    percent = f"{outcome.settings.confidence:.0%}"
     caption = (
-        f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.num_samples} rollouts "
+        f"Gradients in m²/rad with half the width of their {percent} intervals, from {outcome.settings.num_samples} rollouts "
         "each. "
         "A bias in bold differs from zero beyond chance over the whole table. The ratio is the variance of a sample of "
         "first order over that of zeroth order. The last column is the estimate with the clearly "
-        f"smaller expected error at {outcome.budget} rollouts per gradient."
+        f"smaller expected error at {outcome.settings.rollouts_per_gradient} rollouts per gradient."
     )
-    return Table(columns, rows, caption, frozenset(emphasised))
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def name(outcome: Outcome, i: int) -> str:
@@ -141,7 +143,7 @@ def _range(outcome: Outcome, rows: ArrayLike) -> str:
 def _bias(outcome: Outcome) -> str:
     biased = outcome.is_biased[outcome.swept].any(axis=1)
     if not biased.any():
-        return f"No bias of the first-order estimate is seen in the sweep ({outcome.confidence:.0%} over all cases)."
+        return f"No bias of the first-order estimate is seen in the sweep ({outcome.settings.confidence:.0%} over all cases)."
     sentence = f"The first-order estimate is measurably biased {_range(outcome, biased)}"
     # No bias seen is no bias only where one of half the gradient's own size would have been seen.
     half_width = (outcome.bias.high - outcome.bias.low)[outcome.swept] / 2

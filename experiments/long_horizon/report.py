@@ -2,32 +2,31 @@
 
 import numpy as np
 
+from experiments.long_horizon.figures import draw
 from experiments.long_horizon.outcome import Found, Outcome, Windows
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
 from experiments.theme import power
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say up to which horizon first order is better, and what to do beyond.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say up to which horizon first order is better, and what to do beyond."""
     return " ".join(sentence for one in outcome.found.values() for sentence in (_crossing(outcome, one), _window(one)))
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support.
-    """
+    """Single findings, one sentence each."""
     found = []
     for one in outcome.found.values():
         found += [_growth(one), *_biases(one)]

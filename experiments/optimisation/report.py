@@ -1,48 +1,45 @@
 """The answer of an optimisation experiment in words, computed from its numbers."""
 
+import json
+
 import numpy as np
 
+from experiments.optimisation.figures import draw
 from experiments.optimisation.outcome import Difference, Outcome, Run
-from experiments.report import Table, quantity
+from experiments.overview import HEADLINE
+from experiments.report import Report, Table, quantity
+from experiments.workspace import Workspace
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    (workspace.folder / HEADLINE).write_text(json.dumps(headline(outcome), indent=2) + "\n", encoding="utf-8")
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        warnings=warnings(outcome),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say whether α-order is worse than the better of first and zeroth order, and which method ends lowest.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Two sentences, or one if α-order or what it is compared with did not take part.
-    """
+    """Say whether α-order is worse than the better of first and zeroth order, and which method ends lowest."""
     return " ".join([*(_comparison(difference) for difference in outcome.verdicts), _lowest(outcome)])
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support; there may be none.
-    """
+    """Single findings, one sentence each."""
     found = (_reproduction(outcome), _choice(outcome), _time(outcome), _without_progress(outcome))
     return [sentence for sentence in found if sentence]
 
 
 def warnings(outcome: Outcome) -> list[str]:
-    """Say what was lost or left out.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        One sentence for each method that it concerns.
-    """
+    """Say what was lost or left out."""
     sentences = []
     for run in outcome.runs:
         parts = []
@@ -57,7 +54,7 @@ def warnings(outcome: Outcome) -> list[str]:
     return sentences
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all methods."""
     worse = {difference.ours.method.label for difference in outcome.verdicts if difference.is_above}
     rows, emphasised = [], set()
@@ -93,18 +90,11 @@ def table(outcome: Outcome) -> Table:
         "better of first and zeroth order. The error is that of one estimate at the start. A step's time is that of one "
         "seed of all that run at once."
     )
-    return Table(columns, rows, caption, frozenset(emphasised))
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def headline(outcome: Outcome) -> dict[str, str]:
-    """Give the row of this run in the page over a sweep.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Final costs by method, and how α-order compares.
-    """
+    """Give the row of this run in the page over a sweep."""
     cells = {
         run.method.label: quantity(run.mean, run.spread) + (f" ({run.is_lost.sum()} lost)" if run.is_lost.any() else "")
         for run in outcome.runs

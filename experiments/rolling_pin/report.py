@@ -1,18 +1,27 @@
 """The answer of the rolling pin's experiment in words, computed from its numbers."""
 
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
+from experiments.rolling_pin.figures import draw, video
 from experiments.rolling_pin.outcome import Descent, Outcome
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    file, caption = video(outcome, workspace)
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        video=file,
+        video_caption=caption,
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say what plain first order did, and what solved the task.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Two or three sentences.
-    """
+    """Say what plain first order did, and what solved the task."""
     plain, settings = outcome.plain, outcome.settings
     if outcome.start_gradient == 0 and not plain.has_moved:
         told = (
@@ -36,14 +45,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support; there may be none.
-    """
+    """Single findings, one sentence each."""
     solved = [(steps, one) for one in outcome.descents if (steps := _steps(outcome, one)) is not None]
     sentences = []
     if solved:
@@ -55,7 +57,7 @@ def findings(outcome: Outcome) -> list[str]:
     return sentences
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all descents."""
     rows, emphasised = [], set()
     for row, one in enumerate(outcome.descents):
@@ -84,7 +86,7 @@ def table(outcome: Outcome) -> Table:
         f"In bold what ends below {below}. The last column is the largest distance of a pillar from its wanted height "
         "in the end."
     )
-    return Table(columns, rows, caption, frozenset(emphasised))
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def _steps(outcome: Outcome, one: Descent) -> int | None:

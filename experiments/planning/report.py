@@ -1,31 +1,33 @@
 """What the plans say, in sentences and in a table."""
 
+from experiments.planning.figures import draw, video
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import NAMES
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    file, caption = video(outcome, workspace)
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        video=file,
+        video_caption=caption,
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Answer the question from the data: which linear models solve the task, and what the others do.
-
-    Args:
-        outcome: the plans.
-
-    Returns:
-        Two or three sentences.
-    """
+    """Answer the question from the data: which linear models solve the task, and what the others do."""
     return " ".join(_one(outcome, model) for model in outcome.settings.models)
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """List one sentence per further finding.
-
-    Args:
-        outcome: the plans.
-
-    Returns:
-        The sentences.
-    """
+    """List one sentence per further finding."""
     sentences = []
     best = outcome.shown[-1]
     off = max(abs(best - outcome.best.states[-1, :5]))
@@ -49,15 +51,8 @@ def findings(outcome: Outcome) -> list[str]:
     return sentences
 
 
-def table(outcome: Outcome) -> Table:
-    """Tabulate the attempts.
-
-    Args:
-        outcome: the plans.
-
-    Returns:
-        One row per attempt.
-    """
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate the attempts."""
     columns = [
         "linear models",
         "seed",
@@ -80,7 +75,7 @@ def table(outcome: Outcome) -> Table:
             "" if attempt.nodes is None else str(len(attempt.nodes)),
             f"{attempt.seconds:.0f} s",
         ])  # fmt: skip
-    return Table(columns, rows, "Every attempt; later seeds of a kind use the compiled program of the first.")
+    return [Table(columns, rows, "Every attempt; later seeds of a kind use the compiled program of the first.")]
 
 
 def _one(outcome: Outcome, model: str) -> str:

@@ -2,19 +2,28 @@
 
 from collections.abc import Sequence
 
+from experiments.billiards.figures import draw, video
 from experiments.billiards.outcome import IDLE, Outcome, Run
-from experiments.report import Table
+from experiments.report import Report, Table
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    file, caption = video(outcome, workspace)
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        video=file,
+        video_caption=caption,
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say what solves the stroke from balls that do not touch, and what does not.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Two or three sentences.
-    """
+    """Say what solves the stroke from balls that do not touch, and what does not."""
     apart = [run for run in outcome.runs if not run.has_touched]
     solved, stuck = [run for run in apart if run.is_solved], [run for run in apart if run.is_stuck]
     between = [run for run in apart if run not in solved and run not in stuck]
@@ -39,14 +48,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences.
-    """
+    """Single findings, one sentence each."""
     best = min(outcome.runs, key=lambda run: run.hard_cost)
     return [
         f"Played on balls that collide in no time (another program: closed forms and root finding), the forces of "
@@ -56,7 +58,7 @@ def findings(outcome: Outcome) -> list[str]:
     ]
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all descents."""
     rows = [
         [
@@ -82,7 +84,9 @@ def table(outcome: Outcome) -> Table:
         "s",
         "s compiling",
     )
-    return Table(columns, rows, "Costs in m², without noise; bold where the stroke is solved to one per cent.", solved)
+    return [
+        Table(columns, rows, "Costs in m², without noise; bold where the stroke is solved to one per cent.", solved)
+    ]
 
 
 def _listed(runs: Sequence[Run]) -> str:

@@ -2,23 +2,29 @@
 
 import numpy as np
 
+from experiments.policy_gradient.figures import draw
 from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
+from experiments.workspace import Workspace
 from mjxgrad.estimators import Reason
 
 NEGLIGIBLE = 0.05
 """Of the gradient's norm: a bias below it matters to no descent."""
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say where which first-order estimate is right.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say where which first-order estimate is right."""
     smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]
     repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_better(cell)]
     sentences = []
@@ -46,14 +52,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        What α-order makes of it, whether it does harm, what descents make of it.
-    """
+    """Single findings, one sentence each."""
     sentences = []
     for cell in outcome.cells:
         (before, _), (after, _) = cell.alpha(DISCRETE), cell.alpha(ONSET)

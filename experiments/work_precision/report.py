@@ -3,20 +3,26 @@
 import numpy as np
 
 from experiments.parallel import num_compilers
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
+from experiments.work_precision.figures import draw
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Outcome, Point
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say how the libraries stand at the largest target, over all scenes.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say how the libraries stand at the largest target, over all scenes."""
     target = max(outcome.settings.targets)
     sentences = []
     for other, name in ((MJX, "mjx.step"), (C, f"C MuJoCo on {_threads(outcome)}")):
@@ -40,14 +46,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Recommend, scene by scene, and say what is not known.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Sentences.
-    """
+    """Recommend, scene by scene, and say what is not known."""
     sentences = [_recommendation(course, outcome) for course in outcome.courses]
     sentences += _onset_against_step(outcome)
     loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]

@@ -2,22 +2,28 @@
 
 import numpy as np
 
+from experiments.ablation.figures import draw
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import EVERYTHING, NEEDED, REACHED
-from experiments.report import Table
+from experiments.report import Report, Table
+from experiments.workspace import Workspace
 
 _WORTH = 0.95  # of the time with everything: what the upper quartile must stay below to be called faster
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say what leaving out gains, and whether it changes anything.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say what leaving out gains, and whether it changes anything."""
     sentences = [_gain(outcome, NEEDED, "what no motion needs"), _safety(outcome)]
     if any(scene.find(REACHED) for scene in outcome.scenes):
         sentences.append(_gain(outcome, REACHED, "what recorded motions did not reach, either"))
@@ -26,14 +32,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence for each group.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        In the order in which groups appear.
-    """
+    """Single findings, one sentence for each group."""
     names = dict.fromkeys(v.name for scene in outcome.scenes for v in scene.variants)
     groups = [name for name in names if name not in (EVERYTHING, NEEDED, REACHED)]
     return [*(_group(outcome, name) for name in groups), *_missed(outcome)]

@@ -2,23 +2,29 @@
 
 import numpy as np
 
+from experiments.artificial_discontinuity.figures import draw
 from experiments.artificial_discontinuity.outcome import ARTIFICIAL, ONSET, REAL, TURN, WAYS, Outcome, largest, worst
-from experiments.report import Table, quantity
+from experiments.report import Report, Table, quantity
+from experiments.workspace import Workspace
 
 # Standard errors from which a bias is beyond chance, of some dozens of estimates.
 _FAR = 4.0
 _SMALL = 1e-4
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say which bodies jump, and what to build contact of.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say which bodies jump, and what to build contact of."""
     threshold = outcome.settings.threshold
     bodies = [name for name in outcome.shapes if not outcome.of(name)[0].is_lattice]
     most = {name: max(one.geometric for one in outcome.of(name)) for name in bodies}
@@ -48,14 +54,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support.
-    """
+    """Single findings, one sentence each."""
     return [
         sentence
         for sentence in (

@@ -5,24 +5,30 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from experiments.report import Table
+from experiments.report import Report, Table
+from experiments.stability.figures import draw
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.reasons import UNEXPLAINED, reasons
+from experiments.workspace import Workspace
 from mjxgrad.diagnostics.stability import Derivative, Motion
 
 _FAILS = Motion.GAINS_ENERGY
 
 
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
+
+
 def verdict(outcome: Outcome) -> str:
-    """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        A few sentences.
-    """
+    """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
     precisions = outcome.settings.precisions
     silent = sum(outcome.total(name, "is_silent") for name in precisions)
     missed = sum(outcome.total(name, "is_missed") for name in precisions)
@@ -46,11 +52,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-    """
+    """Single findings, one sentence each."""
     found = [_limit(outcome), *(_gradients(outcome, name) for name in outcome.settings.precisions)]
     found += [_unflagged(outcome, name) for name in outcome.settings.precisions]
     found += [_event(outcome, name) for name in outcome.settings.precisions]

@@ -2,37 +2,35 @@
 
 import numpy as np
 
-from experiments.report import Table, quantity
-from experiments.textbook.figures import stiffness_name
+from experiments.report import Report, Table, quantity
+from experiments.textbook.figures import draw, stiffness_name
 from experiments.textbook.outcome import Outcome
 from experiments.theme import power
+from experiments.workspace import Workspace
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+    )
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say which estimator is closest, and which are biased.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        Two or three sentences.
-    """
+    """Say which estimator is closest, and which are biased."""
     return " ".join(sentence for sentence in (_closest(outcome), _bias(outcome), _crossing(outcome)) if sentence)
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        The sentences that the numbers support; there may be none.
-    """
+    """Single findings, one sentence each."""
     return [sentence for sentence in (_agreement(outcome), _unseen(outcome), _left_out(outcome)) if sentence]
 
 
-def table(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all estimators at the largest number of rollouts."""
     last = outcome.by_samples[-1]
     rows, emphasised = [], set()
@@ -58,7 +56,7 @@ def table(outcome: Outcome) -> Table:
         "over all numbers of rollouts. The last column is the root of the mean squared standard error of the estimates: "
         "an estimator that claims less than its error hides something."
     )
-    return Table(columns, rows, caption, frozenset(emphasised))
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def _closest(outcome: Outcome) -> str:
