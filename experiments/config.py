@@ -65,6 +65,7 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
         candidate = json.loads(json.dumps(table, default=str))
         for key, value in varied.items():
             _assign(candidate, key.split("."), value)
+        _choose_size(candidate)
         settings, found = _validate(candidate, swept=set(sweep))
         problems += found
         runs.append(Run(path.stem, settings, question or path.stem, expected, varied))
@@ -112,6 +113,18 @@ def read_header(text: str) -> tuple[str, str]:
 def kinds() -> list[str]:
     """List the kinds of experiment: the folders that hold settings."""
     return sorted(path.parent.name for path in FOLDER.glob("*/settings.py"))
+
+
+def _choose_size(table: dict[str, Any]) -> None:
+    """Put the one of the tables `[sizes.*]` that `size` names in the place of all; single values in `[sizes]` win over it."""
+    sizes = table.get("sizes")
+    if not isinstance(sizes, dict):
+        return
+    named = {key: value for key, value in sizes.items() if isinstance(value, dict)}
+    if named:
+        # A size that is not there is answered when the settings are checked, with those there are.
+        chosen = named.get(str(table.get("size", "default")), next(iter(named.values())))
+        table["sizes"] = chosen | {key: value for key, value in sizes.items() if key not in named}
 
 
 def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:

@@ -13,7 +13,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure as Picture
 
-from experiments.report import Figure, superscript
+from experiments.report import Figure
+from experiments.words import superscript
 
 # Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
 FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"

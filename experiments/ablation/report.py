@@ -6,6 +6,7 @@ from experiments.ablation.figures import draw
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import EVERYTHING, NEEDED, REACHED
 from experiments.report import Report, Table
+from experiments.words import joined
 from experiments.workspace import Workspace
 
 _WORTH = 0.95  # of the time with everything: what the upper quartile must stay below to be called faster
@@ -55,7 +56,7 @@ def _gain(outcome: Outcome, name: str, subject: str) -> str:
         )
         sentences.append(f"Without {subject} a step takes of its time with everything: {times}.")
     if same:
-        sentences.append(f"Without {subject} XLA is given the same program, letter for letter, in {_listed(same)}.")
+        sentences.append(f"Without {subject} XLA is given the same program, letter for letter, in {joined(same)}.")
     return " ".join(sentences)
 
 
@@ -63,7 +64,7 @@ def _safety(outcome: Outcome) -> str:
     safe = [(scene, scene.find(NEEDED)) for scene in outcome.scenes]
     changed = [scene.name for scene, v in safe if v is not None and not v.is_unchanged]
     if changed:
-        return f"Motion or gradient change by more than rounding in {_listed(changed)}."
+        return f"Motion or gradient change by more than rounding in {joined(changed)}."
     return "Motions and gradients stay the same, bit for bit or to rounding, in every scene."
 
 
@@ -78,7 +79,7 @@ def _generalisation(outcome: Outcome) -> str:
 def _group(outcome: Outcome, name: str) -> str:
     having = [(scene, v) for scene in outcome.scenes if (v := scene.find(name))]
     if all(v.is_same_program for _, v in having):
-        where = _listed([scene.name for scene, _ in having])
+        where = joined([scene.name for scene, _ in having])
         return f"{name.capitalize()}: nothing to gain, for the program is the same without in {where}."
     real = [(scene, v) for scene, v in having if not v.is_same_program]
     changed = [(scene, v) for scene, v in real if not v.is_unchanged]
@@ -89,7 +90,7 @@ def _group(outcome: Outcome, name: str) -> str:
         for scene, v in real
     )
     pays = (
-        f"A step is faster beyond the spread in {_listed(faster)}"
+        f"A step is faster beyond the spread in {joined(faster)}"
         if faster
         else "Nowhere is a step faster beyond the spread"
     )
@@ -97,7 +98,7 @@ def _group(outcome: Outcome, name: str) -> str:
     if changed:
         same = (
             ". The motion is another one in "
-            + _listed([f"{scene.name} ({v.step.verdict})" for scene, v in changed])
+            + joined([f"{scene.name} ({v.step.verdict})" for scene, v in changed])
             + "."
         )
     return f"Without {name}: {text}. {pays}{same}"
@@ -186,7 +187,3 @@ def _spread(cost: Cost | None) -> str:
 
 def _microseconds(cost: Cost | None, scene: SceneOutcome) -> str:
     return f"{1e6 * float(np.median(cost.seconds)) / scene.steps_per_run:.3g}" if cost else ""
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -4,7 +4,8 @@ import numpy as np
 
 from experiments.artificial_discontinuity.figures import draw
 from experiments.artificial_discontinuity.outcome import ARTIFICIAL, ONSET, REAL, TURN, WAYS, Outcome, largest, worst
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import joined, percent, quantity
 from experiments.workspace import Workspace
 
 # Standard errors from which a bias is beyond chance, of some dozens of estimates.
@@ -33,13 +34,13 @@ def verdict(outcome: Outcome) -> str:
     rough = [f"{name} ({most[name]:.0%})" for name in bodies if most[name] > threshold]
     sentences = []
     if rough:
-        sentences.append(f"By its geometry alone the force jumps by more than {threshold:.0%} with {_listed(rough)}.")
+        sentences.append(f"By its geometry alone the force jumps by more than {threshold:.0%} with {joined(rough)}.")
     if smooth:
         rows = [f"{name} ({_counted(outcome.of(name)[0].num_rows, 'row')})" for name in smooth]
-        sentences.append(f"It does not with {_listed(rows)}: to differentiate through contact build it of these.")
+        sentences.append(f"It does not with {joined(rows)}: to differentiate through contact build it of these.")
         if worse := [f"{name} ({plain[name]:.0%})" for name in smooth if plain[name] > threshold]:
             sentences.append(
-                f"Under MuJoCo's default contact, whose force begins with a jump, it still does with {_listed(worse)} where "
+                f"Under MuJoCo's default contact, whose force begins with a jump, it still does with {joined(worse)} where "
                 "one more part touches: there let the impedance rise from zero (the first number of solimp)."
             )
     else:
@@ -48,7 +49,7 @@ def verdict(outcome: Outcome) -> str:
     if kinds:
         counts = [f"{kinds.count(kind)} {kind}" for kind in (REAL, TURN, ARTIFICIAL, ONSET) if kind in kinds]
         sentences.append(
-            f"Of the box's {len(kinds)} such jumps, held against the gradient of the overlap volume: {_listed(counts)}."
+            f"Of the box's {len(kinds)} such jumps, held against the gradient of the overlap volume: {joined(counts)}."
         )
     return " ".join(sentences)
 
@@ -84,14 +85,14 @@ def _lattices(outcome: Outcome) -> str:
         return ""
     return (
         f"With ever more points the largest jump of a pressure field's stand-in falls as a power of their number along an edge: "
-        f"{_listed(parts)}."
+        f"{joined(parts)}."
     )
 
 
 def _biases(outcome: Outcome) -> str:
     jumping = [one for one in outcome.slopes if abs(one.jump) > abs(one.bias[0]) / 2 and one.deviation[0] > _FAR]
     biased = [sum(one.deviation[way] > _FAR for one in outcome.slopes) for way in range(3)]
-    counts = _listed([f"{count} with {way}" for count, way in zip(biased, WAYS, strict=True)])
+    counts = joined([f"{count} with {way}" for count, way in zip(biased, WAYS, strict=True)])
     sentence = f"Beyond chance off the slope of the mean push: of {len(outcome.slopes)} estimates each, {counts}."
     if not jumping:
         return sentence
@@ -248,10 +249,4 @@ def _counted(number: int, what: str) -> str:
 
 
 def _percent(share: float) -> str:
-    if share < _SMALL:
-        return "none"
-    return f"{100 * share:.2g}%" if share < 0.995 else f"{100 * share:.0f}%"
-
-
-def _listed(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+    return "none" if share < _SMALL else percent(share)

@@ -7,8 +7,9 @@ from numpy.typing import ArrayLike
 
 from experiments.bias_variance.figures import draw, video
 from experiments.bias_variance.outcome import Outcome
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
 from experiments.theme import power
+from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 
 
@@ -100,7 +101,7 @@ def _choice(outcome: Outcome) -> str:
     by_stiffness = _sides(first, zeroth, lambda rows: f"at every angle {_range(outcome, rows)}")
     by_angle = _sides(first.T, zeroth.T, lambda columns: f"{_angles(outcome, columns)} at every stiffness")
     parts, _ = min(by_stiffness, by_angle, key=lambda sides: sides[1])
-    return _join(parts)
+    return joined(parts)
 
 
 def _sides(first: np.ndarray, zeroth: np.ndarray, words: Callable[[ArrayLike], str]) -> tuple[list[str], int]:
@@ -122,7 +123,7 @@ def _degree(wins: np.ndarray) -> str:
 
 
 def _angles(outcome: Outcome, columns: ArrayLike) -> str:
-    return f"at {_join([f'{angle:g}' for angle in outcome.angles[np.asarray(columns)]])} rad"
+    return f"at {joined([f'{angle:g}' for angle in outcome.angles[np.asarray(columns)]])} rad"
 
 
 def _range(outcome: Outcome, rows: ArrayLike) -> str:
@@ -132,7 +133,7 @@ def _range(outcome: Outcome, rows: ArrayLike) -> str:
     if len(picked) == 1:
         return f"at {labels[0]} 1/s²"
     if (np.diff(picked) > 1).any():
-        return f"at {_join(labels)} 1/s²"
+        return f"at {joined(labels)} 1/s²"
     if picked[0] == 0:
         return f"up to a stiffness of {labels[-1]} 1/s²"
     if picked[-1] == outcome.swept.stop - 1:
@@ -192,7 +193,3 @@ def _variance(outcome: Outcome) -> str | None:
     if not larger.any():
         return "Nowhere in the sweep is the variance of first order beyond that of zeroth order."
     return f"The variance of first order exceeds that of zeroth order, at some angle, {_range(outcome, larger)}."
-
-
-def _join(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -8,6 +8,7 @@ from experiments.bounce.figures import draw
 from experiments.bounce.outcome import Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Report, Table
+from experiments.words import joined
 from experiments.workspace import Workspace
 
 # Steps in contact by which the outcome is told apart.
@@ -36,7 +37,7 @@ def verdict(outcome: Outcome) -> str:
     within = [f"{outcome.holds(arm)[fine].sum()} ({arm})" for arm in (CONTINUOUS, EVENT, DISCRETE)]
     sentences = [
         f"Up to {1e3 * settings.fine_timestep:g} ms the mean derivative is within {settings.tolerance:.0%} of the slope at "
-        f"{', '.join(within[:-1])} and {within[-1]} of {judged.sum()} contacts and time steps."
+        f"{joined(within)} of {judged.sum()} contacts and time steps."
     ]
     if (coarse := _coarse(outcome)) is not None:
         sentences.append(coarse)

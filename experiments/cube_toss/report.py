@@ -4,7 +4,8 @@ import numpy as np
 
 from experiments.cube_toss.figures import draw
 from experiments.cube_toss.outcome import METHODS, Course, Outcome, Point
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import quantity
 from experiments.workspace import Workspace
 from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from experiments.kernels.figures import NAMES, draw
 from experiments.kernels.outcome import ENTRIES, TITLES, WAYS, Outcome
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import capitalised, quantity
 from experiments.workspace import Workspace
 
 # Beyond it, of some twenty numbers, none is expected by chance.
@@ -39,9 +40,7 @@ def verdict(outcome: Outcome) -> str:
 
 def findings(outcome: Outcome) -> list[str]:
     """Single findings, one sentence each."""
-    found = [
-        f"{NAMES[one.name][:1].upper() + NAMES[one.name][1:]}: {_describe(one.found)}." for one in outcome.profiles
-    ]
+    found = [f"{capitalised(NAMES[one.name])}: {_describe(one.found)}." for one in outcome.profiles]
     for way in (2, 1):
         close, total = 0, 0
         for states in outcome.linear.values():

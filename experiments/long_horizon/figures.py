@@ -9,6 +9,7 @@ from experiments.long_horizon.outcome import ZEROTH, Errors, Outcome
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, save, subplots
 from experiments.theme import ZEROTH as BLUE
+from experiments.words import capitalised
 
 _EVENT, _ONSET = "#cc79a7", "#009e73"
 COLOURS = {"first order, discrete": FIRST, "first order, event": _EVENT, "first order, onset": _ONSET, ZEROTH: BLUE}
@@ -35,7 +36,7 @@ def errors(outcome: Outcome):
                 high = min(crossing.high, one.times[-1])
                 upper.axvspan(crossing.low, high, color=COLOURS[label], alpha=0.12, lw=0)
                 upper.axvline(crossing.horizon, color=COLOURS[label], lw=0.9, ls=(0, (2, 2)))
-        upper.set(yscale="log", title=one.title[:1].upper() + one.title[1:])
+        upper.set(yscale="log", title=capitalised(one.title))
         lower.set(yscale="log", xlabel="horizon, s")
     axes[0, 0].set_ylabel("error over the largest gradient")
     axes[1, 0].set_ylabel("variance of one sample, m²")
@@ -69,7 +70,7 @@ def growth(outcome: Outcome):
             axis.plot(
                 one.times, logs + shift, color=COLOURS[each.label], lw=1.2, label=f"√variance, {each.label}, shifted"
             )
-        axis.set(title=one.title[:1].upper() + one.title[1:], xlabel="time, s")
+        axis.set(title=capitalised(one.title), xlabel="time, s")
         axis.legend(fontsize=7.5)
     axes[0, 0].set_ylabel("logarithm")
     last = axes[0, -1]
@@ -117,9 +118,7 @@ def windows(outcome: Outcome):
         error, low, high = next(iter(one.windows.values())).zeroth
         axis.axhline(error, color=BLUE, lw=1.2, label=ZEROTH)
         axis.axhspan(low, high, color=BLUE, alpha=0.12, lw=0)
-        axis.set(
-            xscale="log", yscale="log", title=one.title[:1].upper() + one.title[1:], xlabel="length of a window, s"
-        )
+        axis.set(xscale="log", yscale="log", title=capitalised(one.title), xlabel="length of a window, s")
         axis.set_xticks(length, [f"{seconds:.2g}" for seconds in length])
         axis.xaxis.set_minor_locator(NullLocator())
     axes[0, 0].set_ylabel("error over the gradient")

@@ -1,7 +1,5 @@
 """From settings to numbers."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -75,7 +73,7 @@ def _measure(settings: Settings, one: Problem, rng: np.random.Generator, workspa
     first = dict(zip(labels, found, strict=True))
     # What diverged is left out of all estimates alike, and the report says how much that was.
     is_finite = np.all([np.isfinite(slopes).all(axis=(1, 2)) for _, slopes in first.values()], axis=0)
-    sizes = dataclasses.replace(sizes, num_samples=int(is_finite.sum()) // sizes.num_repeats)
+    sizes = sizes.model_copy(update={"num_samples": int(is_finite.sum()) // sizes.num_repeats})
     kept = np.flatnonzero(is_finite)[: sizes.num_repeats * sizes.num_samples]
     noise = noise[kept]
     first = {label: (_chosen(rollouts, kept), slopes[kept]) for label, (rollouts, slopes) in first.items()}

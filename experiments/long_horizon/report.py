@@ -4,8 +4,9 @@ import numpy as np
 
 from experiments.long_horizon.figures import draw
 from experiments.long_horizon.outcome import Found, Outcome, Windows
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
 from experiments.theme import power
+from experiments.words import capitalised, percent, quantity
 from experiments.workspace import Workspace
 
 
@@ -31,7 +32,9 @@ def findings(outcome: Outcome) -> list[str]:
     for one in outcome.found.values():
         found += [_growth(one), *_biases(one)]
         if one.finite < 1:
-            found.append(f"{_capital(one.title)}: derivatives of {1 - one.finite:.1%} of the rollouts are not finite.")
+            found.append(
+                f"{capitalised(one.title)}: derivatives of {1 - one.finite:.1%} of the rollouts are not finite."
+            )
     return [*found, *_adaptive(outcome)]
 
 
@@ -51,7 +54,7 @@ def _crossing(outcome: Outcome, one: Found) -> str:
             high = f"{crossing.high:.3g}" if np.isfinite(crossing.high) else "beyond the longest"
             parts.append(f"{crossing.horizon:.3g} s ({crossing.low:.3g} to {high}) of {label}")
     return (
-        f"{_capital(one.title)}: at {outcome.settings.sizes.num_samples} rollouts an estimate, zeroth order is as good from "
+        f"{capitalised(one.title)}: at {outcome.settings.sizes.num_samples} rollouts an estimate, zeroth order is as good from "
         f"a horizon of {' and '.join(parts)}."
     )
 
@@ -86,7 +89,7 @@ def _growth(one: Found) -> str:
     rate, error = one.growth_rate
     rates = [f"{quantity(rate)} 1/s with {label}" for label, rate in one.variance_rate.items()]
     return (
-        f"{_capital(one.title)}: over the second half of the time the largest singular value grows at {quantity(rate, error)} "
+        f"{capitalised(one.title)}: over the second half of the time the largest singular value grows at {quantity(rate, error)} "
         f"1/s; the root of the variance of one sample at {' and '.join(rates)}. The largest finite-time exponent at the end is "
         f"{quantity(float(one.exponents[-1].max()))} 1/s, the smallest {quantity(float(one.exponents[-1].min()))} 1/s."
     )
@@ -100,7 +103,7 @@ def _biases(one: Found) -> list[str]:
         if is_seen.mean() > 0.1:
             first = one.times[np.flatnonzero(is_seen)[0]]
             found.append(
-                f"{_capital(one.title)}, {each.label}: biased beyond chance at {is_seen.sum()} of {len(is_seen)} horizons, "
+                f"{capitalised(one.title)}, {each.label}: biased beyond chance at {is_seen.sum()} of {len(is_seen)} horizons, "
                 f"first at {first:.3g} s, by up to {_percent(float(each.bias[is_seen].max()))} of the largest gradient."
             )
     for label, cut in one.windows.items():
@@ -112,7 +115,7 @@ def _cut_bias(one: Found, label: str, cut: Windows) -> str:
     shortest = [f"{_percent(cut.bias[kind, 0])}" for kind in range(2)]
     length = one.times[0] * cut.lengths[0]
     return (
-        f"{_capital(one.title)}, {label}: cut after {length:.3g} s the gradient is off by a bias of {shortest[0]}, with a "
+        f"{capitalised(one.title)}, {label}: cut after {length:.3g} s the gradient is off by a bias of {shortest[0]}, with a "
         f"value function (which explains {cut.fit:.0%} of the variance of the costs to come) by {shortest[1]}."
     )
 
@@ -171,10 +174,4 @@ def _by_window(outcome: Outcome) -> Table:
 
 
 def _percent(share: float) -> str:
-    if share < 10:
-        return f"{100 * share:.2g}%" if share < 0.995 else f"{100 * share:.0f}%"
-    return f"{power(float(f'{share:.2g}'))} times"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    return percent(share) if share < 10 else f"{power(float(f'{share:.2g}'))} times"

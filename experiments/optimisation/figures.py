@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
-from experiments.report import Figure, quantity
+from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
+from experiments.words import quantity
 
 # One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
 _COLOURS = {

@@ -7,7 +7,8 @@ import numpy as np
 from experiments.optimisation.figures import draw
 from experiments.optimisation.outcome import Difference, Outcome, Run
 from experiments.overview import HEADLINE
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import quantity
 from experiments.workspace import Workspace
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.

@@ -3,7 +3,8 @@
 from experiments.planning.figures import draw, video
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import NAMES
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import quantity
 from experiments.workspace import Workspace
 
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from experiments.policy_gradient.figures import draw
 from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad.estimators import Reason
 
@@ -36,7 +37,7 @@ def verdict(outcome: Outcome) -> str:
         )
     worse = [cell for cell in smooth if _is_biased(cell, ONSET) and cell.bias(ONSET)[1] > cell.bias(DISCRETE)[2]]
     sentences.append(
-        f"Contact that begins within the step is worse in {_join([cell.label for cell in worse])}."
+        f"Contact that begins within the step is worse in {joined([cell.label for cell in worse])}."
         if worse
         else "Nowhere is contact that begins within the step the worse of both beyond chance."
     )
@@ -178,7 +179,3 @@ def _range(values: list[float]) -> str:
 def _span(values: list[float]) -> str:
     low, high = f"{min(values):.2f}", f"{max(values):.2f}"
     return low if low == high else f"{low} to {high}"
-
-
-def _join(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

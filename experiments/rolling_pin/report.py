@@ -1,8 +1,9 @@
 """The answer of the rolling pin's experiment in words, computed from its numbers."""
 
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
 from experiments.rolling_pin.figures import draw, video
 from experiments.rolling_pin.outcome import Descent, Outcome
+from experiments.words import quantity
 from experiments.workspace import Workspace
 
 

@@ -15,7 +15,7 @@ from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOut
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
-from experiments.stability.settings import SIZES, Settings, Size
+from experiments.stability.settings import Settings, Sizes
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics.stability import (
     UNSOLVED,
@@ -72,7 +72,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     Returns:
         The numbers.
     """
-    size = SIZES[settings.size]
+    size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
     grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]
     references = []
@@ -109,7 +109,7 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(cases: list[_Case], precision: str, size: Size, settings: Settings, workspace: Workspace) -> list[_Runs]:
+def _run_all(cases: list[_Case], precision: str, size: Sizes, settings: Settings, workspace: Workspace) -> list[_Runs]:
     """Run the programs of all scenes, some at a time: most of it is compilation."""
 
     def run(case: _Case) -> _Runs:

@@ -1,56 +1,25 @@
 """What an experiment on stability can be told; imports nothing heavy."""
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.settings import RunSettings
+from experiments.settings import RunSettings, SettingsTable
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much of the grid is looked at.
-
-    Attributes:
-        resolution: points along each side of a plane.
-        num_random: points of a Latin hypercube over all parameters of a scene.
-        scenes: by name; None for all.
-        event: scenes whose event gradient is looked at, too; None for all.
-        chunk: rollouts that go through a program at once.
-    """
+class Sizes(SettingsTable):
+    """How much of the grid is looked at."""
 
     resolution: int
+    """Points along each side of a plane."""
     num_random: int
-    scenes: tuple[str, ...] | None
-    event: tuple[str, ...] | None
+    """Points of a Latin hypercube over all parameters of a scene."""
+    scenes: tuple[str, ...] | None = None
+    """By name; None for all."""
+    event: tuple[str, ...] | None = None
+    """Scenes whose event gradient is looked at, too; None for all."""
     chunk: int
-
-
-SIZES = {
-    "quick": Size(8, 32, ("ball", "two balls, elliptic"), (), 128),
-    "default": Size(
-        12,
-        256,
-        (
-            "ball",
-            "ball, refsafe",
-            "sphere, condim 1",
-            "sphere, condim 3, pyramidal",
-            "sphere, condim 3, elliptic",
-            "sphere, condim 4, elliptic",
-            "sphere, condim 6, pyramidal",
-            "two balls, pyramidal",
-            "two balls, elliptic",
-            "stack",
-            "box, pyramidal",
-            "chain",
-        ),
-        ("ball", "two balls, pyramidal"),
-        128,
-    ),
-    "full": Size(24, 2048, None, None, 4096),
-}
+    """Rollouts that go through a program at once."""
 
 
 class Settings(RunSettings):
@@ -58,6 +27,8 @@ class Settings(RunSettings):
 
     size: Literal["quick", "default", "full"] = "default"
     """How fine the grid is, and how many scenes and gradients are looked at."""
+    sizes: Sizes
+    """The numbers that go with the size: those of the file's table of that name."""
     num_steps: Annotated[int, Field(ge=20, le=1000)] = 100
     """Of every rollout, whatever its time step."""
     onset: bool = False

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
 from experiments.textbook.figures import draw, stiffness_name
 from experiments.textbook.outcome import Outcome
 from experiments.theme import power
+from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 
 
@@ -73,7 +74,7 @@ def _best(outcome: Outcome, errors: np.ndarray, intervals: np.ndarray) -> str:
     """Name the estimator of least error, with all whose intervals overlap its own."""
     best = int(np.argmin(errors))
     ties = [outcome.labels[row] for row in np.argsort(errors) if intervals[0, row] <= intervals[1, best]]
-    return ties[0] if len(ties) == 1 else f"{', '.join(ties[:-1])} or {ties[-1]} (a tie)"
+    return joined(ties, "or") + (" (a tie)" if len(ties) > 1 else "")
 
 
 def _bias(outcome: Outcome) -> str:

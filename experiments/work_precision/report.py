@@ -3,7 +3,8 @@
 import numpy as np
 
 from experiments.parallel import num_compilers
-from experiments.report import Report, Table, quantity
+from experiments.report import Report, Table
+from experiments.words import quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
 from experiments.work_precision.figures import draw
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Outcome, Point

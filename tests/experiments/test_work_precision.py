@@ -32,7 +32,6 @@ from experiments.work_precision.outcome import (
     relative_errors,
 )
 from experiments.work_precision.programs import Knobs, softened
-from experiments.work_precision.settings import SIZES, Settings
 
 STDDEV = 0.3
 
@@ -90,7 +89,7 @@ def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendatio
     known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01, 1e-4)
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
     course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known, 3, 1.0)
-    outcome = Outcome(Settings(experiment="work_precision"), (course,))
+    outcome = Outcome(load_runs("work_precision", [])[0].settings, (course,))
     for draw in (figures.motion, figures.gradient):
         figure = draw(course, outcome)
         figure.canvas.draw()
@@ -178,7 +177,7 @@ def test_distances_of_free_bodies_are_metres_and_radians():
 
 
 def test_only_what_makes_a_difference_is_compiled():
-    settings = Settings(experiment="work_precision")
+    settings = load_runs("work_precision", [])[0].settings
     compiled = {name: variants(case(name), settings, True) for name in ("pendulum", "push", "bounce", "arm")}
     assert all(len(found) == len(set(found)) for found in compiled.values())
     assert [v.derivative for v in compiled["pendulum"] if v.derivative] == ["discrete"]  # no contact, no event
@@ -193,11 +192,12 @@ def test_only_what_makes_a_difference_is_compiled():
     assert {one.cone for one in left_out if (one.library, one.batch) == ("mg", 32)} == {"elliptic"}
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", ["quick", "default", "full"])
 def test_every_time_step_divides_every_motion(size):
-    for name in SIZES[size].scenes:
+    sizes = load_runs("work_precision", [f"size={size}"])[0].settings.sizes
+    for name in sizes.scenes:
         one = case(name)
-        for refinement in (*SIZES[size].refinements, *SIZES[size].gradient_refinements):
+        for refinement in (*sizes.refinements, *sizes.gradient_refinements):
             steps = one.duration * refinement / one.model.opt.timestep
             assert steps == pytest.approx(round(steps), abs=1e-9), (name, refinement)
 
