@@ -34,15 +34,7 @@ class _Program:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Time every variant of every scene, and compare motions and gradients.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Time every variant of every scene, and compare motions and gradients."""
     scenes = []
     # Compile times are measured, so none may come from an earlier run.
     had_cache = jax.config.jax_enable_compilation_cache

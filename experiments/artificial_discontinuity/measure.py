@@ -31,15 +31,7 @@ _FRICTION = """<mujoco><option gravity="0 0 0" tolerance="1e-10"/><worldbody>
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Find the jumps of every body along every path, judge the box's, and estimate slopes across them.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Find the jumps of every body along every path, judge the box's, and estimate slopes across them."""
     sizes = settings.sizes
     bodies = {name: shape(name) for name in sizes.shapes} | {count: lattice(count) for count in sizes.lattices}
     shapes = list(bodies.values())

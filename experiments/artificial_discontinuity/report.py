@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.artificial_discontinuity.figures import draw
-from experiments.artificial_discontinuity.outcome import ARTIFICIAL, ONSET, REAL, TURN, WAYS, Outcome, largest, worst
+from experiments.artificial_discontinuity.outcome import WAYS, Outcome, largest, worst
 from experiments.report import Report, Table
 from experiments.words import joined, percent, quantity
 from experiments.workspace import Workspace
@@ -45,12 +45,6 @@ def verdict(outcome: Outcome) -> str:
             )
     else:
         sentences.append(f"None of the bodies is without; the least has {min(bodies, key=lambda name: most[name])}.")
-    kinds = [one.kind for one in outcome.judged if one.relative > threshold]
-    if kinds:
-        counts = [f"{kinds.count(kind)} {kind}" for kind in (REAL, TURN, ARTIFICIAL, ONSET) if kind in kinds]
-        sentences.append(
-            f"Of the box's {len(kinds)} such jumps, held against the gradient of the overlap volume: {joined(counts)}."
-        )
     return " ".join(sentences)
 
 
@@ -61,9 +55,7 @@ def findings(outcome: Outcome) -> list[str]:
         for sentence in (
             _lattices(outcome),
             _biases(outcome),
-            _smoothing(outcome),
             _same_in_c(outcome),
-            *_mating(outcome),
             _friction(outcome),
         )
         if sentence
@@ -71,8 +63,8 @@ def findings(outcome: Outcome) -> list[str]:
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate jumps by body and path, the box's jumps one by one, and the estimates across them."""
-    return [_by_body(outcome), _by_jump(outcome), _by_estimate(outcome)]
+    """Tabulate jumps by body and path, the box's jumps one by one, the estimates across them, and the peg and the hole."""
+    return [_by_body(outcome), _by_jump(outcome), _by_estimate(outcome), _by_mating(outcome)]
 
 
 def _lattices(outcome: Outcome) -> str:
@@ -91,78 +83,24 @@ def _lattices(outcome: Outcome) -> str:
 
 def _biases(outcome: Outcome) -> str:
     jumping = [one for one in outcome.slopes if abs(one.jump) > abs(one.bias[0]) / 2 and one.deviation[0] > _FAR]
-    biased = [sum(one.deviation[way] > _FAR for one in outcome.slopes) for way in range(3)]
-    counts = joined([f"{count} with {way}" for count, way in zip(biased, WAYS, strict=True)])
-    sentence = f"Beyond chance off the slope of the mean push: of {len(outcome.slopes)} estimates each, {counts}."
     if not jumping:
-        return sentence
+        return ""
     rest = [abs(one.bias[0] + one.jump) / abs(one.bias[0]) for one in jumping]
     return (
-        f"{sentence} Where the push itself jumps ({len(jumping)} of them), the jump times the density of the noise is the "
+        f"Where the push itself jumps ({len(jumping)} of {len(outcome.slopes)}), the jump times the density of the noise is the "
         f"discrete gradient's bias, up to {np.median(rest):.0%} of it in the median."
     )
 
 
-def _smoothing(outcome: Outcome) -> str:
-    pairs = [(one.worst, worst(one.smoothed)) for one in outcome.statics if one.smoothed is not None]
-    before, after = np.array(pairs).T
-    threshold = outcome.settings.threshold
-    had = before > threshold
-    new = (~had & (after > threshold)).sum()
-    sentence = (
-        f"Smoothing by {1e3 * outcome.settings.smoothing:g} mm takes the jump below {threshold:.0%} at "
-        f"{(had & (after <= threshold)).sum()} of {had.sum()} bodies and paths that had one"
-    )
-    if new:
-        sentence += (
-            f", and makes one at {new} that had none: beyond the surface of a box MJX knows no distance, so that force at a "
-            "distance ends there"
-        )
-    return f"{sentence}."
-
-
 def _same_in_c(outcome: Outcome) -> str:
-    pairs = [(one.worst, worst(one.c_mujoco)) for one in outcome.statics]
-    threshold = outcome.settings.threshold
-    both = sum((a > threshold) == (b > threshold) for a, b in pairs)
-    sentence = f"C MuJoCo and MJX agree on whether a body jumps along a path in {both} of {len(pairs)} cases."
     own = [one for one in outcome.statics if len(one.plain.places) > len(one.c_mujoco.places)]
-    if own:
-        copies = sum(bool(one.copies.max()) for one in own)
-        sentence += (
-            f" MJX has jumps that C has not at {len(own)}, some of them small; at {copies} of these it repeats contact points to "
-            "fill their number, which weighs some corners twice or three times."
-        )
-    return sentence
-
-
-def _mating(outcome: Outcome) -> list[str]:
-    found = []
-    for one in outcome.matings:
-        held, let_go = len(one.force.places), len(one.depth.places)
-        force = (
-            f"jumps {_counted(held, 'time')}, by {worst(one.force):.0%} of its largest at most"
-            if held
-            else "does not jump"
-        )
-        depth = (
-            f"jumps at {_counted(let_go, 'offset')}, by {largest(one.depth) * 1e3:.0f} mm at most"
-            if let_go
-            else "does not"
-        )
-        slope = quantity(one.slopes.reference, one.slopes.reference_error)
-        says = [
-            # What is left of a derivative that is zero is rounding.
-            "0" if abs(value) < 1e-9 * abs(one.slopes.reference) else quantity(value, error)
-            for value, error in zip(one.slopes.estimates, one.slopes.errors, strict=True)
-        ]
-        where = "where it jumps most" if let_go else "in the middle"
-        found.append(
-            f"Mating with {one.label}: the force on the held peg {force}; the depth that it reaches when let go {depth}. "
-            f"Under noise {where} its slope is {slope}; first order says {says[0]} (discrete) and {says[1]} (event), "
-            f"zeroth order {says[2]}."
-        )
-    return found
+    if not own:
+        return ""
+    copies = sum(bool(one.copies.max()) for one in own)
+    return (
+        f"MJX has jumps that C has not at {len(own)} of {len(outcome.statics)} bodies and paths, some of them small; at {copies} "
+        "of these it repeats contact points to fill their number, which weighs some corners twice or three times."
+    )
 
 
 def _friction(outcome: Outcome) -> str:
@@ -241,6 +179,34 @@ def _by_estimate(outcome: Outcome) -> Table:
         f"Slope of the mean push by the start, from {outcome.settings.sizes.num_samples} rollouts each. In bold what is more "
         f"than {_FAR:g} standard errors off.",
         frozenset(emphasised),
+    )
+
+
+def _by_mating(outcome: Outcome) -> Table:
+    rows = []
+    for one in outcome.matings:
+        # What is left of a derivative that is zero is rounding.
+        least = 1e-9 * abs(one.slopes.reference)
+        says = [
+            "0" if abs(value) < least else quantity(value, error)
+            for value, error in zip(one.slopes.estimates, one.slopes.errors, strict=True)
+        ]
+        jumps = [str(len(one.force.places)), _percent(worst(one.force)), str(len(one.depth.places))]
+        slope = quantity(one.slopes.reference, one.slopes.reference_error)
+        rows.append([one.label, *jumps, f"{1e3 * largest(one.depth):.0f}", slope, *says])
+    return Table(
+        (
+            "contact of peg and hole",
+            "jumps of the force",
+            "largest",
+            "jumps of the depth",
+            "largest, mm",
+            "slope",
+            *WAYS,
+        ),
+        rows,
+        "Force on the held peg against its offset, jumps over the largest force; the depth that it reaches when let go; slope of "
+        "its mean under noise, where it jumps most.",
     )
 
 

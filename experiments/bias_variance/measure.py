@@ -21,13 +21,6 @@ REACH = 4.0
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Estimate at every stiffness and angle, with a progress bar.
 
-    Args:
-        settings: of the run.
-        workspace: for the clock and for warnings.
-
-    Returns:
-        The numbers.
-
     Raises:
         ExperimentError: if at some stiffness and angle there is no estimate, for hardly any rollout was finite.
     """

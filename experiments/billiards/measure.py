@@ -19,15 +19,7 @@ from mjxgrad.tasks.billiards import Billiards, billiards
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Descend by every method.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Descend by every method."""
     task = billiards(num_pieces=settings.num_pieces)
     workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)

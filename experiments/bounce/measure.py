@@ -45,15 +45,7 @@ class _Contacts(eqx.Module):
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Compare derivatives with the slope for every contact and time step.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Compare derivatives with the slope for every contact and time step."""
     grid = itertools.product(settings.damping_ratios, settings.time_constants, settings.impedances)
     with workspace.stage("quadrature", "steps", 1):
         cells = [_cell(settings, *point) for point in grid]

@@ -12,7 +12,6 @@ from experiments.words import joined
 from experiments.workspace import Workspace
 
 # Steps in contact by which the outcome is told apart.
-_MANY_STEPS = 10
 _STEPS = (0, 3, 6, 10, 20, np.inf)
 
 
@@ -48,7 +47,7 @@ def findings(outcome: Outcome) -> list[str]:
     """Single findings, one sentence each."""
     return [
         sentence
-        for sentence in (_failures(outcome), _jump(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))
+        for sentence in (_jump(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))
         if sentence is not None
     ]
 
@@ -68,21 +67,6 @@ def _coarse(outcome: Outcome) -> str | None:
     return (
         f"At {1e3 * settings.coarse_timestep:g} ms it is within {settings.coarse_tolerance:.0%} at {close[0].sum()} and "
         f"{close[1].sum()} (event) of {judged.sum()}."
-    )
-
-
-def _failures(outcome: Outcome) -> str | None:
-    """Say what the failures have in common: few steps in contact."""
-    judged, is_long = outcome.can_judge, outcome.steps_in_contact >= _MANY_STEPS
-    if not judged.any():
-        return None
-    parts = []
-    for arm in (CONTINUOUS, EVENT):
-        fails = outcome.fails(arm)
-        parts.append(f"{(fails & ~is_long).sum()} and {(fails & is_long).sum()} ({arm})")
-    return (
-        f"Beyond {outcome.settings.tolerance:.0%}, and beyond chance, of {(judged & ~is_long).sum()} contacts of fewer than "
-        f"{_MANY_STEPS} time steps and {(judged & is_long).sum()} longer ones: {', '.join(parts)}."
     )
 
 

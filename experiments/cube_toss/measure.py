@@ -31,13 +31,6 @@ _STATE = ("qpos", "qvel", "time", "qacc_warmstart")
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Take the derivative of every throw by every method.
 
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-
     Raises:
         ExperimentError: if a time step does not divide the throw, or the reference fails.
     """

@@ -24,15 +24,7 @@ _LITTLE = 1e-3
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise."""
     scene = _scene(settings, settings.impedance, settings.impedance)
     workspace.check(scene, speed=settings.speed)
     profiles = _profiles(settings)

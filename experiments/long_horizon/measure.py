@@ -32,15 +32,7 @@ class Rollouts(eqx.Module):
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Measure every problem.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Measure every problem."""
     found, reference = {}, None
     for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.long_horizon.figures import draw
-from experiments.long_horizon.outcome import Found, Outcome, Windows
+from experiments.long_horizon.outcome import Found, Outcome
 from experiments.report import Report, Table
 from experiments.theme import power
 from experiments.words import capitalised, percent, quantity
@@ -106,18 +106,7 @@ def _biases(one: Found) -> list[str]:
                 f"{capitalised(one.title)}, {each.label}: biased beyond chance at {is_seen.sum()} of {len(is_seen)} horizons, "
                 f"first at {first:.3g} s, by up to {_percent(float(each.bias[is_seen].max()))} of the largest gradient."
             )
-    for label, cut in one.windows.items():
-        found.append(_cut_bias(one, label, cut))
     return found
-
-
-def _cut_bias(one: Found, label: str, cut: Windows) -> str:
-    shortest = [f"{_percent(cut.bias[kind, 0])}" for kind in range(2)]
-    length = one.times[0] * cut.lengths[0]
-    return (
-        f"{capitalised(one.title)}, {label}: cut after {length:.3g} s the gradient is off by a bias of {shortest[0]}, with a "
-        f"value function (which explains {cut.fit:.0%} of the variance of the costs to come) by {shortest[1]}."
-    )
 
 
 def _adaptive(outcome: Outcome) -> list[str]:

@@ -15,15 +15,7 @@ from mjxgrad.tasks.published import Published
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Run every method from every seed, and estimate the gradient at the start many times.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Run every method from every seed, and estimate the gradient at the start many times."""
     task = problem(settings)
     if (simulated := scene(settings)) is not None:
         workspace.check(simulated)

@@ -108,11 +108,10 @@ def plane(outcome: Outcome):
         axis.set(title=f"{part[0] * _DECISION:.1f} to {part[-1] * _DECISION:.1f} s", xlabel="x in m", aspect="equal")
     axes[0, 0].set_ylabel("y in m")
     axes[0, 0].autoscale_view()
-    plane = (
+    caption = (
         "Rod and finger every 0.3 s and at the end, from light to dark; the dashed outline is the goal, the ring where the "
         "finger starts."
     )
-    caption = plane
     return figure, "The plan, seen from above", caption
 
 

@@ -34,15 +34,7 @@ _RANGE = (0.3, 0.3, 0.25, 0.25, 3.3)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Plan in every way that is asked for.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The plans.
-    """
+    """Plan in every way that is asked for."""
     task = planar_pusher(finger=settings.finger, goal=settings.goal)
     workspace.check(task.system.scene)
     attempts, polished = [], None

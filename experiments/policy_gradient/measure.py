@@ -71,15 +71,7 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Compare both gradients on all tasks.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Compare both gradients on all tasks."""
     cells, courses = [], []
     with workspace.stage("estimates", "tasks", len(settings.tasks)) as advance_to:
         for number, name in enumerate(settings.tasks):

@@ -55,15 +55,7 @@ class Group:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Descend in every way from controls of zero, and judge each by the true cost.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Descend in every way from controls of zero, and judge each by the true cost."""
     task = rolling_pin()
     workspace.check(task.scene)
     groups = _groups(settings)

@@ -113,15 +113,7 @@ def _sample(simulate: _Simulate, parameters: Float[Array, " phases"]) -> tuple[A
 
 
 def measure(settings: Settings, workspace: Workspace) -> list[Course]:
-    """Sample outcomes and derivatives of every motion at every time step.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The courses, motion by motion.
-    """
+    """Sample outcomes and derivatives of every motion at every time step."""
     courses = []
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
         for number, name in enumerate(settings.cases):

@@ -63,15 +63,7 @@ def largest(num_steps: int) -> float:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Run every scene in every precision, and C MuJoCo beside it.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Run every scene in every precision, and C MuJoCo beside it."""
     size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
     grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]

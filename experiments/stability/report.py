@@ -55,7 +55,6 @@ def findings(outcome: Outcome) -> list[str]:
     """Single findings, one sentence each."""
     found = [_limit(outcome), *(_gradients(outcome, name) for name in outcome.settings.precisions)]
     found += [_unflagged(outcome, name) for name in outcome.settings.precisions]
-    found += [_event(outcome, name) for name in outcome.settings.precisions]
     return [sentence for sentence in found if sentence]
 
 
@@ -111,20 +110,6 @@ def _unflagged(outcome: Outcome, precision: str) -> str | None:
     return (
         f"In {precision}, {unflagged} gradients explode or are not finite ({(kinds == Derivative.NON_FINITE).sum()} of them not "
         "finite) although their rollouts did not diverge: only `soundness`, or an estimator's count, tells."
-    )
-
-
-def _event(outcome: Outcome, precision: str) -> str | None:
-    kinds = [one.behaviour[precision].event for one in outcome.scenes]
-    known = [kind for kind in kinds if kind is not None]
-    if not known:
-        return None
-    kinds = np.concatenate(known)
-    right, wrong = (kinds == Derivative.RIGHT).sum(), (kinds == Derivative.WRONG).sum()
-    return (
-        f"The event gradient, in {precision}, is not finite at {_count(int((kinds == Derivative.NON_FINITE).sum()))} of "
-        f"{len(kinds)} points and explodes at {_count(int((kinds == Derivative.EXPLODES).sum()))}; after a right bounce it is "
-        f"within a tenth of the restitution at {right} of {right + wrong}, for the one phase of the time step that was taken."
     )
 
 

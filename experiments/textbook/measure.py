@@ -31,13 +31,6 @@ _SETS = 4000
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Repeat every estimator at every number of rollouts and every stiffness.
 
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-
     Raises:
         ExperimentError: if there is no estimator of some name.
     """

@@ -1,7 +1,6 @@
 """From settings to numbers."""
 
 import itertools
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -16,15 +15,7 @@ from experiments.workspace import Workspace
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed."""
     cases = {name: case(name) for name in settings.scene_names}
     courses = []
     # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.
@@ -87,9 +78,7 @@ def has_friction(one: Case) -> bool:
 
 
 def _course(name: str, one: Case, settings: Settings, on_each: Callable[[], None]) -> Course:
-    begun = time.perf_counter()
     programs = compiled(one, variants(one, settings, settings.has_asides(name)), on_each)
-    compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
     right = simulation.truths(one, programs, qvel, settings.num_threads)
     points = simulation.measured(one, programs, qvel, right, settings)
@@ -103,6 +92,4 @@ def _course(name: str, one: Case, settings: Settings, on_each: Callable[[], None
         references=tuple(truth.found for truth in right.values()),
         estimates=tuple(estimates),
         gradient_reference=gradient_reference,
-        num_programs=len(programs),
-        compile_wall_seconds=compiling,
     )

@@ -17,7 +17,8 @@ def report(outcome: Outcome, workspace: Workspace) -> Report:
         verdict=verdict(outcome),
         findings=findings(outcome),
         figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
+        summary=summary(outcome),
+        tables=[batches(outcome)],
         metrics=outcome.rows(),
     )
 
@@ -47,9 +48,8 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Recommend, scene by scene, and say what is not known."""
-    sentences = [_recommendation(course, outcome) for course in outcome.courses]
-    sentences += _onset_against_step(outcome)
+    """Say what an onset makes of the error, and what is not known."""
+    sentences = _onset_against_step(outcome)
     loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]
     if loose:
         sentences.append(
@@ -67,12 +67,6 @@ def findings(outcome: Outcome) -> list[str]:
             "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful: "
             f"{'; '.join(doubtful)}."
         )
-    programs = sum(course.num_programs for course in outcome.courses)
-    seconds = sum(course.compile_wall_seconds for course in outcome.courses)
-    sentences.append(
-        f"{programs} programs were compiled, {num_compilers()} at a time, in {seconds:.0f} s (less where a former run had "
-        "compiled them)."
-    )
     return sentences
 
 
@@ -171,31 +165,6 @@ def _alone_and_together(course: Course, library: str) -> str:
     return "; ".join(f"{costs[together]:.3g}" if together in costs else "–" for together in (False, True))
 
 
-def _recommendation(course: Course, outcome: Outcome) -> str:
-    targets = sorted(outcome.settings.targets, reverse=True)
-    motions, gradients = [], []
-    for target in targets:
-        best = _best(course, MG, target)
-        native = _best(course, C, target)
-        if best is None:
-            motions.append(f"for {_percent(target)} {_absence(course, target)}")
-        else:
-            beside = f", C MuJoCo {_milliseconds(native)}" if native is not None else ""
-            price = f"{_milliseconds(best)} ms per simulated second and state{beside}"
-            motions.append(f"for {_percent(target)} take mg.step, {_setting(best)} ({price})")
-        choice = cheapest(course.estimates, target)
-        known = course.gradient_reference.error
-        if choice is None:
-            gradients.append(
-                f"for {_percent(target)} none is known to get there (reference known to {_percent(known)})"
-            )
-        elif known > target:
-            gradients.append(f"for {_percent(target)} it cannot be told (reference known to {_percent(known)})")
-        else:
-            gradients.append(f"for {_percent(target)} take {_choice(choice)}")
-    return f"{course.title}, motion: {'; '.join(motions)}. Gradient: {'; '.join(gradients)}."
-
-
 def _best(course: Course, library: str, target: float) -> Point | None:
     """Give the fastest way of a library, unless the reference is not known that well."""
     if course.floor(library) > target:
@@ -206,12 +175,6 @@ def _best(course: Course, library: str, target: float) -> Point | None:
 def _ratios(outcome: Outcome, other: str, target: float) -> list[float]:
     pairs = [(_best(course, MG, target), _best(course, other, target)) for course in outcome.courses]
     return [one.cost / two.cost for one, two in pairs if one is not None and two is not None]
-
-
-def _absence(course: Course, target: float) -> str:
-    if course.floor(MG) > target:
-        return f"it cannot be told (reference known to {_percent(course.floor(MG))})"
-    return "no setting that was tried is enough"
 
 
 def _way(point: Point | None, course: Course, target: float) -> str:

@@ -211,7 +211,7 @@ def test_figures_are_drawn_where_every_run_of_a_method_is_lost(tmp_path):
     lost = made_up("first_order", [np.inf, np.inf])
     lost = dataclasses.replace(lost, alpha=np.full((2, 3), np.nan), cost=np.full((2, 2), np.inf))
     found = outcome(lost, made_up("alpha_order", [5.0, 6.0]))
-    figures = draw(found, tmp_path, {"final": "", "curves": "", "alpha": ""})
+    figures = draw(found, tmp_path)
     assert [(tmp_path / figure.file).is_file() for figure in figures] == [True] * 3
     assert "undefined" in tables(found)[0].rows[0][1]
 
