@@ -1,4 +1,4 @@
-"""The pictures of the experiment on billiards, and their captions."""
+"""The pictures of the experiment on billiards."""
 
 from pathlib import Path
 

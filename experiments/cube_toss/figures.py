@@ -1,4 +1,4 @@
-"""The pictures of the experiment on the thrown cube, and their captions."""
+"""The pictures of the experiment on the thrown cube."""
 
 from pathlib import Path
 
