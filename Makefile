@@ -52,13 +52,13 @@ test-slow: .venv/.installed  ## the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 bench: .venv/.installed  ## measure speed and memory against mjx.step
-	@$(BIN)/python -m experiments.bench $(ARGS)
+	@$(BIN)/python -m experiments.benchmarks bench $(ARGS)
 
 throughput: .venv/.installed  ## measure a sweep over softness in one program against ten, and its memory
-	@$(BIN)/python -m experiments.throughput $(ARGS)
+	@$(BIN)/python -m experiments.benchmarks throughput $(ARGS)
 
 costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
-	@$(BIN)/python -m experiments.costs $(ARGS)
+	@$(BIN)/python -m experiments.benchmarks costs $(ARGS)
 
 lint: .venv/.installed  ## ruff and pyright
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python

@@ -1,39 +1,21 @@
 """A run's configuration: a TOML file, checked as a whole before anything heavy is imported."""
 
+import importlib
 import itertools
 import json
 import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ValidationError
 
-from experiments import mistakes
 from experiments.failure import ConfigurationError, suggest
+from experiments.mistakes import mistakes_of
+from experiments.settings import RunSettings
 
 FOLDER = Path(__file__).parent
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class Settings(BaseModel):
-    """A table of settings that refuses unknown keys and wrong types."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True)
-
-
-class RunSettings(Settings):
-    """What every kind of experiment has."""
-
-    experiment: str
-    """The kind of experiment, a key of `experiments.registry.EXPERIMENTS`."""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Of every random number in the run."""
-    precision: Literal["float32", "float64"] = "float64"
-    """Of every array in the run."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +65,8 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
         candidate = json.loads(json.dumps(table, default=str))
         for key, value in varied.items():
             _assign(candidate, key.split("."), value)
-        settings, found = mistakes.validate(candidate, swept=set(sweep))
+        _choose_size(candidate)
+        settings, found = _validate(candidate, swept=set(sweep))
         problems += found
         runs.append(Run(path.stem, settings, question or path.stem, expected, varied))
     if problems or sweep_problems:
@@ -125,6 +108,37 @@ def read_header(text: str) -> tuple[str, str]:
     comment = " ".join(line.lstrip("# ").strip() for line in lines)
     question, _, expected = comment.partition("Expected:")
     return question.strip(), expected.strip()
+
+
+def kinds() -> list[str]:
+    """List the kinds of experiment: the folders that hold settings."""
+    return sorted(path.parent.name for path in FOLDER.glob("*/settings.py"))
+
+
+def _choose_size(table: dict[str, Any]) -> None:
+    """Put the one of the tables `[sizes.*]` that `size` names in the place of all; single values in `[sizes]` win over it."""
+    sizes = table.get("sizes")
+    if not isinstance(sizes, dict):
+        return
+    named = {key: value for key, value in sizes.items() if isinstance(value, dict)}
+    if named:
+        # A size that is not there is answered when the settings are checked, with those there are.
+        chosen = named.get(str(table.get("size", "default")), next(iter(named.values())))
+        table["sizes"] = chosen | {key: value for key, value in sizes.items() if key not in named}
+
+
+def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
+    """Check a table against the settings of its kind: these or None, and one sentence per mistake."""
+    kind = table.get("experiment")
+    if kind not in kinds():
+        named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
+        return None, [f"experiment: {named}{suggest(str(kind), kinds())}"]
+    settings = importlib.import_module(f"experiments.{kind}.settings").Settings
+    try:
+        # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
+        return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
+    except ValidationError as error:
+        return None, mistakes_of(settings, error, swept)
 
 
 def _apply(table: dict[str, Any], override: str) -> str | None:

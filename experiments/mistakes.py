@@ -1,4 +1,4 @@
-"""From a table of settings to a checked configuration, or to sentences about all that is wrong with it."""
+"""Sentences about all that is wrong with a table of settings."""
 
 import json
 import types
@@ -10,28 +10,18 @@ from pydantic_core import ErrorDetails
 from experiments.failure import suggest
 
 
-def validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
-    """Check a table of settings against the configuration of its kind of experiment.
+def mistakes_of(settings: type[BaseModel], error: ValidationError, swept: set[str]) -> list[str]:
+    """Give one sentence per mistake.
 
     Args:
-        table: as read from TOML.
+        settings: that a table was checked against.
+        error: what that found.
         swept: dotted keys whose value came from the `[sweep]` table, for the paths in the answer.
 
     Returns:
-        The settings, or None, and one sentence per mistake.
+        In the order in which they were found.
     """
-    from experiments.registry import EXPERIMENTS
-
-    kind = table.get("experiment")
-    if kind not in EXPERIMENTS:
-        named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
-        return None, [f"experiment: {named}{suggest(str(kind), EXPERIMENTS)}"]
-    settings = EXPERIMENTS[kind].settings
-    try:
-        # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
-        return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
-    except ValidationError as error:
-        return None, [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
+    return [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
 
 
 def _follows(detail: ErrorDetails, error: ValidationError) -> bool:

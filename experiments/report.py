@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from experiments.words import capitalised
+
 STYLE = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
 
 
@@ -49,7 +51,7 @@ class Report:
 
     Attributes:
         verdict: the answer in a sentence or two, computed from the data.
-        details: further sentences, one finding each.
+        findings: further sentences, one each.
         figures: in order of reading.
         tables: after the figures.
         metrics: rows for metrics.csv, in SI units.
@@ -63,43 +65,11 @@ class Report:
     figures: Sequence[Figure]
     tables: Sequence[Table]
     metrics: Sequence[dict[str, Any]]
-    details: Sequence[str] = ()
+    findings: Sequence[str] = ()
     video: str | None = None
     video_caption: str = ""
     warnings: Sequence[str] = field(default_factory=tuple)
     summary: Table | None = None
-
-
-def quantity(value: float, error: float | None = None) -> str:
-    """Write a number with as many digits as its error allows.
-
-    Args:
-        value: the number.
-        error: one standard error or half an interval; without it three digits are given.
-
-    Returns:
-        Such as "−0.0118 ± 0.0004" or "(1.23 ± 0.05)×10⁵".
-    """
-    if value != value or (error is not None and error != error):
-        return "undefined"
-    magnitude = max(abs(value), error or 0.0)
-    exponent = int(f"{magnitude:e}".partition("e")[2]) if magnitude else 0
-    power = exponent if exponent >= 4 or exponent < -3 else 0
-    scale = 10.0**power
-    if not error:
-        text = f"{value / scale:.{max(0, 2 - exponent + power)}f}"
-    else:
-        decimals = max(0, 1 - int(f"{error / scale:e}".partition("e")[2]))
-        text = f"{value / scale:.{decimals}f} ± {error / scale:.{decimals}f}"
-    text = text.replace("-", "−")
-    if not power:
-        return text
-    return f"({text})×10{superscript(power)}" if error else f"{text}×10{superscript(power)}"
-
-
-def superscript(number: int) -> str:
-    """Write an integer as an exponent."""
-    return str(number).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
@@ -119,11 +89,9 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
     body = [
         f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
         f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
-        _items(report.details),
+        _items(report.findings),
         "</section>",
-        f'<p class="expected"><b>Expected beforehand.</b> {_text(expected[:1].upper() + expected[1:])}</p>'
-        if expected
-        else "",
+        f'<p class="expected"><b>Expected beforehand.</b> {_text(capitalised(expected))}</p>' if expected else "",
         _warnings(report.warnings),
         _video(report, folder),
         _table(report.summary) if report.summary is not None else "",

@@ -1,5 +1,6 @@
 """From a configuration to a finished output folder."""
 
+import importlib
 import json
 import os
 import re
@@ -17,7 +18,6 @@ from experiments.config import Run, load_runs
 from experiments.opengl import OpenGL
 from experiments.output import building, write_csv, write_text, write_toml, writing
 from experiments.overview import overview
-from experiments.registry import EXPERIMENTS
 from experiments.report import Report, page
 from experiments.workspace import CompileClock, Workspace
 
@@ -95,7 +95,10 @@ def _call(run: Run, workspace: Workspace) -> Report:
     """Run the experiment; what the library warns of, and what it finds unstable, goes into the report, not to the terminal."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        report = EXPERIMENTS[run.settings.experiment].load()(run.settings, workspace)
+        # Late, once precision and OpenGL are chosen: these import JAX and MuJoCo.
+        kind = f"experiments.{run.settings.experiment}"
+        outcome = importlib.import_module(f"{kind}.measure").measure(run.settings, workspace)
+        report = importlib.import_module(f"{kind}.report").report(outcome, workspace)
     said = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
     # A scene warns of some of it when it is loaded.
     sentences = dict.fromkeys([*report.warnings, *said, *workspace.warnings])

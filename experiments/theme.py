@@ -1,5 +1,6 @@
 """How the figures look: one type size, few lines, colours that colour-blind readers can tell apart."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,17 @@ from cycler import cycler
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Picture
+
+from experiments.report import Figure
+from experiments.words import superscript
 
 # Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
 FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
 DEFAULT, MUTED = "#cc79a7", "#8b94a1"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
+
+Drawing = Callable[[Any], tuple[Picture, str, str]]
 
 RULES: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -66,21 +72,28 @@ def subplots(rows: int, columns: int, *, height: float, **settings):
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 
-def save(figure: Figure, folder: Path, name: str) -> str:
-    """Write a figure and let go of it.
+def save(drawings: Iterable[Drawing], outcome: Any, folder: Path) -> list[Figure]:
+    """Draw figures, write them, and let go of them.
 
     Args:
-        figure: made by `subplots`.
+        drawings: each gives a picture made by `subplots`, its title of a few words, and what it shows and how to read it; the
+            file has the drawing's name.
+        outcome: the numbers.
         folder: of the run.
-        name: of the picture, without ending.
 
     Returns:
-        The file's path relative to `folder`.
+        The figures of the report.
     """
+    return [save_one(drawing(outcome), folder, drawing.__name__) for drawing in drawings]
+
+
+def save_one(drawn: tuple[Picture, str, str], folder: Path, name: str) -> Figure:
+    """Write a picture with its title and caption under a name of its own, and let go of it."""
+    picture, title, caption = drawn
     (folder / "figures").mkdir(exist_ok=True)
-    figure.savefig(folder / "figures" / f"{name}.png")
-    plt.close(figure)
-    return f"figures/{name}.png"
+    picture.savefig(folder / "figures" / f"{name}.png")
+    plt.close(picture)
+    return Figure(f"figures/{name}.png", title, caption)
 
 
 def shades(count: int) -> np.ndarray:
@@ -90,8 +103,6 @@ def shades(count: int) -> np.ndarray:
 
 def power(value: float) -> str:
     """Write a number for an axis or a legend: 10⁴, 3×10⁵, 2500."""
-    from experiments.report import superscript
-
     exponent = int(np.floor(np.log10(value) + 1e-12))
     mantissa = value / 10.0**exponent
     if exponent in (0, 1, 2) or (exponent == 3 and not np.isclose(mantissa, 1)):

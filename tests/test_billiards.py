@@ -7,8 +7,8 @@ import pytest
 
 from experiments.billiards import hard
 from experiments.billiards.outcome import Outcome, Run
-from experiments.billiards.settings import BilliardsSettings, MethodSettings
-from experiments.billiards.verdict import verdict
+from experiments.billiards.report import verdict
+from experiments.billiards.settings import MethodSettings, Settings
 from mjxgrad.tasks.billiards import billiards
 
 
@@ -78,7 +78,7 @@ def run_of(label, cost, *, touches=False):
 
 def test_the_verdict_tells_solved_from_stuck():
     runs = (run_of("near", 1.395), run_of("idle", 1.9999), run_of("half", 1.7), run_of("touching", 1.39, touches=True))
-    settings = BilliardsSettings(experiment="billiards", methods=tuple(run.method for run in runs))
+    settings = Settings(experiment="billiards", methods=tuple(run.method for run in runs))
     text = verdict(Outcome(settings, hard.optimum(), runs, 1 / 960))
     assert "near (1.395) reach the optimum of 1.3965" in text
     assert "No progress beyond standing still (cost 2): idle (2.000)." in text

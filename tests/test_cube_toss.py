@@ -9,8 +9,8 @@ import pytest
 import mjxgrad as mg
 from experiments.cube_toss.measure import substepped_step
 from experiments.cube_toss.outcome import Course, Outcome, Point
-from experiments.cube_toss.settings import CubeTossSettings
-from experiments.cube_toss.verdict import findings, verdict
+from experiments.cube_toss.report import findings, verdict
+from experiments.cube_toss.settings import Settings
 from mjxgrad._rollout import data_of
 from mjxgrad.tasks.cube_toss import cube_toss
 from tests.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
@@ -40,9 +40,7 @@ def test_a_lucky_coarse_step_is_not_the_fastest(course):
 
 
 def test_the_verdict_names_the_fastest_and_what_never_is_right(course):
-    settings = CubeTossSettings(
-        experiment="cube_toss", timesteps=(2e-3, 1e-3), refined_timesteps=(1e-3,), tolerances=(1e-3,)
-    )
+    settings = Settings(experiment="cube_toss", timesteps=(2e-3, 1e-3), refined_timesteps=(1e-3,), tolerances=(1e-3,))
     outcome = Outcome(settings, (course,))
     assert verdict(outcome) == (
         "With MuJoCo's default contact the first below 2% is event (time step 0.001 s): 1.5 % in 0.3 s of processor time; "

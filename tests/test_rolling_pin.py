@@ -10,8 +10,8 @@ import pytest
 
 import mjxgrad as mg
 from experiments.rolling_pin.outcome import Descent, Outcome
-from experiments.rolling_pin.settings import RollingPinSettings
-from experiments.rolling_pin.verdict import findings, table, verdict
+from experiments.rolling_pin.report import findings, tables, verdict
+from experiments.rolling_pin.settings import Settings
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.rolling_pin import DENT, DEPTH, rolling_pin
 
@@ -108,7 +108,7 @@ def outcome(task):
         _descent("zeroth order", [1, 0.9, 0.8, 0.7]),
     ]
     return Outcome(
-        settings=RollingPinSettings(experiment="rolling_pin", num_steps=3),
+        settings=Settings(experiment="rolling_pin", num_steps=3),
         descents=descents,
         start_gradient=0.0,
         target=np.array([0, 0, -DEPTH]),
@@ -130,7 +130,7 @@ def test_the_verdict_names_what_stayed_what_solved_and_what_did_not(outcome):
     assert "Solved, with a true cost below 0.1 of the untouched bed's 1, by margin (0.0200)" in said
     assert "Not solved by zeroth order (0.700)" in said
     assert "solved by margin: 6 of them in 3 steps" in findings(outcome)[0]
-    shown = table(outcome)
+    shown = tables(outcome)[0]
     assert [row[0] for row in shown.rows] == ["first order", "margin", "zeroth order"]
     assert shown.rows[0][4] == "never"
     assert shown.rows[0][-1] == "1.0"  # mm

@@ -6,6 +6,7 @@ from matplotlib.lines import Line2D
 
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
+from experiments.parallel import num_compilers
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
@@ -17,26 +18,14 @@ _KINDS = {
 }
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: ratios.
-
-    Returns:
-        The figures in order of reading; none if every variant is the same program.
-    """
-    drawn = [(scene, v) for scene in outcome.scenes for v in scene.variants[1:] if not v.is_same_program]
-    if not drawn:
-        return []
-    title = "Cost without, as a share of the cost with everything"
-    return [Figure(save(ratios(drawn), folder, "ratios"), title, captions["ratios"])]
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figure and save it in the run's folder; none if every variant is the same program."""
+    return save([ratios] if _drawn(outcome) else [], outcome, folder)
 
 
-def ratios(drawn: list[tuple[SceneOutcome, VariantOutcome]]):
+def ratios(outcome: Outcome):
     """One line per scene and group, one panel per cost."""
+    drawn = _drawn(outcome)
     figure, axes = subplots(1, 4, height=1.7 + 0.27 * len(drawn), sharey=True)
     for place, (_, variant) in enumerate(drawn):
         for axis, (middle, low, high) in zip(axes[0], _shares(variant), strict=True):
@@ -61,7 +50,19 @@ def ratios(drawn: list[tuple[SceneOutcome, VariantOutcome]]):
     if not all(variant.is_unchanged for _, variant in drawn):
         handles.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="changes motion or gradient"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
-    return figure
+    sizes = outcome.settings.sizes
+    caption = (
+        f"Each as a share of the same scene with everything; left of the line is cheaper. Dots are medians of {sizes.repeats} "
+        f"turns, bars their quartiles; compilation is that of the gradient, once, without a cache, {num_compilers(besides=1)} "
+        "at a time while others are traced. Only variants that make another program are drawn: all others are the scene with "
+        f"everything, letter for letter. Open dots: motion or gradient is another one. {sizes.batch} rollouts of "
+        f"{sizes.horizon} steps, started along recorded motions."
+    )
+    return figure, "Cost without, as a share of the cost with everything", caption
+
+
+def _drawn(outcome: Outcome) -> list[tuple[SceneOutcome, VariantOutcome]]:
+    return [(scene, v) for scene in outcome.scenes for v in scene.variants[1:] if not v.is_same_program]
 
 
 def _kind(variant: VariantOutcome) -> str | None:

@@ -14,7 +14,7 @@ import numpy as np
 import mjxgrad as mg
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.recording import record, scene_path, segments
-from experiments.ablation.settings import AblationSettings
+from experiments.ablation.settings import Settings
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, REACHED, Variant, variants
 from experiments.parallel import num_compilers
 from experiments.workspace import Workspace
@@ -33,16 +33,8 @@ class _Program:
     flops: float
 
 
-def measure(settings: AblationSettings, workspace: Workspace) -> Outcome:
-    """Time every variant of every scene, and compare motions and gradients.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Time every variant of every scene, and compare motions and gradients."""
     scenes = []
     # Compile times are measured, so none may come from an earlier run.
     had_cache = jax.config.jax_enable_compilation_cache
@@ -57,7 +49,7 @@ def measure(settings: AblationSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, scenes)
 
 
-def _scene(name: str, settings: AblationSettings, workspace: Workspace) -> SceneOutcome:
+def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
     sizes, path = settings.sizes, scene_path(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

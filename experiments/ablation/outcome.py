@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from experiments.ablation.settings import AblationSettings
+from experiments.ablation.settings import Settings
 from mjxgrad.diagnostics import OmissionCheck
 
 # Two programs round differently in every operation of every step, the moved start only once.
@@ -133,7 +133,7 @@ class Outcome:
         scenes: in the order of the settings.
     """
 
-    settings: AblationSettings
+    settings: Settings
     scenes: list[SceneOutcome]
 
     def rows(self) -> list[dict[str, Any]]:

@@ -4,34 +4,18 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.artificial_discontinuity.mating import TILT
 from experiments.artificial_discontinuity.outcome import WAYS, Outcome, worst
-from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
 
 _EVENT = "#009e73"
 _LEAST = 1e-4
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: forces, jumps, refinement, slopes, mating.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {
-        "forces": ("Force along a path", forces),
-        "jumps": ("Largest jump, by body and path", jumps),
-        "refinement": ("A pressure field of ever more points", refinement),
-        "slopes": ("What gradients say across the jump", slopes),
-        "mating": ("A peg and a hole", mating),
-    }
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([forces, jumps, refinement, slopes, mating], outcome, folder)
 
 
 def forces(outcome: Outcome):
@@ -60,7 +44,13 @@ def forces(outcome: Outcome):
                 axis.set_ylabel(f"{body}\nforce over its largest")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5)
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Force on a body held {1e3 * settings.depth:g} mm deep in a cube, over its largest. Dashed, the gradient of the "
+        "volume that both boxes share, scaled alike: it is continuous. Grey lines: places where the force jumps by more than "
+        f"{settings.threshold:.0%} of that."
+    )
+    return figure, "Force along a path", caption
 
 
 def jumps(outcome: Outcome):
@@ -99,7 +89,13 @@ def jumps(outcome: Outcome):
     axes[0, 0].set_yticks(places, outcome.shapes)
     axes[0, len(names) // 2].set_xlabel("largest jump, over the largest force on the path")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
-    return figure
+    settings = outcome.settings
+    caption = (
+        "A jump is what remains of a change after its interval was divided by millions; force and torque together, over the "
+        "largest on the path. Contact that begins gently has an impedance that rises from zero: what still jumps is of the "
+        f"geometry. Smoothing is Gaussian, of {1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
+    )
+    return figure, "Largest jump, by body and path", caption
 
 
 def refinement(outcome: Outcome):
@@ -126,7 +122,12 @@ def refinement(outcome: Outcome):
         right.plot(one.plain.parameters, one.plain.values[:, 2], color=colour, lw=1.3, label=one.shape)
     right.set(xlabel="position, m", title="Force upwards as the body slides past the edge, N")
     right.legend(fontsize=8)
-    return figure
+    caption = (
+        "Bodies that touch by points, each a spring of its own with an equal share of the stiffness. Each point's force jumps "
+        "where its nearest face changes; of a slide along the lattice a whole row does so at once, of one askew one point "
+        "after the other. Paths on which some lattice does not jump, or a single point touches, are left out."
+    )
+    return figure, "A pressure field of ever more points", caption
 
 
 def slopes(outcome: Outcome):
@@ -157,7 +158,13 @@ def slopes(outcome: Outcome):
     _errors(outcome, axes[0, 2])
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5)
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"The body is let go and pushed for 30 ms; the outcome is its height. Noise on the start of {settings.stddev:.1%} of "
+        f"the path, at the place where the box's force jumps. Lines: slopes that {settings.sizes.num_samples} rollouts say, "
+        "and the reference. Right: errors for all bodies, one mark per path."
+    )
+    return figure, "What gradients say across the jump", caption
 
 
 def _errors(outcome: Outcome, axis) -> None:
@@ -191,7 +198,12 @@ def mating(outcome: Outcome):
     axes[0, 0].set_ylabel("held in the hole: force, N")
     axes[1, 0].set_ylabel("let go: depth at the end, mm")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8.5)
-    return figure
+    caption = (
+        f"A peg tilted by {TILT:g} rad, in and above a hole that is wider by 3 mm on each side. Points on the peg meet the "
+        "boxes of the hole, points on the rim the box of the peg; where only one part has points the other's corners meet "
+        "nothing. Grey lines: jumps. That the peg falls through or stays on the rim is real."
+    )
+    return figure, "A peg and a hole", caption
 
 
 _PARTS = ("sideways", "upwards", "torque over half the length")

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 import mjxgrad as mg
 from experiments.artificial_discontinuity.outcome import Mating
 from experiments.artificial_discontinuity.pushes import slopes_at
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.artificial_discontinuity.settings import Settings
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import jumps_along
@@ -35,7 +35,7 @@ _SCENE = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
 <geom class="peg" type="box" size="{width} .01 {length}"/>{points}</body></worldbody></mujoco>"""
 
 
-def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> list[Mating]:
+def measure(settings: Settings, workspace: Workspace) -> list[Mating]:
     """Hold the peg in the hole, and drop it beside it.
 
     Args:
@@ -74,7 +74,7 @@ def _mjcf(label: str) -> str:
     )
 
 
-def _mate(settings: ArtificialDiscontinuitySettings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
+def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
     def forces(offsets: np.ndarray) -> np.ndarray:
         return np.asarray(_forces(scene, jnp.asarray(offsets)))
 

@@ -13,7 +13,7 @@ from experiments.artificial_discontinuity.outcome import Judged, Outcome, Static
 from experiments.artificial_discontinuity.paths import PATHS
 from experiments.artificial_discontinuity.pushes import push_slopes
 from experiments.artificial_discontinuity.reference import overlap_force
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.artificial_discontinuity.settings import Settings
 from experiments.artificial_discontinuity.shapes import HALF, Shape, lattice, shape
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
@@ -30,16 +30,8 @@ _FRICTION = """<mujoco><option gravity="0 0 0" tolerance="1e-10"/><worldbody>
 <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
 
 
-def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> Outcome:
-    """Find the jumps of every body along every path, judge the box's, and estimate slopes across them.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Find the jumps of every body along every path, judge the box's, and estimate slopes across them."""
     sizes = settings.sizes
     bodies = {name: shape(name) for name in sizes.shapes} | {count: lattice(count) for count in sizes.lattices}
     shapes = list(bodies.values())
@@ -67,7 +59,7 @@ def measure(settings: ArtificialDiscontinuitySettings, workspace: Workspace) -> 
     )
 
 
-def _static(settings: ArtificialDiscontinuitySettings, body: Shape, name: str) -> Static:
+def _static(settings: Settings, body: Shape, name: str) -> Static:
     path, count = PATHS[name], settings.sizes.num_points
 
     def poses(parameters: np.ndarray) -> np.ndarray:
@@ -136,7 +128,7 @@ def _overlap(settings, body: Shape, name: str, parameters: np.ndarray) -> Float[
     return overlap_force(PATHS[name].poses(body, settings.depth, parameters))
 
 
-def _judged(settings: ArtificialDiscontinuitySettings, body: Shape, static: Static) -> list[Judged]:
+def _judged(settings: Settings, body: Shape, static: Static) -> list[Judged]:
     """Hold each jump of the box against the reference just beside it, and a penetration depth away."""
     found, jumps, gentle, path = [], static.plain, static.gentle or static.plain, PATHS[static.path]
     away = settings.depth if path.unit == "m" else settings.depth / HALF

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from experiments.artificial_discontinuity.paths import Path
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.artificial_discontinuity.settings import Settings
 from mjxgrad.diagnostics import Jumps
 
 WAYS = ("first order, discrete", "first order, event", "zeroth order")
@@ -166,7 +166,7 @@ class Outcome:
         friction: jumps of the friction on a sliding ball against its speed, and its steepest slope.
     """
 
-    settings: ArtificialDiscontinuitySettings
+    settings: Settings
     paths: dict[str, Path]
     statics: list[Static]
     judged: list[Judged]

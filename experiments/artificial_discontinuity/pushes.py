@@ -12,7 +12,7 @@ from scipy.stats import norm
 import mjxgrad as mg
 from experiments.artificial_discontinuity.outcome import Slopes
 from experiments.artificial_discontinuity.paths import PATHS
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
+from experiments.artificial_discontinuity.settings import Settings
 from experiments.artificial_discontinuity.shapes import Shape
 from experiments.parallel import in_threads
 from mjxgrad.diagnostics import jumps_along
@@ -25,9 +25,7 @@ _SMALLEST = 1e-3
 Simulate = Callable[[np.ndarray, str], tuple[np.ndarray, np.ndarray]]
 
 
-def push_slopes(
-    settings: ArtificialDiscontinuitySettings, body: Shape, places: dict[str, float], index: int
-) -> list[Slopes]:
+def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index: int) -> list[Slopes]:
     """Let a body go where the box's force jumps, and estimate how high it is pushed, by where it was.
 
     Args:
@@ -58,7 +56,7 @@ def push_slopes(
 
 
 def slopes_at(
-    settings: ArtificialDiscontinuitySettings,
+    settings: Settings,
     label: str,
     path: str,
     simulate: Simulate,

@@ -2,36 +2,26 @@
 
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from experiments.bias_variance.outcome import Interval, Outcome
+from experiments.bias_variance.problems import problem, wall_contact
 from experiments.report import Figure
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, power, save, shades, subplots
+from experiments.video import film, shown_speed, with_coarse_shadows
+from experiments.workspace import Workspace
 
 UNIT = "1/s²"
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: choice, landscape, gradient, bias_variance.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {
-        "landscape": ("The cost against the angle of the throw", landscape(outcome)),
-        "gradient": ("Both estimates against the truth", gradient(outcome)),
-        "bias_variance": ("Bias and variance", bias_variance(outcome)),
-        "choice": ("Which estimate is closer", choice(outcome)),
-    }
-    return [Figure(save(drawn, folder, name), title, captions[name]) for name, (title, drawn) in pictures.items()]
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([landscape, gradient, bias_variance, choice], outcome, folder)
 
 
 def landscape(outcome: Outcome):
@@ -39,7 +29,7 @@ def landscape(outcome: Outcome):
     figure, axes = subplots(1, 2, height=4.0, sharey=True)
     shown = (
         (axes[0, 0], outcome.grid, outcome.cost, "Without noise"),
-        (axes[0, 1], outcome.smooth_grid, outcome.smoothed, f"Mean under noise of {outcome.stddev:g} rad"),
+        (axes[0, 1], outcome.smooth_grid, outcome.smoothed, f"Mean under noise of {outcome.settings.stddev:g} rad"),
     )
     for axis, grid, costs, title in shown:
         swept = outcome.swept
@@ -57,7 +47,12 @@ def landscape(outcome: Outcome):
     axes[0, 0].set_ylabel("cost, m²")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", title=f"stiffness, {UNIT}")
-    return figure
+    caption = (
+        "Left, one rollout per angle: where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer "
+        "the wall the sharper. Right, what noise makes of it, and what both estimates are to differentiate. Dotted lines mark "
+        "the angles examined below."
+    )
+    return figure, "The cost against the angle of the throw", caption
 
 
 def gradient(outcome: Outcome):
@@ -74,7 +69,13 @@ def gradient(outcome: Outcome):
         _robust_limits(axis, outcome, j)
     axes[0, 0].set_ylabel("gradient, m²/rad")
     _legend(figure, axes)
-    return figure
+    percent = f"{outcome.settings.confidence:.0%}"
+    default = " The diamond on the dashed line is MuJoCo's default contact." if outcome.has_default else ""
+    caption = (
+        f"Mean of {outcome.settings.num_samples} samples with its {percent} interval, at each angle. The reference comes from "
+        f"rollouts of its own; the grey band is its interval. Intervals that leave a panel are cut.{default}"
+    )
+    return figure, "Both estimates against the truth", caption
 
 
 def bias_variance(outcome: Outcome):
@@ -98,7 +99,14 @@ def bias_variance(outcome: Outcome):
     axes[0, 0].set_ylabel("bias of first order, m²/rad")
     axes[1, 0].set_ylabel("variance of one sample, (m²/rad)²")
     _legend(figure, axes[1:])
-    return figure
+    percent = f"{outcome.settings.confidence:.0%}"
+    default = " The diamond on the dashed line is MuJoCo's default contact." if outcome.has_default else ""
+    caption = (
+        f"Above, the mean of the first-order estimate less the reference, with the {percent} interval of the difference; "
+        "filled where it differs from zero beyond chance over all cases, hollow where it does not. Below, the variance of a "
+        f"single sample, with {percent} bootstrap intervals.{default}"
+    )
+    return figure, "Bias and variance", caption
 
 
 def choice(outcome: Outcome):
@@ -122,11 +130,42 @@ def choice(outcome: Outcome):
     axis.set_xticks(range(len(names)), names)
     axis.set_yticks(range(len(outcome.angles)), [f"{angle:g}" for angle in outcome.angles])
     axis.set(xlabel=f"contact stiffness, {UNIT}", ylabel="angle, rad")
-    axis.set_title(f"Expected error with {outcome.budget} rollouts: first order over zeroth order")
+    axis.set_title(
+        f"Expected error with {outcome.settings.rollouts_per_gradient} rollouts: first order over zeroth order"
+    )
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
     axis.tick_params(length=0)
-    return figure
+    caption = (
+        f"Root of squared bias plus variance over {outcome.settings.rollouts_per_gradient}, of first order divided by that of "
+        "zeroth order: orange, and below 1, where first order is closer to the truth, blue where zeroth order is. A bias "
+        "counts where it is beyond chance (*); † marks the wrong sign."
+    )
+    return figure, "Which estimate is closer", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw the throws that the settings ask for, and give the file and its caption; nothing if there are none."""
+    wanted, task = outcome.settings.video, problem(outcome.settings).task
+    if wanted is None or task is None:
+        return None, ""
+    only_swept = outcome.settings.model_copy(update={"include_default": False})
+    knob = wall_contact(task, np.asarray(wanted.stiffness), only_swept)
+    mj_model = with_coarse_shadows(task.scene.mj_model)
+
+    @jax.jit
+    def throw(softness, angles):
+        thrown = task.with_softness(softness)
+        return jax.vmap(lambda angle: thrown.trajectory(angle[None]).qpos)(angles)
+
+    motions = [
+        (mj_model, qpos)
+        for i in range(len(wanted.stiffness))
+        for qpos in throw(jax.tree.map(lambda leaf, i=i: leaf[i], knob), jnp.asarray(wanted.angles))
+    ]
+    titles = [f"{angle:g} rad, stiffness {power(k)} 1/s²" for k in wanted.stiffness for angle in wanted.angles]
+    caption = f"Throws without noise, by angle (columns) and stiffness of the wall (rows), {shown_speed(wanted.speed)}."
+    return film(workspace, motions, wanted, camera="side", caption=caption, titles=titles, columns=len(wanted.angles))
 
 
 def _panels(outcome: Outcome, *, rows: int, height: float):

@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from experiments.bias_variance.outcome import Interval, Outcome
 from experiments.bias_variance.problems import Problem
-from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.bias_variance.problems import problem as set_up
+from experiments.bias_variance.settings import Settings
 from experiments.failure import ExperimentError
 from experiments.theme import power
 from experiments.workspace import Workspace
@@ -17,20 +18,13 @@ from mjxgrad.diagnostics import BiasVariance, Landscape, bias_variance
 REACH = 4.0
 
 
-def measure(problem: Problem, settings: BiasVarianceSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Estimate at every stiffness and angle, with a progress bar.
-
-    Args:
-        problem: what to differentiate.
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
 
     Raises:
         ExperimentError: if at some stiffness and angle there is no estimate, for hardly any rollout was finite.
     """
+    problem = set_up(settings)
     rows = len(problem.stiffness)
     if problem.task is not None:
         workspace.check(problem.task.scene)
@@ -46,7 +40,13 @@ def measure(problem: Problem, settings: BiasVarianceSettings, workspace: Workspa
             progress=lambda done, _: advance_to(done),
         )
     _refuse_without_estimate(measured, problem)
-    return _outcome(measured, problem, settings)
+    outcome = _outcome(measured, problem, settings)
+    for i in np.flatnonzero(outcome.finite.min(axis=1) < 1):
+        workspace.warnings.append(
+            f"At stiffness {power(problem.stiffness[i])}, {1 - outcome.finite[i].min():.2%} of the rollouts at one angle were "
+            "not finite and were left out, so its means are over the others."
+        )
+    return outcome
 
 
 def _refuse_without_estimate(measured: BiasVariance, problem: Problem) -> None:
@@ -59,7 +59,7 @@ def _refuse_without_estimate(measured: BiasVariance, problem: Problem) -> None:
         )
 
 
-def _outcome(measured: BiasVariance, problem: Problem, settings: BiasVarianceSettings) -> Outcome:
+def _outcome(measured: BiasVariance, problem: Problem, settings: Settings) -> Outcome:
     first, zeroth = measured.first, measured.zeroth
     assert measured.landscape is not None
     smooth_grid, smoothed = _smoothed(measured.landscape, settings.stddev)
@@ -67,10 +67,7 @@ def _outcome(measured: BiasVariance, problem: Problem, settings: BiasVarianceSet
         stiffness=problem.stiffness,
         angles=np.asarray(settings.angles),
         has_default=problem.has_default,
-        stddev=settings.stddev,
-        num_samples=settings.num_samples,
-        confidence=settings.confidence,
-        budget=settings.rollouts_per_gradient,
+        settings=settings,
         first=_interval(first.value, measured.first_interval),
         zeroth=_interval(zeroth.value, measured.zeroth_interval),
         reference=_interval(measured.reference, measured.reference_interval),
@@ -96,22 +93,3 @@ def _smoothed(landscape: Landscape, stddev: float) -> tuple[Float[np.ndarray, " 
     grid = np.linspace(points[0] + REACH * stddev, points[-1] - REACH * stddev, 300)
     weights = np.exp(-0.5 * ((points[:, None] - grid) / stddev) ** 2)
     return grid, costs @ (weights / weights.sum(axis=0))
-
-
-def scene_warnings(problem: Problem, finite: Float[np.ndarray, "stiffness angles"]) -> list[str]:
-    """Say what a reader must know of the scene and of the samples that were left out.
-
-    Args:
-        problem: that was measured.
-        finite: share of samples that could be used.
-
-    Returns:
-        One sentence each.
-    """
-    sentences = []
-    for i in np.flatnonzero(finite.min(axis=1) < 1):
-        sentences.append(
-            f"At stiffness {power(problem.stiffness[i])}, {1 - finite[i].min():.2%} of the rollouts at one angle were "
-            "not finite and were left out, so its means are over the others."
-        )
-    return sentences

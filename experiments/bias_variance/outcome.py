@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
+from experiments.bias_variance.settings import Settings
+
 # A ratio of errors nearer to 1 is a tie: a few hundred samples know their variance no better.
 MARGIN = 1.25
 
@@ -29,10 +31,7 @@ class Outcome:
         stiffness: effective, in 1/s²; of the sweep, ascending, and after it of MuJoCo's default if that was asked for.
         angles: in rad.
         has_default: whether the last row is MuJoCo's default contact, which differs from the sweep in impedance, too.
-        stddev: of the noise, in rad.
-        num_samples: rollouts per estimate.
-        confidence: of the intervals.
-        budget: rollouts per gradient for which a choice is made.
+        settings: of the run.
         first: mean of the first-order estimate.
         zeroth: mean of the zeroth-order estimate.
         reference: the gradient of the smoothed cost.
@@ -50,10 +49,7 @@ class Outcome:
     stiffness: Float[np.ndarray, " stiffness"]
     angles: Float[np.ndarray, " angles"]
     has_default: bool
-    stddev: float
-    num_samples: int
-    confidence: float
-    budget: int
+    settings: Settings
     first: Interval
     zeroth: Interval
     reference: Interval
@@ -79,8 +75,8 @@ class Outcome:
         Of many intervals some miss by chance, so each is widened until all of them hold together as often as one
         is said to (Bonferroni).
         """
-        tail = (1 - self.confidence) / 2 / self.bias.value.size
-        return np.abs(self.bias.value) > stats.t.isf(tail, self.num_samples - 1) * self.bias_error
+        tail = (1 - self.settings.confidence) / 2 / self.bias.value.size
+        return np.abs(self.bias.value) > stats.t.isf(tail, self.settings.num_samples - 1) * self.bias_error
 
     @property
     def has_wrong_sign(self) -> Bool[np.ndarray, "stiffness angles"]:
@@ -93,12 +89,12 @@ class Outcome:
     def first_error(self) -> Cells:
         """Expected error of a first-order estimate within the budget: root of bias² + variance / rollouts."""
         bias = np.where(self.is_biased, self.bias.value, 0.0)
-        return np.sqrt(bias**2 + self.first_variance.value / self.budget)
+        return np.sqrt(bias**2 + self.first_variance.value / self.settings.rollouts_per_gradient)
 
     @property
     def zeroth_error(self) -> Cells:
         """Expected error of a zeroth-order estimate within the budget."""
-        return np.sqrt(self.zeroth_variance.value / self.budget)
+        return np.sqrt(self.zeroth_variance.value / self.settings.rollouts_per_gradient)
 
     @property
     def first_wins(self) -> Bool[np.ndarray, "stiffness angles"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 import mjxgrad as mg
-from experiments.bias_variance.settings import BiasVarianceSettings
+from experiments.bias_variance.settings import Settings
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
 
@@ -41,7 +41,7 @@ class Problem:
     task: BallWall | None = None
 
 
-def problem(settings: BiasVarianceSettings) -> Problem:
+def problem(settings: Settings) -> Problem:
     """Set up what the settings ask for.
 
     Args:
@@ -53,7 +53,7 @@ def problem(settings: BiasVarianceSettings) -> Problem:
     return {"ball_wall": _ball_wall, "ramp": _ramp}[settings.task](settings)
 
 
-def wall_contact(task: BallWall, stiffness: Float[np.ndarray, " rows"], settings: BiasVarianceSettings) -> mg.Softness:
+def wall_contact(task: BallWall, stiffness: Float[np.ndarray, " rows"], settings: Settings) -> mg.Softness:
     """Give the wall each stiffness with its own impedance, and MuJoCo's default contact as one more row."""
     rows = len(stiffness)
     pair = [pair.names for pair in task.scene.pairs].index(WALL_CONTACT[0])
@@ -68,7 +68,7 @@ def wall_contact(task: BallWall, stiffness: Float[np.ndarray, " rows"], settings
     return mg.Softness(stiffness, damping_ratio, impedance, width, pairs=WALL_CONTACT)
 
 
-def _ball_wall(settings: BiasVarianceSettings) -> Problem:
+def _ball_wall(settings: Settings) -> Problem:
     task = ball_wall()
     knob = wall_contact(task, np.sort(settings.stiffness), settings)
     stiffness = np.asarray(knob.stiffness)
@@ -95,7 +95,7 @@ class Ramp(eqx.Module):
         return jnp.clip(self.slope * angle[0], -1, 1) + angle[0] ** 2
 
 
-def _ramp(settings: BiasVarianceSettings) -> Problem:
+def _ramp(settings: Settings) -> Problem:
     slopes = np.sort(np.asarray(settings.stiffness))
 
     def cost(slope: Float[Array, ""], angle: Float[Array, " 1"]) -> Float[Array, ""]:

@@ -4,27 +4,19 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import Finite, Positive, RunSettings, Settings
+from experiments.settings import Finite, Positive, RunSettings, VideoSettings
 
 
-class VideoSettings(Settings):
+class ThrowsSettings(VideoSettings):
     """Rollouts side by side: each of some angles at each of some stiffnesses."""
 
     angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=4)]
     """One column each, in rad."""
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=3)]
     """One row each, in 1/s²."""
-    speed: Positive = 0.25
-    """Simulated over shown time."""
-    fps: Positive = 30.0
-    """Frames per second."""
-    width: Annotated[int, Field(ge=64, le=1920)] = 480
-    """Of one rollout, in pixels."""
-    height: Annotated[int, Field(ge=64, le=1080)] = 270
-    """Of one rollout, in pixels."""
 
 
-class BiasVarianceSettings(RunSettings):
+class Settings(RunSettings):
     """Bias and variance of both estimates against contact stiffness, at several points."""
 
     task: Literal["ball_wall", "ramp"]
@@ -47,4 +39,4 @@ class BiasVarianceSettings(RunSettings):
     """The budget for which the report says which estimate to use."""
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
-    video: VideoSettings | None = None
+    video: ThrowsSettings | None = None

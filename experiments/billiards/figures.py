@@ -1,4 +1,4 @@
-"""The pictures of the experiment on billiards, and their captions."""
+"""The pictures of the experiment on billiards."""
 
 from pathlib import Path
 
@@ -7,53 +7,21 @@ from matplotlib.patches import Circle
 
 from experiments.billiards.outcome import IDLE, Outcome, Run
 from experiments.report import Figure
+from experiments.settings import VideoSettings
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.video import film
+from experiments.workspace import Workspace
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks.files import scene_path
 
 _COLOURS = (FIRST, "#8c6d31", ZEROTH, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6ecf", "#393b79", "#8b94a1")
 _MARKERS = "osD^vP*X<>"
 _RADIUS = 0.2
 
 
-def captions(outcome: Outcome) -> dict[str, str]:
-    """Write the captions.
-
-    Args:
-        outcome: the numbers.
-
-    Returns:
-        By the figure's name.
-    """
-    best, time, speed = outcome.optimum
-    return {
-        "cost": (
-            "Cost without noise and with the contact as it is, along each descent. Solid: the balls do not touch at the start; "
-            f"dashed: they do. Dotted: standing still, and the optimum for hard balls, {best:.6f}. "
-            "Descents that coincide cover each other."
-        ),
-        "strokes": (
-            "From above: the driven ball's way (blue), the knocked ball's (orange), both where they end; the ring is the target. "
-            f"The best stroke with hard balls hits after {time:.3f} s at {speed:.2f} m/s."
-        ),
-        "forces": "Force along the line of the balls that each descent ended with, and the best one for hard balls (black).",
-    }
-
-
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name.
-
-    Returns:
-        The figures in order of reading.
-    """
-    return [
-        Figure(save(cost(outcome), folder, "cost"), "Cost against steps", captions["cost"]),
-        Figure(save(strokes(outcome), folder, "strokes"), "The strokes", captions["strokes"]),
-        Figure(save(forces(outcome), folder, "forces"), "The forces", captions["forces"]),
-    ]
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([cost, strokes, forces], outcome, folder)
 
 
 def cost(outcome: Outcome):
@@ -67,7 +35,13 @@ def cost(outcome: Outcome):
         axis.axhline(level, color=MUTED, lw=1.0, ls=(0, (1, 2)), zorder=0)
     axis.set(xlabel="step", ylabel="cost, m²", ylim=(1.3, 2.5))
     figure.legend(loc="outside lower center", ncols=3, fontsize=8.5)
-    return figure
+    best = outcome.optimum[0]
+    caption = (
+        "Cost without noise and with the contact as it is, along each descent. Solid: the balls do not touch at the start; "
+        f"dashed: they do. Dotted: standing still, and the optimum for hard balls, {best:.6f}. Descents that coincide cover "
+        "each other."
+    )
+    return figure, "Cost against steps", caption
 
 
 def strokes(outcome: Outcome):
@@ -83,7 +57,12 @@ def strokes(outcome: Outcome):
             axis.add_patch(Circle(way[-1], _RADIUS, color=colour, alpha=0.5, lw=0))
         axis.set(title=run.method.label, xlabel="x, m", aspect="equal", xlim=(-2.4, 0.4), ylim=(-2.4, 0.4))
     axes[0, 0].set_ylabel("y, m")
-    return figure
+    _, time, speed = outcome.optimum
+    caption = (
+        "From above: the driven ball's way (blue), the knocked ball's (orange), both where they end; the ring is the target. "
+        f"The best stroke with hard balls hits after {time:.3f} s at {speed:.2f} m/s."
+    )
+    return figure, "The strokes", caption
 
 
 def forces(outcome: Outcome):
@@ -101,7 +80,27 @@ def forces(outcome: Outcome):
     axis.plot([0, end, end, 1], [first, last, 0, 0], color=REFERENCE, lw=1.0)
     axis.set(xlabel="time, s", ylabel="force, N")
     figure.legend(loc="outside lower center", ncols=3, fontsize=8.5)
-    return figure
+    caption = "Force along the line of the balls that each descent ended with, and the best one for hard balls (black)."
+    return figure, "The forces", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw a stroke that stands still and the best one, and give the file and its caption."""
+    mj_model = load_scene(scene_path("billiards")).mj_model
+    # Without a GPU fine shadows double the time of a frame, and coarse ones speckle the table.
+    mj_model.light_castshadow[:] = False
+    apart = [run for run in outcome.runs if not run.has_touched] or list(outcome.runs)
+    chosen = [max(apart, key=lambda run: run.final_cost), min(apart, key=lambda run: run.final_cost)]
+    return film(
+        workspace,
+        [(mj_model, run.qpos) for run in chosen],
+        VideoSettings(speed=0.5, width=400, height=400),
+        camera="above",
+        caption="The strokes that two descents end with, at 0.5 of real speed; the dark disc is the target.",
+        titles=[f"{run.method.label}: {run.final_cost:.3f}" for run in chosen],
+        columns=2,
+        timestep=outcome.timestep,
+    )
 
 
 def _shown(outcome: Outcome) -> list[Run]:

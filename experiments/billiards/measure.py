@@ -12,22 +12,14 @@ from jaxtyping import Array, Float
 import mjxgrad as mg
 from experiments.billiards import hard
 from experiments.billiards.outcome import Outcome, Run
-from experiments.billiards.settings import BilliardsSettings, MethodSettings
+from experiments.billiards.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.billiards import Billiards, billiards
 
 
-def measure(settings: BilliardsSettings, workspace: Workspace) -> Outcome:
-    """Descend by every method.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Descend by every method."""
     task = billiards(num_pieces=settings.num_pieces)
     workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)
@@ -41,7 +33,7 @@ def measure(settings: BilliardsSettings, workspace: Workspace) -> Outcome:
 
 
 def _run(
-    method: MethodSettings, task: Billiards, settings: BilliardsSettings, key: Array, play: Callable[[Array], Array]
+    method: MethodSettings, task: Billiards, settings: Settings, key: Array, play: Callable[[Array], Array]
 ) -> Run:
     every = -(-settings.num_steps // settings.evaluations)
     start = task.start(method.start)
@@ -76,7 +68,7 @@ def _run(
 
 
 def _objective(
-    method: MethodSettings, task: Billiards, settings: BilliardsSettings
+    method: MethodSettings, task: Billiards, settings: Settings
 ) -> Callable[[Float[Array, ""]], mg.Objective]:
     """From the scale of the smoothing to what is minimised at it."""
     own = task.scene.model.pair_margin[0]

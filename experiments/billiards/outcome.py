@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.billiards.settings import BilliardsSettings, MethodSettings
+from experiments.billiards.settings import MethodSettings, Settings
 
 IDLE = 2.0  # m², the cost of standing still
 
@@ -62,7 +62,7 @@ class Outcome:
         timestep: of the scene, in s.
     """
 
-    settings: BilliardsSettings
+    settings: Settings
     optimum: tuple[float, float, float]
     runs: tuple[Run, ...]
     timestep: float

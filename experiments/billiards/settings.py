@@ -4,12 +4,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings, Settings
+from experiments.settings import Positive, RunSettings, SettingsTable
 
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
-class MethodSettings(Settings):
+class MethodSettings(SettingsTable):
     """One way to descend, from one start."""
 
     label: str
@@ -36,7 +36,7 @@ class MethodSettings(Settings):
         return self
 
 
-class BilliardsSettings(RunSettings):
+class Settings(RunSettings):
     """Cost against steps of several descents on the same stroke."""
 
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
@@ -53,7 +53,7 @@ class BilliardsSettings(RunSettings):
     """How often along a descent the true cost is measured."""
 
     @model_validator(mode="after")
-    def _check(self) -> "BilliardsSettings":
+    def _check(self) -> "Settings":
         labels = [method.label for method in self.methods]
         if len(set(labels)) < len(labels):
             raise ValueError("labels of methods must differ")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from experiments.bounce.outcome import Cell, Outcome
-from experiments.bounce.settings import BounceSettings, ImpedanceSettings
+from experiments.bounce.settings import ImpedanceSettings, Settings
 from experiments.motion import ARMS, DISCRETE, at_time_step, motion
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import compare_to_slope, phases
@@ -44,16 +44,8 @@ class _Contacts(eqx.Module):
         ]
 
 
-def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
-    """Compare derivatives with the slope for every contact and time step.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Compare derivatives with the slope for every contact and time step."""
     grid = itertools.product(settings.damping_ratios, settings.time_constants, settings.impedances)
     with workspace.stage("quadrature", "steps", 1):
         cells = [_cell(settings, *point) for point in grid]
@@ -82,7 +74,7 @@ def measure(settings: BounceSettings, workspace: Workspace) -> Outcome:
     )
 
 
-def _cell(settings: BounceSettings, ratio: float, constant: float, impedance: ImpedanceSettings) -> Cell:
+def _cell(settings: Settings, ratio: float, constant: float, impedance: ImpedanceSettings) -> Cell:
     numbers = (impedance.first, impedance.last, impedance.width)
     restitution, duration = integrated_restitution(constant, ratio, numbers, settings.speed)
     is_constant = impedance.first == impedance.last
@@ -90,7 +82,7 @@ def _cell(settings: BounceSettings, ratio: float, constant: float, impedance: Im
     return Cell(ratio, constant, impedance, -restitution, closed, duration)
 
 
-def _contacts(scene: Scene, cells: list[Cell], settings: BounceSettings, timestep: float) -> _Contacts:
+def _contacts(scene: Scene, cells: list[Cell], settings: Settings, timestep: float) -> _Contacts:
     impedances = [(cell.impedance.first, cell.impedance.last, cell.impedance.width, 0.5, 2.0) for cell in cells]
     return _Contacts(
         scene,

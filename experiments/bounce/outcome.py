@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from experiments.bounce.settings import BounceSettings, ImpedanceSettings
+from experiments.bounce.settings import ImpedanceSettings, Settings
 from experiments.motion import DISCRETE
 from mjxgrad.diagnostics import SlopeComparison
 
@@ -45,7 +45,7 @@ class Outcome:
         wide_spread: standard deviation of these over the phases.
     """
 
-    settings: BounceSettings
+    settings: Settings
     cells: list[Cell]
     found: dict[str, list[SlopeComparison]]
     tiny: Float[np.ndarray, "timesteps cells"]

@@ -4,12 +4,12 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings, Settings
+from experiments.settings import Positive, RunSettings, SettingsTable
 
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
-class ImpedanceSettings(Settings):
+class ImpedanceSettings(SettingsTable):
     """The first three numbers of `solimp`."""
 
     first: Share
@@ -27,7 +27,7 @@ class ImpedanceSettings(Settings):
         return f"{self.first:g} to {self.last:g} in {1e3 * self.width:g} mm"
 
 
-class BounceSettings(RunSettings):
+class Settings(RunSettings):
     """Derivatives of a bounce over contact parameters and time steps, with the closed form."""
 
     damping_ratios: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=8)]
@@ -56,7 +56,7 @@ class BounceSettings(RunSettings):
     """Largest time step at which `tolerance` is asked for, in s."""
 
     @model_validator(mode="after")
-    def _check(self) -> "BounceSettings":
+    def _check(self) -> "Settings":
         if list(self.timesteps) != sorted(set(self.timesteps)):
             raise ValueError(f"timesteps must increase, got {list(self.timesteps)}")
         if not self.heights[0] < self.heights[1]:

@@ -1,4 +1,4 @@
-"""The pictures of the experiment on the thrown cube, and their captions."""
+"""The pictures of the experiment on the thrown cube."""
 
 from pathlib import Path
 
@@ -22,45 +22,9 @@ DIFFMJX = (("Euler 1 ms", 17.77, 3.29), ("Euler 30 µs", 0.0277, 102.5), ("Bosh3
 _CONTACTS = {"published": "Force begins continuously (d₀ = 0)", "default": "Force jumps (MuJoCo's default, d₀ = 0.9)"}
 
 
-def captions(outcome: Outcome) -> dict[str, str]:
-    """Write the captions.
-
-    Args:
-        outcome: the numbers, for what they were made with.
-
-    Returns:
-        By the figure's name.
-    """
-    settings = outcome.settings
-    return {
-        "error": (
-            f"Root-mean-square error of a single derivative over {settings.num_throws} throws, as a share of the "
-            "derivative, against processor time of one derivative without compilation. Along a line the time step or the "
-            "tolerance gets smaller to the right. Grey: what DiffMJX published for its own simulator, on other "
-            "hardware and against its own reference. The dotted line is the error that the verdict asks for."
-        ),
-        "bias": (
-            f"Mean error over the throws (thick), and single throws (thin). A mean over {settings.num_throws} throws is "
-            "what noise on the throw would leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
-        ),
-    }
-
-
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name.
-
-    Returns:
-        The figures in order of reading.
-    """
-    return [
-        Figure(save(error(outcome), folder, "error"), "Error against time", captions["error"]),
-        Figure(save(bias(outcome), folder, "bias"), "Bias and spread", captions["bias"]),
-    ]
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([error, bias], outcome, folder)
 
 
 def error(outcome: Outcome):
@@ -93,7 +57,14 @@ def error(outcome: Outcome):
         axis.set(title=_CONTACTS[course.contact], xlabel="processor time of one derivative, s")
     axes[0, 0].set_ylabel("relative error of one derivative")
     _legend(figure, axes[0, 0])
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Root-mean-square error of a single derivative over {settings.num_throws} throws, as a share of the derivative, "
+        "against processor time of one derivative without compilation. Along a line the time step or the tolerance gets "
+        "smaller to the right. Grey: what DiffMJX published for its own simulator, on other hardware and against its own "
+        "reference. The dotted line is the error that the verdict asks for."
+    )
+    return figure, "Error against time", caption
 
 
 def bias(outcome: Outcome):
@@ -116,7 +87,12 @@ def bias(outcome: Outcome):
         axis.set(title=_CONTACTS[course.contact], xlabel="time step, s")
     axes[0, 0].set_ylabel("error of the derivative, relative")
     _legend(figure, axes[0, 0])
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Mean error over the throws (thick), and single throws (thin). A mean over {settings.num_throws} throws is what "
+        "noise on the throw would leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
+    )
+    return figure, "Bias and spread", caption
 
 
 def _finite(course: Course, method: str) -> list[Point]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 import mjxgrad as mg
 from experiments.cube_toss.outcome import Course, Outcome, Point
-from experiments.cube_toss.settings import CubeTossSettings
+from experiments.cube_toss.settings import Settings
 from experiments.failure import ExperimentError
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
@@ -30,15 +30,8 @@ Program = Callable[..., Float[Array, " throws"]]
 _STATE = ("qpos", "qvel", "time", "qacc_warmstart")
 
 
-def measure(settings: CubeTossSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Take the derivative of every throw by every method.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
 
     Raises:
         ExperimentError: if a time step does not divide the throw, or the reference fails.
@@ -65,7 +58,7 @@ def measure(settings: CubeTossSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, tuple(courses))
 
 
-def _jobs(settings: CubeTossSettings) -> list[tuple[str, float]]:
+def _jobs(settings: Settings) -> list[tuple[str, float]]:
     fixed = [(name, h) for name in ("discrete", "event", "continuous") for h in settings.timesteps]
     refined = [("substeps", h) for h in settings.refined_timesteps]
     adaptive = [(name, tol) for name in ("adaptive", "quotient") for tol in settings.tolerances]
@@ -99,7 +92,7 @@ def _point(
     )
 
 
-def _programs(settings: CubeTossSettings) -> dict[str, Program]:
+def _programs(settings: Settings) -> dict[str, Program]:
     """One program per method, whatever the contact and the time step; each takes the throws one after the other."""
 
     def fixed(gradient: str, onset: mg.Onset | None = None):

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.cube_toss.settings import CubeTossSettings
+from experiments.cube_toss.settings import Settings
 
 METHODS = {
     "discrete": "discrete",
@@ -97,7 +97,7 @@ class Outcome:
         courses: one per contact.
     """
 
-    settings: CubeTossSettings
+    settings: Settings
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:

@@ -4,10 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import Positive, RunSettings
+from experiments.settings import Positive, RunSettings
 
 
-class CubeTossSettings(RunSettings):
+class Settings(RunSettings):
     """Error of a derivative against processor time, for time steps and methods."""
 
     contacts: Annotated[tuple[Literal["published", "default"], ...], Field(min_length=1)] = ("published", "default")

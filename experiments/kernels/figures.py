@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.kernels.outcome import TITLES, Outcome
-from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
 COLOURS = {
     "gaussian": FIRST,
@@ -19,22 +18,9 @@ COLOURS = {
 NAMES = TITLES | {"margin": "margin of one length", "impedance": "impedance from 0.2 to 0.9"}
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: profiles, motion.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {
-        "profiles": ("Force at a distance, and the noise that it is", profiles),
-        "motion": ("A ball that meets a plane, smoothed and sampled", motion),
-    }
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([profiles, motion], outcome, folder)
 
 
 def profiles(outcome: Outcome):
@@ -59,7 +45,14 @@ def profiles(outcome: Outcome):
     right.set(xlim=(-3, 3), ylim=(-0.45, 0.75), title="Density of the noise, × length", xlabel="noise / length")
     right.axhline(0, color=MUTED, lw=0.7)
     figure.legend(*near.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8.5)
-    return figure
+    settings = outcome.settings
+    caption = (
+        "Static force of a contact against distance, in units of its slope deep inside and of the length of the noise, "
+        f"{1e3 * settings.length:g} mm; in the middle on a logarithmic scale. Right, the second derivative of the same curves "
+        "over their slope: the density of the noise that they are the mean over, where there is one. A margin is a shift (a "
+        "point mass, drawn as a line). MuJoCo's rising impedance is negative somewhere, and so no density."
+    )
+    return figure, "Force at a distance, and the noise that it is", caption
 
 
 def motion(outcome: Outcome):
@@ -89,4 +82,12 @@ def motion(outcome: Outcome):
     figure.legend(
         *left.get_legend_handles_labels(), loc="outside lower center", ncols=7, columnspacing=1.2, fontsize=8.5
     )
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"A ball thrown at a plane with {settings.speed:g} m/s. Lines: one rollout of the smoothed solver. Dots: mean over "
+        f"{settings.num_rollouts} rollouts of MuJoCo's own contact whose distance is shifted by other noise in each step, "
+        "with bars of two standard errors. Right, the derivative: lines by automatic differentiation of the smoothed rollout, "
+        "dots by differences of the sampled mean. Dashed, MuJoCo's contact without noise and the exact derivative of its "
+        "simulated map, which does not see that the time of impact moves."
+    )
+    return figure, "A ball that meets a plane, smoothed and sampled", caption

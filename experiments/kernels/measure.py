@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.kernels.outcome import Linear, Motion, Outcome, Profile
-from experiments.kernels.settings import KernelsSettings
+from experiments.kernels.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics.equivalent_noise import contact_profile, probe
 from mjxgrad.dynamics.kernels import KERNELS
@@ -23,16 +23,8 @@ _SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" t
 _LITTLE = 1e-3
 
 
-def measure(settings: KernelsSettings, workspace: Workspace) -> Outcome:
-    """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise."""
     scene = _scene(settings, settings.impedance, settings.impedance)
     workspace.check(scene, speed=settings.speed)
     profiles = _profiles(settings)
@@ -49,14 +41,14 @@ def measure(settings: KernelsSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, profiles, time, hard, hard_slope, motions, linear)
 
 
-def _scene(settings: KernelsSettings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
+def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
     text = _SCENE.format(
         timestep=settings.timestep, time_constant=settings.time_constant, first=first, last=last, margin=margin
     )
     return mg.load_scene(text)
 
 
-def _profiles(settings: KernelsSettings) -> list[Profile]:
+def _profiles(settings: Settings) -> list[Profile]:
     """Probe each kernel on a constant impedance, and what MuJoCo has of its own."""
     plain = _scene(settings, 0.9, 0.9)
     cases = {name: contact_profile(plain, smoothing=mg.Smoothing(settings.length, name)) for name in settings.kernels}
@@ -100,7 +92,7 @@ def _heights(scene, smoothing, start, speed, noise):
     return jnp.concatenate([start[None], heights])
 
 
-def _smoothed_motion(scene, settings: KernelsSettings, smoothing) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed_motion(scene, settings: Settings, smoothing) -> tuple[np.ndarray, np.ndarray]:
     noise = jnp.zeros(settings.horizon)
 
     def heights(start: Float[Array, ""]) -> Float[Array, " steps"]:
@@ -110,7 +102,7 @@ def _smoothed_motion(scene, settings: KernelsSettings, smoothing) -> tuple[np.nd
     return np.asarray(height), np.asarray(slope)
 
 
-def _sampled_motion(scene, settings: KernelsSettings, name: str, key: Array) -> list[np.ndarray]:
+def _sampled_motion(scene, settings: Settings, name: str, key: Array) -> list[np.ndarray]:
     """Average rollouts whose contact has other noise in each step, from three start heights with the same noise."""
     noise = settings.length * _draw(name, key, (settings.num_rollouts, settings.horizon))
     width = 0.25 * settings.length
@@ -152,7 +144,7 @@ def _samples(scene, point, noise, score):
     return jax.vmap(sample)(noise, score)
 
 
-def _linear(scene, settings: KernelsSettings, name: str, velocity: float, key: Array) -> Linear:
+def _linear(scene, settings: Settings, name: str, velocity: float, key: Array) -> Linear:
     """Differentiate the velocity after one step, half a length above the plane, in three ways."""
     smoothing, length = mg.Smoothing(settings.length, name), settings.length
     point = jnp.array([0.5 * length, velocity, 0.0])

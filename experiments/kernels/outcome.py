@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from experiments.kernels.settings import KernelsSettings
+from experiments.kernels.settings import Settings
 from mjxgrad.diagnostics.equivalent_noise import EquivalentNoise
 
 TITLES = {"gaussian": "Gaussian", "logistic": "logistic", "log_barrier": "log barrier"}
@@ -88,7 +88,7 @@ class Outcome:
         linear: by kernel, at rest and approaching.
     """
 
-    settings: KernelsSettings
+    settings: Settings
     profiles: list[Profile]
     time: Float[np.ndarray, " steps"]
     hard: Float[np.ndarray, " steps"]

@@ -4,12 +4,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings
+from experiments.settings import Positive, RunSettings
 
 KernelName = Literal["gaussian", "logistic", "log_barrier"]
 
 
-class KernelsSettings(RunSettings):
+class Settings(RunSettings):
     """Force at a distance, the noise it stands for, and motion and derivatives against samples of that noise."""
 
     kernels: Annotated[tuple[KernelName, ...], Field(min_length=1, max_length=3)]
@@ -34,7 +34,7 @@ class KernelsSettings(RunSettings):
     """Of single steps."""
 
     @model_validator(mode="after")
-    def _check(self) -> "KernelsSettings":
+    def _check(self) -> "Settings":
         if len(set(self.kernels)) < len(self.kernels):
             raise ValueError(f"kernels must differ, got {', '.join(self.kernels)}")
         if self.timestep > 0.25 * self.time_constant:

@@ -7,13 +7,13 @@ import numpy as np
 import mjxgrad as mg
 from experiments.long_horizon.outcome import Adaptive
 from experiments.long_horizon.problems import Problem, vector
-from experiments.long_horizon.settings import LongHorizonSettings
+from experiments.long_horizon.settings import Settings
 
 _TOLERANCE = 1e-10
 _AWAY = 1e-5  # rad and rad/s, half width of differences: far above the tolerance, whatever it grows to
 
 
-def adaptive(settings: LongHorizonSettings, pendulum: Problem) -> Adaptive:
+def adaptive(settings: Settings, pendulum: Problem) -> Adaptive:
     """Integrate the pendulum without noise, and its neighbours.
 
     Args:

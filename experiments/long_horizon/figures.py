@@ -6,32 +6,18 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 from experiments.long_horizon.outcome import ZEROTH, Errors, Outcome
-from experiments.pictures import drawn
 from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, save, subplots
 from experiments.theme import ZEROTH as BLUE
+from experiments.words import capitalised
 
 _EVENT, _ONSET = "#cc79a7", "#009e73"
 COLOURS = {"first order, discrete": FIRST, "first order, event": _EVENT, "first order, onset": _ONSET, ZEROTH: BLUE}
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: errors, growth, windows.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {
-        "errors": ("Error, bias and variance against the horizon", errors),
-        "growth": ("Why: the product of the Jacobians", growth),
-        "windows": ("Windows, plain and with a value function", windows),
-    }
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([errors, growth, windows], outcome, folder)
 
 
 def errors(outcome: Outcome):
@@ -50,13 +36,20 @@ def errors(outcome: Outcome):
                 high = min(crossing.high, one.times[-1])
                 upper.axvspan(crossing.low, high, color=COLOURS[label], alpha=0.12, lw=0)
                 upper.axvline(crossing.horizon, color=COLOURS[label], lw=0.9, ls=(0, (2, 2)))
-        upper.set(yscale="log", title=one.title[:1].upper() + one.title[1:])
+        upper.set(yscale="log", title=capitalised(one.title))
         lower.set(yscale="log", xlabel="horizon, s")
     axes[0, 0].set_ylabel("error over the largest gradient")
     axes[1, 0].set_ylabel("variance of one sample, m²")
     handles, labels = axes[0, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8.5)
-    return figure
+    sizes, confidence = outcome.settings.sizes, outcome.settings.confidence
+    caption = (
+        f"Gradient of the mean cost at the horizon by the policy's noisy parameters, from {sizes.num_samples} rollouts. "
+        f"Lines: root mean squared error over {sizes.num_repeats} repeats, over the largest gradient of all horizons; bands: "
+        f"{confidence:.0%}. Circles: bias, where it is beyond chance. Dashed: horizon from which on zeroth order is as good, "
+        "with its interval. Below: variance of one rollout's gradient, summed over parameters."
+    )
+    return figure, "Error, bias and variance against the horizon", caption
 
 
 def _draw_bias(axis, times: np.ndarray, each: Errors, colour: str) -> None:
@@ -77,7 +70,7 @@ def growth(outcome: Outcome):
             axis.plot(
                 one.times, logs + shift, color=COLOURS[each.label], lw=1.2, label=f"√variance, {each.label}, shifted"
             )
-        axis.set(title=one.title[:1].upper() + one.title[1:], xlabel="time, s")
+        axis.set(title=capitalised(one.title), xlabel="time, s")
         axis.legend(fontsize=7.5)
     axes[0, 0].set_ylabel("logarithm")
     last = axes[0, -1]
@@ -86,15 +79,26 @@ def growth(outcome: Outcome):
         for one in outcome.found.values():
             last.plot(one.times, one.exponents, lw=1.2)
         last.set(title="Finite-time Lyapunov exponents, 1/s", xlabel="time, s")
-        return figure
-    last.plot(adaptive.times, adaptive.stepped, color=REFERENCE, label="steps: largest singular value")
-    last.plot(adaptive.times, adaptive.log_largest, "o", color=BLUE, ms=4, label="error control: the same")
-    last.plot(
-        adaptive.times, np.log(adaptive.apart), "s-", color=FIRST, ms=3, lw=1, label="steps less error control, over it"
+    else:
+        last.plot(adaptive.times, adaptive.stepped, color=REFERENCE, label="steps: largest singular value")
+        last.plot(adaptive.times, adaptive.log_largest, "o", color=BLUE, ms=4, label="error control: the same")
+        last.plot(
+            adaptive.times,
+            np.log(adaptive.apart),
+            "s-",
+            color=FIRST,
+            ms=3,
+            lw=1,
+            label="steps less error control, over it",
+        )
+        last.set(title="The pendulum's steps and its motion", xlabel="time, s")
+        last.legend(fontsize=7.5)
+    caption = (
+        "Grey: logarithm of the largest singular value of the product of all steps' Jacobians, rollout by rollout; black, its "
+        "median. Half the logarithm of the estimate's variance runs along with it. With the pendulum, both are held against "
+        "integration with error control: where the steps' distance from it nears one the steps are another motion."
     )
-    last.set(title="The pendulum's steps and its motion", xlabel="time, s")
-    last.legend(fontsize=7.5)
-    return figure
+    return figure, "Why: the product of the Jacobians", caption
 
 
 def windows(outcome: Outcome):
@@ -114,12 +118,15 @@ def windows(outcome: Outcome):
         error, low, high = next(iter(one.windows.values())).zeroth
         axis.axhline(error, color=BLUE, lw=1.2, label=ZEROTH)
         axis.axhspan(low, high, color=BLUE, alpha=0.12, lw=0)
-        axis.set(
-            xscale="log", yscale="log", title=one.title[:1].upper() + one.title[1:], xlabel="length of a window, s"
-        )
+        axis.set(xscale="log", yscale="log", title=capitalised(one.title), xlabel="length of a window, s")
         axis.set_xticks(length, [f"{seconds:.2g}" for seconds in length])
         axis.xaxis.set_minor_locator(NullLocator())
     axes[0, 0].set_ylabel("error over the gradient")
     handles, labels = axes[0, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8.5)
-    return figure
+    caption = (
+        "Gradient of the cost's mean over the whole horizon, when derivatives are cut after a window: plain, and with the "
+        "value of what comes after, fitted by a quadratic. Circles: bias beyond chance. The rightmost window is the whole "
+        "horizon. A short window has bias in place of variance."
+    )
+    return figure, "Windows, plain and with a value function", caption

@@ -1,7 +1,5 @@
 """From settings to numbers."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,7 @@ from experiments.long_horizon.adaptive import adaptive
 from experiments.long_horizon.estimates import reference_gradient, zeroth
 from experiments.long_horizon.outcome import BEYOND_CHANCE, ZEROTH, Errors, Found, Outcome, Windows
 from experiments.long_horizon.problems import Problem, problem
-from experiments.long_horizon.settings import LongHorizonSettings, Sizes
+from experiments.long_horizon.settings import Settings, Sizes
 from experiments.long_horizon.windows import cut
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
@@ -33,16 +31,8 @@ class Rollouts(eqx.Module):
     tangents: Float[np.ndarray, "samples times n dim"] | None
 
 
-def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
-    """Measure every problem.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Measure every problem."""
     found, reference = {}, None
     for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)
@@ -55,7 +45,7 @@ def measure(settings: LongHorizonSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, found, reference)
 
 
-def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generator, workspace: Workspace) -> Found:
+def _measure(settings: Settings, one: Problem, rng: np.random.Generator, workspace: Workspace) -> Found:
     sizes, dim = settings.sizes, len(one.params)
     whole, count, batch = sizes.num_times, sizes.num_repeats * sizes.num_samples, sizes.batch
     noise = one.stddev * rng.normal(size=(count, dim))
@@ -75,7 +65,7 @@ def _measure(settings: LongHorizonSettings, one: Problem, rng: np.random.Generat
     first = dict(zip(labels, found, strict=True))
     # What diverged is left out of all estimates alike, and the report says how much that was.
     is_finite = np.all([np.isfinite(slopes).all(axis=(1, 2)) for _, slopes in first.values()], axis=0)
-    sizes = dataclasses.replace(sizes, num_samples=int(is_finite.sum()) // sizes.num_repeats)
+    sizes = sizes.model_copy(update={"num_samples": int(is_finite.sum()) // sizes.num_repeats})
     kept = np.flatnonzero(is_finite)[: sizes.num_repeats * sizes.num_samples]
     noise = noise[kept]
     first = {label: (_chosen(rollouts, kept), slopes[kept]) for label, (rollouts, slopes) in first.items()}
@@ -181,7 +171,7 @@ def _costs(one: Problem, rollouts: Rollouts) -> tuple[np.ndarray, Float[np.ndarr
 
 
 def _errors(
-    settings: LongHorizonSettings,
+    settings: Settings,
     sizes: Sizes,
     label: str,
     samples: np.ndarray,

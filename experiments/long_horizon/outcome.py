@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from experiments.long_horizon.settings import LongHorizonSettings
+from experiments.long_horizon.settings import Settings
 from mjxgrad.diagnostics import Crossover
 
 ZEROTH = "zeroth order"
@@ -124,7 +124,7 @@ class Outcome:
         adaptive: of the pendulum; None without it.
     """
 
-    settings: LongHorizonSettings
+    settings: Settings
     found: dict[str, Found]
     adaptive: Adaptive | None
 

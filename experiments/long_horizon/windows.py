@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from experiments.long_horizon.estimates import reference_gradient, zeroth
 from experiments.long_horizon.outcome import BEYOND_CHANCE, Windows
 from experiments.long_horizon.problems import Problem
-from experiments.long_horizon.settings import LongHorizonSettings, Sizes
+from experiments.long_horizon.settings import Settings, Sizes
 from mjxgrad.diagnostics import root_mean_square_interval
 
 # Of the features' own squares. Noisy parameters are few, so the states lie close to a surface, and across it a fit knows no
@@ -18,9 +18,7 @@ from mjxgrad.diagnostics import root_mean_square_interval
 _RIDGE = 1e-2
 
 
-def cut(
-    settings: LongHorizonSettings, sizes: Sizes, one: Problem, again: Callable[[int], np.ndarray], many, own
-) -> Windows:
+def cut(settings: Settings, sizes: Sizes, one: Problem, again: Callable[[int], np.ndarray], many, own) -> Windows:
     """Estimate the gradient of the mean cost over the whole horizon from windows of every length.
 
     A window charges the costs in it, and at its end the fitted value of the costs to come; the next one starts from the same
@@ -71,7 +69,7 @@ def cut(
 
 
 def _error(
-    settings: LongHorizonSettings,
+    settings: Settings,
     sizes: Sizes,
     samples: np.ndarray,
     reference: np.ndarray,

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
-from experiments.pictures import drawn
-from experiments.report import Figure, quantity
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, subplots
+from experiments.report import Figure
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
+from experiments.words import quantity
 
 # One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
 _COLOURS = {
@@ -46,24 +46,10 @@ _SENTENCES = {
 _DARK = ("inconsistent", "not_finite")
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: final, curves, alpha.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {
-        "final": ("Where each method ends, and how far off one estimate is", final),
-        "curves": ("Cost against rollouts and against time", curves),
-    }
-    if any(run.reasons for run in outcome.runs):
-        pictures["alpha"] = ("The weight of the first-order part", alpha)
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    has_alpha = any(run.reasons for run in outcome.runs)
+    return save([final, curves, alpha] if has_alpha else [final, curves], outcome, folder)
 
 
 def final(outcome: Outcome):
@@ -108,7 +94,21 @@ def final(outcome: Outcome):
         _log_scale(axes[0, 1], "x")
         axes[0, 1].set(title="Relative error of one estimate at the start", xlabel="error / norm of the gradient")
     _mark_ours(left, outcome.runs)
-    return figure
+    settings = outcome.settings
+    percent = f"{settings.confidence:.0%}"
+    published = "; diamonds are published means ± standard deviations" if outcome.reference else ""
+    errors = (
+        " Right, distance of one estimate at the start to the gradient, over its norm: root mean square of "
+        f"{settings.error_repeats} estimates of {outcome.num_samples} rollouts, with its {percent} interval; the gradient is "
+        f"an unbiased estimate from {settings.reference_samples} rollouts."
+        if outcome.errors is not None
+        else ""
+    )
+    caption = (
+        f"Left, dots are seeds, bars the means with their {percent} intervals{published}. An arrow stands for a mean ± "
+        f"standard deviation beyond the panel.{errors}"
+    )
+    return figure, "Where each method ends, and how far off one estimate is", caption
 
 
 def curves(outcome: Outcome):
@@ -135,7 +135,14 @@ def curves(outcome: Outcome):
     for axis in axes.flat:
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
         axis.yaxis.set_minor_formatter(NullFormatter())
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Lines are medians over {settings.seeds} seeds, bands reach from the lowest to the highest. The axis is the cost "
+        "above the lowest that any run has met, so a line that ends low on the logarithmic scale is as good as the best; "
+        "below, what one would otherwise use, with α-order for comparison. Both columns are of the same runs; the seconds "
+        "include the measurement of the noise-free cost, which is no rollout of the method."
+    )
+    return figure, "Cost against rollouts and against time", caption
 
 
 def alpha(outcome: Outcome):
@@ -165,7 +172,11 @@ def alpha(outcome: Outcome):
     right.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
     right.grid(visible=False, axis="y")
     right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
-    return figure
+    caption = (
+        "Left, the weight of the first-order part, the mean over seeds and over a fiftieth of the steps; where there are "
+        "several blocks, over these, too. Right, how often each reason settled it."
+    )
+    return figure, "The weight of the first-order part", caption
 
 
 def _descents(outcome: Outcome) -> list[Run]:

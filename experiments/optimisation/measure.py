@@ -7,23 +7,15 @@ import numpy as np
 import mjxgrad as mg
 from experiments.optimisation.methods import estimator, problem, runner, scene
 from experiments.optimisation.outcome import Outcome, Run
-from experiments.optimisation.settings import MethodSettings, OptimisationSettings
+from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import Reason
 from mjxgrad.tasks.published import Published
 
 
-def measure(settings: OptimisationSettings, workspace: Workspace) -> Outcome:
-    """Run every method from every seed, and estimate the gradient at the start many times.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Run every method from every seed, and estimate the gradient at the start many times."""
     task = problem(settings)
     if (simulated := scene(settings)) is not None:
         workspace.check(simulated)
@@ -47,7 +39,7 @@ def measure(settings: OptimisationSettings, workspace: Workspace) -> Outcome:
     )
 
 
-def _run(method: MethodSettings, task: Published, settings: OptimisationSettings, key: jax.Array) -> Run:
+def _run(method: MethodSettings, task: Published, settings: Settings, key: jax.Array) -> Run:
     every = -(-task.num_steps // settings.evaluations)
     keys = jax.random.split(key, settings.seeds)
     result = runner(method, task, key)(keys, evaluate=task.final_cost, evaluate_every=every)
@@ -87,7 +79,7 @@ def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     return {name: where for name, where in found.items() if where.any()}
 
 
-def _errors(task: Published, settings: OptimisationSettings, key: jax.Array, workspace: Workspace) -> Comparison | None:
+def _errors(task: Published, settings: Settings, key: jax.Array, workspace: Workspace) -> Comparison | None:
     named = {one.label: estimator(one, task) for one in settings.methods if not one.is_search}
     if not named:
         return None

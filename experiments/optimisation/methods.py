@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Key
 
 import mjxgrad as mg
-from experiments.optimisation.settings import MethodSettings, OptimisationSettings
+from experiments.optimisation.settings import MethodSettings, Settings
 from mjxgrad.diagnostics import Rollouts
 from mjxgrad.diagnostics.budget import affordable
 from mjxgrad.estimators import GradientEstimate, rules
@@ -27,7 +27,7 @@ _SCENES = {
 }
 
 
-def problem(settings: OptimisationSettings) -> Published:
+def problem(settings: Settings) -> Published:
     """Set up the task, with the run's own settings in place of the published ones where they are given.
 
     Args:
@@ -41,7 +41,7 @@ def problem(settings: OptimisationSettings) -> Published:
     return dataclasses.replace(found, **chosen, reference={}) if chosen else found
 
 
-def scene(settings: OptimisationSettings) -> mg.Scene | None:
+def scene(settings: Settings) -> mg.Scene | None:
     """Give the scene of the task; None under the published equations, which have none.
 
     Args:

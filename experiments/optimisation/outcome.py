@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from experiments.optimisation.settings import MethodSettings, OptimisationSettings
+from experiments.optimisation.settings import MethodSettings, Settings
 from mjxgrad.diagnostics import Comparison, bias_interval, mean_interval
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
@@ -156,7 +156,7 @@ class Outcome:
         errors: of one estimate at the start, of the methods that estimate; None if it was not measured.
     """
 
-    settings: OptimisationSettings
+    settings: Settings
     num_samples: int
     num_steps: int
     dim: int

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings, Settings
+from experiments.settings import Positive, RunSettings, SettingsTable
 
 Count = Annotated[int, Field(ge=2)]
 
@@ -16,7 +16,7 @@ SEARCHES = ("cross_entropy", "mppi", "predictive_sampling")
 _NAMES = {"mppi": "MPPI", "reinforce": "REINFORCE", "cross_entropy": "cross-entropy", "alpha_order": "α-order"}
 
 
-class MethodSettings(Settings):
+class MethodSettings(SettingsTable):
     """One method, with what is set of its options: an estimator for gradient descent, or a search."""
 
     name: Literal[
@@ -87,7 +87,7 @@ class MethodSettings(Settings):
         return name + (f" ({', '.join(parts)})" if parts else "")
 
 
-class OptimisationSettings(RunSettings):
+class Settings(RunSettings):
     """A published task, optimised by several methods from the same start at equal rollouts, over many seeds."""
 
     task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"]
@@ -114,7 +114,7 @@ class OptimisationSettings(RunSettings):
     """Of every interval."""
 
     @model_validator(mode="after")
-    def _check(self) -> "OptimisationSettings":
+    def _check(self) -> "Settings":
         labels = [method.label for method in self.methods]
         if repeated := {label for label in labels if labels.count(label) > 1}:
             raise ValueError(f"methods must differ, got {', '.join(sorted(repeated))} more than once")

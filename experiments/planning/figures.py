@@ -1,17 +1,21 @@
 """The pictures of a planning experiment."""
 
+import copy
 import itertools
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 
-from experiments.pictures import drawn
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+from experiments.video import film, shown_speed
+from experiments.workspace import Workspace
+from mjxgrad.tasks.planar_pusher import planar_pusher
 
 _COLOURS = {"analytic": ZEROTH, "mean_jacobian": FIRST, "least_squares": "#009e73", "none": DEFAULT}
 _HALF_LENGTH, _RADIUS = 0.1, 0.02  # m, of the rod's axis; of rod and finger
@@ -19,23 +23,9 @@ _EVERY = 3  # decisions between the poses drawn
 _DECISION = 0.1  # s
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the plans.
-        folder: of the run.
-        captions: of the figures, by name.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {"plane": ("The plan, seen from above", plane), "pose": ("Where the rod is", pose)}
-    if outcome.settings.method == "trajectory":
-        pictures = {"cost": ("Cost against iterations", cost)} | pictures
-    else:
-        pictures = {"tree": ("The tree", tree)} | pictures
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([cost if outcome.settings.method == "trajectory" else tree, plane, pose], outcome, folder)
 
 
 def cost(outcome: Outcome):
@@ -54,7 +44,12 @@ def cost(outcome: Outcome):
     left.legend(loc="center right")
     right.set_yscale("log")
     right.set(title="Smoothing length in mm", xlabel="iteration")
-    return figure
+    caption = (
+        "Left, the cost of the scene itself under the controls of each iteration (thick), and of the smoothed scene that the "
+        "iteration works on (thin). Right, the smoothing length. Both costs meet as the smoothing vanishes; a cost that rises "
+        "on the way is a plan whose contact existed in the smoothed scene alone. The best controls of all are kept."
+    )
+    return figure, "Cost against iterations", caption
 
 
 def tree(outcome: Outcome):
@@ -87,7 +82,13 @@ def tree(outcome: Outcome):
     right.set_yscale("log")
     right.set(title="Nearest to the goal, in tolerances", xlabel="nodes")
     right.legend(loc="upper right")
-    return figure
+    settings = outcome.settings
+    caption = (
+        "Left, where the rod is in every node, joined to its parent; thick, the way that was found. Right, the nearest that "
+        f"the tree has come to the goal, in units of the tolerance, against its nodes, for {settings.tree.num_seeds} seeds of "
+        "each kind of linear model; below the dotted line it is solved."
+    )
+    return figure, "The tree", caption
 
 
 def plane(outcome: Outcome):
@@ -107,7 +108,11 @@ def plane(outcome: Outcome):
         axis.set(title=f"{part[0] * _DECISION:.1f} to {part[-1] * _DECISION:.1f} s", xlabel="x in m", aspect="equal")
     axes[0, 0].set_ylabel("y in m")
     axes[0, 0].autoscale_view()
-    return figure
+    caption = (
+        "Rod and finger every 0.3 s and at the end, from light to dark; the dashed outline is the goal, the ring where the "
+        "finger starts."
+    )
+    return figure, "The plan, seen from above", caption
 
 
 def pose(outcome: Outcome):
@@ -120,7 +125,24 @@ def pose(outcome: Outcome):
         axis.plot(time, best.states[:, 2 + i], color=_COLOURS[best.model])
         axis.set(title=title, xlabel="time in s")
         axis.margins(y=0.15)
-    return figure
+    caption = "The rod under the plan that was kept, every decision; dashed, the goal."
+    return figure, "Where the rod is", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw the best plan with the goal as a shade, and give the file and its caption; nothing if none was asked for."""
+    wanted = outcome.settings.video
+    if wanted is None:
+        return None, ""
+    mj_model = copy.copy(planar_pusher().system.scene.mj_model)
+    target = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, "target")
+    x, y, turn = outcome.goal
+    mj_model.body_pos[target] = [x, y, mj_model.body_pos[target, 2]]
+    mj_model.body_quat[target] = [np.cos(turn / 2), 0, 0, np.sin(turn / 2)]
+    still = np.repeat(outcome.shown[-1:], int(1 / outcome.timestep * wanted.speed), axis=0)
+    motion = mj_model, np.concatenate([outcome.shown, still])
+    caption = f"The plan on the scene itself, {shown_speed(wanted.speed)}; the goal in a light shade."
+    return film(workspace, [motion], wanted, camera="above", caption=caption, timestep=outcome.timestep)
 
 
 def _stages(attempt: Attempt, shown: list[int], most: int = 9) -> list[list[int]]:

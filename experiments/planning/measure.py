@@ -9,7 +9,7 @@ import numpy as np
 
 import mjxgrad as mg
 from experiments.planning.outcome import Attempt, Outcome
-from experiments.planning.settings import PlanningSettings
+from experiments.planning.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import (
@@ -33,16 +33,8 @@ _STAGE, _TERMINAL = 0.3, 100.0
 _RANGE = (0.3, 0.3, 0.25, 0.25, 3.3)
 
 
-def measure(settings: PlanningSettings, workspace: Workspace) -> Outcome:
-    """Plan in every way that is asked for.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The plans.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Plan in every way that is asked for."""
     task = planar_pusher(finger=settings.finger, goal=settings.goal)
     workspace.check(task.system.scene)
     attempts, polished = [], None
@@ -66,7 +58,7 @@ def measure(settings: PlanningSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, attempts, polished, shown, timestep)
 
 
-def _smoother(model: str, settings: PlanningSettings, length: float) -> Smoother:
+def _smoother(model: str, settings: Settings, length: float) -> Smoother:
     """Give the linear models; sampled ones have noise of the same length on positions, less on velocities."""
     if model == "none":
         return Exact()
@@ -77,12 +69,12 @@ def _smoother(model: str, settings: PlanningSettings, length: float) -> Smoother
     return Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
 
 
-def _cost(task: PlanarPusher, settings: PlanningSettings) -> GoalCost:
+def _cost(task: PlanarPusher, settings: Settings) -> GoalCost:
     weight = jnp.array(_ROD)
     return GoalCost(task.goal, _STAGE * weight, _TERMINAL * weight, settings.control_weight)
 
 
-def _trajectory(task: PlanarPusher, settings: PlanningSettings, model: str):
+def _trajectory(task: PlanarPusher, settings: Settings, model: str):
     """Give the function that optimises a trajectory from resting controls."""
     count = settings.num_iterations
     last = settings.last_length / settings.length
@@ -98,7 +90,7 @@ def _trajectory(task: PlanarPusher, settings: PlanningSettings, model: str):
     return run
 
 
-def _polish(task: PlanarPusher, settings: PlanningSettings, way: Attempt) -> Attempt:
+def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
     """Optimise a way that was found."""
     begin, length = time.perf_counter(), settings.tree.polish_length
     schedule = np.geomspace(1, min(1, settings.last_length / length), settings.tree.polish_iterations)
@@ -110,7 +102,7 @@ def _polish(task: PlanarPusher, settings: PlanningSettings, way: Attempt) -> Att
 @eqx.filter_jit
 def _optimised(
     task: PlanarPusher,
-    settings: PlanningSettings,
+    settings: Settings,
     controls: jax.Array,
     smoother: Smoother,
     schedule: np.ndarray,
@@ -141,7 +133,7 @@ def _planned(plan: Plan, model: str, seed: int, seconds: float, length: float) -
     return Attempt(model, seed, seconds, np.asarray(plan.states), np.asarray(plan.controls), course)
 
 
-def _tree(task: PlanarPusher, settings: PlanningSettings, model: str):
+def _tree(task: PlanarPusher, settings: Settings, model: str):
     """Give the function that grows a tree from a seed; all seeds share one program."""
     tree, width = settings.tree, jnp.array(_RANGE)
     free = [np.inf] * 2

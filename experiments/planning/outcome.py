@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.planning.settings import NAMES, PlanningSettings
+from experiments.planning.settings import NAMES, Settings
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Outcome:
         timestep: between these (s).
     """
 
-    settings: PlanningSettings
+    settings: Settings
     attempts: list[Attempt]
     polished: Attempt | None
     shown: Float[np.ndarray, "steps 5"]

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Finite, Positive, RunSettings, Settings
+from experiments.settings import Finite, Positive, RunSettings, SettingsTable, VideoSettings
 
 Count = Annotated[int, Field(ge=1)]
 
@@ -16,20 +16,7 @@ NAMES = {
 }
 
 
-class VideoSettings(Settings):
-    """A video of what was found."""
-
-    speed: Positive = 0.5
-    """Shown over simulated time's inverse: 0.5 is half as fast as real."""
-    fps: Positive = 25.0
-    """Frames per second."""
-    width: Count = 640
-    """In pixels."""
-    height: Count = 480
-    """In pixels."""
-
-
-class TreeSettings(Settings):
+class TreeSettings(SettingsTable):
     """How a tree is grown."""
 
     capacity: Annotated[int, Field(ge=200)] = 4000
@@ -53,7 +40,7 @@ class TreeSettings(Settings):
     """Smoothing at which these begin (m)."""
 
 
-class PlanningSettings(RunSettings):
+class Settings(RunSettings):
     """A rod is pushed to a pose by a finger that does not touch it at the start."""
 
     method: Literal["trajectory", "tree"]
@@ -87,7 +74,7 @@ class PlanningSettings(RunSettings):
     """Without it, none is made."""
 
     @model_validator(mode="after")
-    def _check(self) -> "PlanningSettings":
+    def _check(self) -> "Settings":
         if len(set(self.models)) < len(self.models):
             raise ValueError("models must differ from each other")
         if self.last_length > self.length:

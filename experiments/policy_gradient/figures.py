@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Course, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Outcome
 from experiments.report import Figure
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
 
@@ -14,32 +14,20 @@ _MARKERS = {DISCRETE: "o", ONSET: "s"}
 _SMALLEST = 1e-3
 _OBSERVED = ("thigh", "leg", "foot", "thigh's speed", "leg's speed", "foot's speed", "offset")
 _MOTORS = ("thigh", "leg", "foot")
+_THROWS, _PUSHES = ("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff")
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: summary, throw, push, hopper, descent.
-
-    Returns:
-        The figures in order of reading; those of tasks that were left out are not drawn.
-    """
-    throws, pushes, hoppers = (
-        outcome.of(*names) for names in (("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff"), ("hopper",))
-    )
-    drawings = [("summary", "Bias, trust and error", lambda: summary(outcome.cells))]
-    drawings += [("throw", "Throws over the wall", lambda: throw(throws))] if throws else []
-    drawings += [("hopper", "Policy gradient of the hopper", lambda: hopper(hoppers[0]))] if hoppers else []
-    drawings += [("push", "Control gradient of the push", lambda: push(pushes))] if pushes else []
-    drawings += [("descent", "Descents", lambda: descent(outcome.courses))] if outcome.courses else []
-    return [Figure(save(picture(), folder, name), title, captions[name]) for name, title, picture in drawings]
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    drawings = [summary]
+    for drawing, names in ((throw, _THROWS), (hopper, ("hopper",)), (push, _PUSHES)):
+        drawings += [drawing] if outcome.of(*names) else []
+    return save([*drawings, descent] if outcome.courses else drawings, outcome, folder)
 
 
-def summary(cells: list[Cell]):
+def summary(outcome: Outcome):
     """Three panels with one row per point: bias of the first order, α, error of one α-order estimate."""
+    cells = outcome.cells
     figure, axes = subplots(1, 3, height=1.4 + 0.27 * len(cells), sharey=True)
     rows = np.arange(len(cells))
     for gradient, shift in ((DISCRETE, -0.14), (ONSET, 0.14)):
@@ -67,11 +55,18 @@ def summary(cells: list[Cell]):
     axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    return figure
+    caption = (
+        "Left, norm of the bias over the norm of the gradient, noise taken off, with two standard errors; where the interval "
+        "reaches the edge no bias was found. Middle, mean weight of the first order. Right, root-mean-square error of one "
+        "estimate, over the norm of the gradient: the smaller, the fewer rollouts are needed. Shaded: the noise covers a jump "
+        "of the cost."
+    )
+    return figure, "Bias, trust and error", caption
 
 
-def throw(cells: list[Cell]):
+def throw(outcome: Outcome):
     """A row per contact: gradients against the angle, and α."""
+    cells = outcome.of(*_THROWS)
     names = list(dict.fromkeys(cell.name for cell in cells))
     figure, axes = subplots(len(names), 2, height=0.6 + 2.7 * len(names), sharex=True, width_ratios=[1.6, 1])
     for (left, right), name in zip(axes, names, strict=True):
@@ -101,11 +96,18 @@ def throw(cells: list[Cell]):
         axis.set_xlabel("angle, rad")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Left, gradient of the cost under noise of {settings.angle_stddev:g} rad; error bars are two standard errors. Right, "
+        "weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the last "
+        "that do not; there neither derivative sees the jump."
+    )
+    return figure, "Throws over the wall", caption
 
 
-def push(cells: list[Cell]):
+def push(outcome: Outcome):
     """A panel per stiffness: components of the gradient over the steps."""
+    cells = outcome.of(*_PUSHES)
     figure, axes = subplots(1, len(cells), height=3.4)
     for axis, cell in zip(axes[0], cells, strict=True):
         mean, error = cell.reference_mean()
@@ -123,11 +125,17 @@ def push(cells: list[Cell]):
     axes[0, 0].set_ylabel("gradient, 1/N")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Components of the gradient by the force at each moment: {settings.num_references} unbiased estimates with a band of "
+        "two standard errors, first-order means before it."
+    )
+    return figure, "Control gradient of the push", caption
 
 
-def hopper(cell: Cell):
+def hopper(outcome: Outcome):
     """A panel per motor: components of the policy gradient by what is observed."""
+    (cell,) = outcome.of("hopper")
     figure, axes = subplots(1, 3, height=3.8, sharey=True)
     looks = [(REFERENCE, "D", "unbiased reference", cell.reference_mean(), 0.0)]
     looks += [
@@ -149,11 +157,16 @@ def hopper(cell: Cell):
     axes[0, 0].set_ylabel("gradient, m per unit of gain")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    return figure
+    caption = (
+        "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
+        "are two standard errors."
+    )
+    return figure, "Policy gradient of the hopper", caption
 
 
-def descent(courses: list[Course]):
+def descent(outcome: Outcome):
     """A column per task and estimator: cost above, α below."""
+    courses = outcome.courses
     kinds = list(dict.fromkeys((course.name, course.estimator) for course in courses))
     figure, axes = subplots(2, len(kinds), height=4.6, sharex="col", height_ratios=[2, 1])
     for (above, below), kind in zip(axes.T, kinds, strict=True):
@@ -173,7 +186,12 @@ def descent(courses: list[Course]):
     axes[1, 0].set_ylabel("α")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    return figure
+    settings = outcome.settings
+    caption = (
+        f"Adam from the same start, {settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of each "
+        "step; below, weight of the first order."
+    )
+    return figure, "Descents", caption
 
 
 def _by_motor(flat: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 import mjxgrad as mg
 from experiments.policy_gradient.outcome import GRADIENTS, Cell, Course, Estimates, Outcome
 from experiments.policy_gradient.problems import Descent, Problem, problem
-from experiments.policy_gradient.settings import PolicyGradientSettings
+from experiments.policy_gradient.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.estimators.mixture import stream_parts, weigh
 from mjxgrad.estimators.rules import Consistent
@@ -69,16 +69,8 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha[0], reason, parts.costs.mean)
 
 
-def measure(settings: PolicyGradientSettings, workspace: Workspace) -> Outcome:
-    """Compare both gradients on all tasks.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Compare both gradients on all tasks."""
     cells, courses = [], []
     with workspace.stage("estimates", "tasks", len(settings.tasks)) as advance_to:
         for number, name in enumerate(settings.tasks):
@@ -91,7 +83,7 @@ def measure(settings: PolicyGradientSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, cells, courses)
 
 
-def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: PolicyGradientSettings) -> Cell:
+def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Cell:
     point = one.points[index]
     own, other = jax.random.split(key)
     keys = jax.random.split(own, settings.num_estimates)

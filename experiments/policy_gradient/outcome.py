@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.policy_gradient.settings import PolicyGradientSettings
+from experiments.policy_gradient.settings import Settings
 from experiments.policy_gradient.statistics import (
     Vectors,
     cosine,
@@ -162,7 +162,7 @@ class Outcome:
         courses: of the descents.
     """
 
-    settings: PolicyGradientSettings
+    settings: Settings
     cells: list[Cell]
     courses: list[Course]
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.policy_gradient.outcome import ONSET
-from experiments.policy_gradient.settings import PolicyGradientSettings
+from experiments.policy_gradient.settings import Settings
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 DEFAULT_CONTACT = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.9, 0.95), width=0.001)
@@ -79,7 +79,7 @@ class Problem:
     descent: Descent | None = None
 
 
-def problem(name: str, settings: PolicyGradientSettings) -> Problem:
+def problem(name: str, settings: Settings) -> Problem:
     """Build a task.
 
     Args:
@@ -103,7 +103,7 @@ def _moved_by(task: Any, arm: str) -> Any:
 _JUMPS = (0.62, 1.29)
 
 
-def _throw(name: str, settings: PolicyGradientSettings) -> Problem:
+def _throw(name: str, settings: Settings) -> Problem:
     is_default = name == "ball_wall_default"
     softness = DEFAULT_CONTACT if is_default else mg.tasks.wall_softness(WALL_STIFFNESS)
     task = mg.tasks.ball_wall().with_softness(softness)
@@ -143,7 +143,7 @@ def _push(name: str) -> Problem:
     )
 
 
-def _hopper(settings: PolicyGradientSettings) -> Problem:
+def _hopper(settings: Settings) -> Problem:
     task = mg.tasks.hopper()
     start = task.initial_params()
     return Problem(

@@ -4,13 +4,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import Positive, RunSettings
+from experiments.settings import Positive, RunSettings
 
 TaskName = Literal["ball_wall", "ball_wall_default", "push_soft", "push_stiff", "hopper"]
 Angle = Annotated[float, Field(gt=0, lt=1.5)]
 
 
-class PolicyGradientSettings(RunSettings):
+class Settings(RunSettings):
     """Both gradients of each task against an unbiased reference, what α-order makes of them, and where a descent ends."""
 
     tasks: Annotated[tuple[TaskName, ...], Field(min_length=1)]

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.rolling_pin.outcome import Outcome
-from experiments.theme import FIRST, MUTED, ZEROTH, subplots
+from experiments.theme import FIRST, MUTED, ZEROTH, save, subplots
+from experiments.video import film, shown_speed, with_coarse_shadows
+from experiments.workspace import Workspace
 
 # Palette as in the theme; those that share a kind of remedy differ by their dashes.
 _COLOURS = {"first order": FIRST, "zeroth order": ZEROTH, "α-order": "#e69f00"}
@@ -15,19 +16,9 @@ _OTHERS = ("#009e73", "#cc79a7", "#22262e", "#56b4e9", "#8c6d31")
 _DASHES = ("-", (0, (5, 2)), (0, (2, 1.5)))
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: descent, bed.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {"descent": ("True cost of each descent", descent), "bed": ("The bed in the end", bed)}
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    return save([descent, bed], outcome, folder)
 
 
 def descent(outcome: Outcome):
@@ -45,7 +36,14 @@ def descent(outcome: Outcome):
     left.set(title="Against steps", xlabel="step", ylabel="true cost")
     right.set(title="Against rollouts", xlabel="rollouts", xscale="log")
     figure.legend(loc="outside lower center", ncols=4)
-    return figure
+    reach = outcome.settings.remedies
+    caption = (
+        "True cost against steps, left, and against rollouts, right: every descent is judged by the same scene, without noise "
+        f"and without its remedy. The dotted line is what counts as solved. At first the pin is {1e3 * reach.radius:g} mm "
+        f"larger, the margin {1e3 * reach.margin:g} mm wide, the kernel {1e3 * reach.length:g} mm long; all shrink to "
+        f"{reach.last:.0%} on the way, so that what is seen becomes what is."
+    )
+    return figure, "True cost of each descent", caption
 
 
 def bed(outcome: Outcome):
@@ -65,7 +63,24 @@ def bed(outcome: Outcome):
         axis.set_ylabel("height (mm)")
     for axis in axes[-1]:
         axis.set_xlabel("pillar")
-    return figure
+    caption = (
+        "Heights of the eight pillars in the end, under the true motion; grey, the dent that was asked for. The pin starts "
+        "above the third."
+    )
+    return figure, "The bed in the end", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw the motion of the best controls, and give the file and its caption; nothing if none was asked for."""
+    wanted = outcome.settings.video
+    if wanted is None:
+        return None, ""
+    motion = with_coarse_shadows(outcome.task.scene.mj_model), outcome.motion
+    caption = (
+        f"The motion that {outcome.best.label} ends with, {shown_speed(wanted.speed)}; the green line is the depth that was "
+        "asked for."
+    )
+    return film(workspace, [motion], wanted, camera="side", caption=caption)
 
 
 def _looks(outcome: Outcome) -> list[dict]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.rolling_pin.outcome import Descent, Outcome
-from experiments.rolling_pin.settings import RollingPinSettings
+from experiments.rolling_pin.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.rolling_pin import STIFFNESS, RollingPin, rolling_pin
@@ -54,16 +54,8 @@ class Group:
     num_samples: int
 
 
-def measure(settings: RollingPinSettings, workspace: Workspace) -> Outcome:
-    """Descend in every way from controls of zero, and judge each by the true cost.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Descend in every way from controls of zero, and judge each by the true cost."""
     task = rolling_pin()
     workspace.check(task.scene)
     groups = _groups(settings)
@@ -87,7 +79,7 @@ def measure(settings: RollingPinSettings, workspace: Workspace) -> Outcome:
     )
 
 
-def _groups(settings: RollingPinSettings) -> list[Group]:
+def _groups(settings: Settings) -> list[Group]:
     few, many = settings.num_samples, settings.search_samples
     first = functools.partial(mg.estimators.first_order, num_samples=few)
     reach, search = settings.remedies, settings.search_stddev
@@ -123,7 +115,7 @@ def _groups(settings: RollingPinSettings) -> list[Group]:
     ]
 
 
-def _descend(task: RollingPin, group: Group, settings: RollingPinSettings, key: Array) -> list[Descent]:
+def _descend(task: RollingPin, group: Group, settings: Settings, key: Array) -> list[Descent]:
     """Descend for all variants of a group at once, with what reaches out shrinking as it goes."""
     shrink = optax.exponential_decay(1.0, settings.num_steps, settings.remedies.last)
     start = jnp.zeros(task.horizon * task.num_controls)
@@ -167,9 +159,7 @@ def _judged(task: RollingPin, visited: Float[Array, "points dim"]) -> Float[Arra
     return jax.vmap(task.true_cost)(visited)
 
 
-def _seen(
-    task: RollingPin, variant: Variant, scale: Array, mode: str | None, settings: RollingPinSettings
-) -> RollingPin:
+def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, settings: Settings) -> RollingPin:
     """Give the task as a variant sees it."""
     task = task.with_proximity(variant.proximity).enlarged(scale * variant.extra)
     # Without a margin this is the contact of the scene.

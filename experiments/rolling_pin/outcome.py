@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from experiments.rolling_pin.settings import RollingPinSettings
+from experiments.rolling_pin.settings import Settings
 from mjxgrad.tasks.rolling_pin import RollingPin
 
 
@@ -56,7 +56,7 @@ class Outcome:
         task: that was solved, for drawing.
     """
 
-    settings: RollingPinSettings
+    settings: Settings
     descents: list[Descent]
     start_gradient: float
     target: Float[np.ndarray, " pillars"]

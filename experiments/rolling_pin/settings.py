@@ -4,10 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import Positive, RunSettings, Settings
+from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 
 
-class RemedySettings(Settings):
+class RemedySettings(SettingsTable):
     """How far each remedy reaches at first; all but proximity shrink on the way."""
 
     proximity: Positive = 0.3
@@ -24,20 +24,7 @@ class RemedySettings(Settings):
     """What is left of radius, margin and length in the end, as a share."""
 
 
-class VideoSettings(Settings):
-    """A video of the bed before and after."""
-
-    width: Annotated[int, Field(ge=64, le=1920)] = 480
-    """Of a picture, in pixels."""
-    height: Annotated[int, Field(ge=64, le=1080)] = 320
-    """Likewise."""
-    fps: Annotated[int, Field(ge=1, le=120)] = 30
-    """Frames per second."""
-    speed: Positive = 0.25
-    """1 is real time."""
-
-
-class RollingPinSettings(RunSettings):
+class Settings(RunSettings):
     """A dent in a bed that the pin does not touch, by descent along different derivatives."""
 
     num_steps: Annotated[int, Field(ge=2)] = 60

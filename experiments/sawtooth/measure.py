@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 import mjxgrad as mg
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, Read, at_time_step, motion
 from experiments.sawtooth.cases import case
-from experiments.sawtooth.settings import SawtoothSettings
+from experiments.sawtooth.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison
@@ -112,16 +112,8 @@ def _sample(simulate: _Simulate, parameters: Float[Array, " phases"]) -> tuple[A
     return jax.vmap(one)(parameters)
 
 
-def measure(settings: SawtoothSettings, workspace: Workspace) -> list[Course]:
-    """Sample outcomes and derivatives of every motion at every time step.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The courses, motion by motion.
-    """
+def measure(settings: Settings, workspace: Workspace) -> list[Course]:
+    """Sample outcomes and derivatives of every motion at every time step."""
     courses = []
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
         for number, name in enumerate(settings.cases):
@@ -131,7 +123,7 @@ def measure(settings: SawtoothSettings, workspace: Workspace) -> list[Course]:
     return courses
 
 
-def _course(name: str, timestep: float, settings: SawtoothSettings) -> Course:
+def _course(name: str, timestep: float, settings: Settings) -> Course:
     one = case(name)
     scene = mg.load_scene(one.model)
     qpos, qvel = scene.data.qpos, scene.data.qvel

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.config import Positive, RunSettings
+from experiments.settings import Positive, RunSettings
 
 CaseName = Literal[
     "hopper",
@@ -24,7 +24,7 @@ CaseName = Literal[
 ]
 
 
-class SawtoothSettings(RunSettings):
+class Settings(RunSettings):
     """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
 
     cases: Annotated[tuple[CaseName, ...], Field(min_length=1)]

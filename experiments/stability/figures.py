@@ -9,11 +9,20 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
 from experiments.report import Figure
-from experiments.stability.classes import Derivative, Motion
+from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.grid import AXES
 from experiments.stability.limits import limit_curve
 from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
-from experiments.theme import REFERENCE, power, save, subplots
+from experiments.theme import REFERENCE, power, save_one, subplots
+
+_LIMITS = {
+    "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",
+    "chain": "Dashed, the explicit limit of a joint limit, h²k + 2hb = 4. ",
+}
+_EXPLICIT = (
+    "Dashed, the explicit limit h²k + 2hb = 4, in the standard format h/t_c = 2ζ(√(1 + ζ²) − ζ): above or to the unstable "
+    "side of it a single contact gains energy. "
+)
 
 MOTION_COLOURS = {
     Motion.SETTLES: "#c9e3f4",
@@ -48,29 +57,17 @@ _NAMES = {
 }
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw a figure per kind of scene: the planes of its first scene, C MuJoCo beside mjxgrad.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by the name of the scene.
-
-    Returns:
-        The figures in order of reading.
-    """
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw a figure per kind of scene, the planes of its first scene, and save them in the run's folder."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    return [
-        Figure(save(_planes(one, outcome), folder, _file(one)), one.scene.name.capitalize(), captions[one.scene.name])
-        for one in reversed(shown.values())
-    ]
+    return [save_one(_planes(one, outcome), folder, _file(one)) for one in reversed(shown.values())]
 
 
 def _file(one: SceneOutcome) -> str:
     return "".join(c if c.isalnum() else "_" for c in one.scene.name)
 
 
-def _planes(one: SceneOutcome, outcome: Outcome) -> Picture:
+def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     """One row per plane: motion in C MuJoCo, in mjxgrad by precision, and the gradient by precision."""
     precisions = outcome.settings.precisions
     columns = [(C_MUJOCO, "motion")] + [(name, what) for what in ("motion", "derivative") for name in precisions]
@@ -89,7 +86,13 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> Picture:
             axis.set_xlabel(_NAMES[across], fontsize=8)
         axes[i, 0].set_ylabel(_NAMES[up], fontsize=8)
     _legend(figure, one)
-    return figure
+    caption = (
+        f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all "
+        f"that is not on an axis is MuJoCo's default. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within "
+        f"{BOUNCE:g} of its restitution; energy is gained beyond {GAIN:.0%}. Gradients are judged by central differences in "
+        "float64; where the motion diverges there is none."
+    )
+    return figure, one.scene.name.capitalize(), caption
 
 
 def _image(axis: Axes, values: np.ndarray, colours: dict) -> None:

@@ -16,7 +16,7 @@ from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOut
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
-from experiments.stability.settings import SIZES, Size, StabilitySettings
+from experiments.stability.settings import Settings, Sizes
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import soundness
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
@@ -56,17 +56,9 @@ def largest(num_steps: int) -> float:
     return 100.0 * 2 * num_steps
 
 
-def measure(settings: StabilitySettings, workspace: Workspace) -> Outcome:
-    """Run every scene in every precision, and C MuJoCo beside it.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
-    size = SIZES[settings.size]
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Run every scene in every precision, and C MuJoCo beside it."""
+    size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
     grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]
     references = []
@@ -103,9 +95,7 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(
-    cases: list[_Case], precision: str, size: Size, settings: StabilitySettings, workspace: Workspace
-) -> list[_Runs]:
+def _run_all(cases: list[_Case], precision: str, size: Sizes, settings: Settings, workspace: Workspace) -> list[_Runs]:
     """Run the programs of all scenes, some at a time: most of it is compilation."""
 
     def run(case: _Case) -> _Runs:
@@ -231,9 +221,7 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(
-    scene: StabilityScene, grid: Points, reference: Reference, expected, settings: StabilitySettings
-) -> Behaviour:
+def _of_c(scene: StabilityScene, grid: Points, reference: Reference, expected, settings: Settings) -> Behaviour:
     record = _record(scene, grid, reference.qpos, reference.course, expected)
     coarse, fine = reference.differences
     is_finite = np.isfinite(fine)
@@ -258,7 +246,7 @@ def _of_mjxgrad(
     runs: _Runs,
     truth: np.ndarray,
     precision: str,
-    settings: StabilitySettings,
+    settings: Settings,
 ) -> Behaviour:
     run, event = runs.discrete, runs.event
     record = _record(scene, grid, reference.qpos, run.course, expected)

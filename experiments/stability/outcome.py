@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from experiments.stability.classes import Derivative, Motion
 from experiments.stability.grid import RANDOM, Points
 from experiments.stability.scenes import StabilityScene
-from experiments.stability.settings import StabilitySettings
+from experiments.stability.settings import Settings
 
 C_MUJOCO = "C MuJoCo"
 
@@ -93,7 +93,7 @@ class Outcome:
         scenes: in the order of the catalogue.
     """
 
-    settings: StabilitySettings
+    settings: Settings
     scenes: list[SceneOutcome]
 
     @property

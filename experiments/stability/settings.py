@@ -1,63 +1,34 @@
 """What an experiment on stability can be told; imports nothing heavy."""
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import RunSettings
+from experiments.settings import RunSettings, SettingsTable
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much of the grid is looked at.
-
-    Attributes:
-        resolution: points along each side of a plane.
-        num_random: points of a Latin hypercube over all parameters of a scene.
-        scenes: by name; None for all.
-        event: scenes whose event gradient is looked at, too; None for all.
-        chunk: rollouts that go through a program at once.
-    """
+class Sizes(SettingsTable):
+    """How much of the grid is looked at."""
 
     resolution: int
+    """Points along each side of a plane."""
     num_random: int
-    scenes: tuple[str, ...] | None
-    event: tuple[str, ...] | None
+    """Points of a Latin hypercube over all parameters of a scene."""
+    scenes: tuple[str, ...] | None = None
+    """By name; None for all."""
+    event: tuple[str, ...] | None = None
+    """Scenes whose event gradient is looked at, too; None for all."""
     chunk: int
+    """Rollouts that go through a program at once."""
 
 
-SIZES = {
-    "quick": Size(8, 32, ("ball", "two balls, elliptic"), (), 128),
-    "default": Size(
-        12,
-        256,
-        (
-            "ball",
-            "ball, refsafe",
-            "sphere, condim 1",
-            "sphere, condim 3, pyramidal",
-            "sphere, condim 3, elliptic",
-            "sphere, condim 4, elliptic",
-            "sphere, condim 6, pyramidal",
-            "two balls, pyramidal",
-            "two balls, elliptic",
-            "stack",
-            "box, pyramidal",
-            "chain",
-        ),
-        ("ball", "two balls, pyramidal"),
-        128,
-    ),
-    "full": Size(24, 2048, None, None, 4096),
-}
-
-
-class StabilitySettings(RunSettings):
+class Settings(RunSettings):
     """Rollouts and their gradients over a grid of stiff and extreme cases, beside C MuJoCo."""
 
     size: Literal["quick", "default", "full"] = "default"
     """How fine the grid is, and how many scenes and gradients are looked at."""
+    sizes: Sizes
+    """The numbers that go with the size: those of the file's table of that name."""
     num_steps: Annotated[int, Field(ge=20, le=1000)] = 100
     """Of every rollout, whatever its time step."""
     onset: bool = False
@@ -69,7 +40,7 @@ class StabilitySettings(RunSettings):
     """In which mjxgrad runs; C MuJoCo runs in float64."""
 
     @model_validator(mode="after")
-    def _check(self) -> "StabilitySettings":
+    def _check(self) -> "Settings":
         if self.precision != "float64" or self.precisions[0] != "float64":
             raise ValueError(
                 f"precisions must begin with float64, whose finite differences judge all, got {', '.join(self.precisions)}"

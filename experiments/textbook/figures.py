@@ -6,10 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from experiments.pictures import drawn
 from experiments.report import Figure
 from experiments.textbook.outcome import Outcome
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, shades, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, shades, subplots
 from mjxgrad.diagnostics import Comparison
 
 # For further estimators, in the order of the settings; told apart by their markers, too.
@@ -17,23 +16,12 @@ _OTHERS = ("#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", "#8
 _MARKERS = "osD^vP*X<>"
 
 
-def draw(outcome: Outcome, folder: Path, captions: dict[str, str]) -> list[Figure]:
-    """Draw all figures.
-
-    Args:
-        outcome: the numbers.
-        folder: of the run.
-        captions: of the figures, by name: problem, samples, stiffness, missing.
-
-    Returns:
-        The figures in order of reading.
-    """
-    pictures = {"problem": ("The cost and its gradient", problem), "samples": ("Error against rollouts", samples)}
-    if outcome.by_stiffness:
-        pictures["stiffness"] = ("Error against stiffness", stiffness)
-    if outcome.missing is not None:
-        pictures["missing"] = ("How often samples miss the slope", missing)
-    return drawn(pictures, outcome, folder, captions)
+def draw(outcome: Outcome, folder: Path) -> list[Figure]:
+    """Draw the figures, and save them in order of reading."""
+    drawings = [problem, samples]
+    drawings += [stiffness] if outcome.by_stiffness else []
+    drawings += [missing] if outcome.missing is not None else []
+    return save(drawings, outcome, folder)
 
 
 def stiffness_name(outcome: Outcome) -> str:
@@ -58,7 +46,12 @@ def problem(outcome: Outcome):
         low, high = axis.get_ylim()
         axis.set_ylim(low, high + 0.22 * (high - low))
         axis.legend(loc="upper left", ncols=2)
-    return figure
+    shown = "" if settings.shown_stiffness is None else f" at stiffness {settings.shown_stiffness:g}"
+    caption = (
+        f"Left, the cost{shown}; right, the gradient that is to be estimated, and what first order converges to. Where the "
+        "two part, first order is biased. The dotted line marks the point of the estimates below."
+    )
+    return figure, "The cost and its gradient", caption
 
 
 def samples(outcome: Outcome):
@@ -84,7 +77,15 @@ def samples(outcome: Outcome):
     _ticks(right, x)
     _ticks(left, x)
     _legend(figure, left)
-    return figure
+    settings = outcome.settings
+    percent = f"{settings.confidence:.0%}"
+    repeats = f"Each mark is from {settings.num_repeats} estimates, with its {percent} interval"
+    caption = (
+        f"{repeats}. Left, distance to the true gradient; thin lines are closed forms, dotted ones join marks that have none. "
+        "Right, mean less truth; at −1 (dotted) an estimate is zero throughout. A budget counts every rollout, that without "
+        "noise included. Intervals that leave the panel are cut."
+    )
+    return figure, "Error against rollouts", caption
 
 
 def stiffness(outcome: Outcome):
@@ -106,7 +107,15 @@ def stiffness(outcome: Outcome):
         axis.set_xlabel(stiffness_name(outcome))
         _ticks(axis, x)
     _legend(figure, left)
-    return figure
+    settings = outcome.settings
+    percent = f"{settings.confidence:.0%}"
+    repeats = f"Each mark is from {settings.num_repeats} estimates, with its {percent} interval"
+    caption = (
+        f"{repeats}, {settings.samples_at_stiffness} rollouts each. Left, distance to the true gradient; thin lines are "
+        "closed forms. Right, variance of the estimate times rollouts. An estimate that never varies, because all its samples "
+        "miss, has no mark there."
+    )
+    return figure, "Error against stiffness", caption
 
 
 def missing(outcome: Outcome):
@@ -151,7 +160,15 @@ def missing(outcome: Outcome):
     right.set(title="Variance of first order", xlabel=stiffness_name(outcome))
     right.legend(loc="lower right")
     _ticks(right, x)
-    return figure
+    settings = outcome.settings
+    percent = f"{settings.confidence:.0%}"
+    caption = (
+        "Left, for each stiffness: line, the closed form (1 − β)ᴺ; dots, how often N simulated samples all missed; diamonds, "
+        f"what {settings.missed_samples} first-order samples tell, with its {percent} interval. Right, the variance of a "
+        "sample of first order, as the same samples show it, and the least that the discrepancy between them and the gradient "
+        "implies; shaded where no sample hit the slope, so that they show none."
+    )
+    return figure, "How often samples miss the slope", caption
 
 
 def _errors(axis: Axes, outcome: Outcome, x: np.ndarray, tables: list[Comparison], exact: dict) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from experiments.failure import ExperimentError, suggest
 from experiments.textbook.outcome import Curves, Missing, Outcome
-from experiments.textbook.settings import EstimatorSettings, TextbookSettings
+from experiments.textbook.settings import EstimatorSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
 from mjxgrad.diagnostics import Comparison, Rollouts, compare, empirical_bias, first_order_samples
@@ -28,15 +28,8 @@ _RULES = {
 _SETS = 4000
 
 
-def measure(settings: TextbookSettings, workspace: Workspace) -> Outcome:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Repeat every estimator at every number of rollouts and every stiffness.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
 
     Raises:
         ExperimentError: if there is no estimator of some name.
@@ -99,7 +92,7 @@ def _estimator(settings: EstimatorSettings) -> functools.partial:
     return functools.partial(getattr(library, settings.name), **options)
 
 
-def _problem(settings: TextbookSettings, stiffness: float | None) -> Textbook:
+def _problem(settings: Settings, stiffness: float | None) -> Textbook:
     if stiffness is None:
         return textbook.heaviside()
     if settings.problem == "soft_heaviside":
@@ -108,7 +101,7 @@ def _problem(settings: TextbookSettings, stiffness: float | None) -> Textbook:
 
 
 def _exact(
-    settings: TextbookSettings, problems: list[Textbook], rollouts: list[int] | tuple[int, ...]
+    settings: Settings, problems: list[Textbook], rollouts: list[int] | tuple[int, ...]
 ) -> dict[str, Float[np.ndarray, " settings"]]:
     """Give the root-mean-square error of each estimator that has a closed form, at each setting."""
     found = {}
@@ -121,7 +114,7 @@ def _exact(
     return found
 
 
-def _exact_error(one: EstimatorSettings, problem: Textbook, settings: TextbookSettings, rollouts: int) -> float:
+def _exact_error(one: EstimatorSettings, problem: Textbook, settings: Settings, rollouts: int) -> float:
     point, stddev = settings.point, settings.stddev
     if one.antithetic:
         return np.nan
@@ -138,7 +131,7 @@ def _exact_error(one: EstimatorSettings, problem: Textbook, settings: TextbookSe
     return float(jnp.sqrt(problem.zeroth_order_variance(point, stddev, baseline) / (rollouts - is_paid)))
 
 
-def _curves(problem: Textbook, settings: TextbookSettings) -> Curves:
+def _curves(problem: Textbook, settings: Settings) -> Curves:
     reach = max(4 * settings.stddev, 1.5 * abs(settings.point))
     grid = jnp.linspace(-reach, reach, 801)
 
@@ -155,7 +148,7 @@ def _curves(problem: Textbook, settings: TextbookSettings) -> Curves:
     return Curves(np.asarray(grid), *(np.asarray(values) for values in along(problem, grid)))
 
 
-def _missing(settings: TextbookSettings, key: Array) -> Missing:
+def _missing(settings: Settings, key: Array) -> Missing:
     """Estimate the chance to miss the slope from first-order samples, and count how often it is missed."""
     counts = np.unique(np.geomspace(2, 1000, 25).astype(int))
     exact, found, frequency = [], [], []

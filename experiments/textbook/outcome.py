@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from experiments.textbook.settings import TextbookSettings
+from experiments.textbook.settings import Settings
 from mjxgrad.diagnostics import Comparison, EmpiricalBias
 
 
@@ -62,7 +62,7 @@ class Outcome:
         missing: for the soft step.
     """
 
-    settings: TextbookSettings
+    settings: Settings
     gradient: float
     by_samples: list[Comparison]
     by_stiffness: list[Comparison]

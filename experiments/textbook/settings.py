@@ -4,12 +4,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Finite, Positive, RunSettings, Settings
+from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 
 Count = Annotated[int, Field(ge=2)]
 
 
-class EstimatorSettings(Settings):
+class EstimatorSettings(SettingsTable):
     """One estimator, with what is set of its options."""
 
     name: str
@@ -37,7 +37,7 @@ class EstimatorSettings(Settings):
         return self.name.replace("_", " ") + (f" ({', '.join(parts)})" if parts else "")
 
 
-class TextbookSettings(RunSettings):
+class Settings(RunSettings):
     """Error, bias and variance of estimators against samples and stiffness, with closed forms drawn in."""
 
     problem: Literal["heaviside", "soft_heaviside", "quadratic_sine"]
@@ -66,7 +66,7 @@ class TextbookSettings(RunSettings):
     """Of every interval."""
 
     @model_validator(mode="after")
-    def _check(self) -> "TextbookSettings":
+    def _check(self) -> "Settings":
         if self.problem == "heaviside" and (self.stiffness or self.shown_stiffness):
             raise ValueError("stiffness and shown_stiffness must not be set: a step has none; take soft_heaviside")
         if self.problem != "heaviside" and (len(self.stiffness) < 2 or self.shown_stiffness is None):

@@ -20,7 +20,7 @@ import mjxgrad as mg
 from experiments.work_precision.cases import Case
 from experiments.work_precision.outcome import Estimate, GradientReference
 from experiments.work_precision.programs import Knobs, Program, Variant, timed
-from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.work_precision.settings import Settings
 from mjxgrad.objective import Differentiated, Objective
 
 # Step of the reference, as a share of the scene's own: eight times finer than the finest estimate's by default.
@@ -97,7 +97,7 @@ class Records:
 
 
 def measured(
-    case: Case, programs: dict[Variant, Program], settings: WorkPrecisionSettings
+    case: Case, programs: dict[Variant, Program], settings: Settings
 ) -> tuple[GradientReference, list[Estimate]]:
     """Estimate the gradient in every way.
 
@@ -164,7 +164,7 @@ def smoothed_gradient(
 
 
 def _reference(
-    case: Case, simulate: Program, noise: Float[np.ndarray, "rollouts dim"], settings: WorkPrecisionSettings
+    case: Case, simulate: Program, noise: Float[np.ndarray, "rollouts dim"], settings: Settings
 ) -> GradientReference:
     own = case.model.opt.timestep
     fine, coarse = (Knobs(own * factor / _FINEST, 1e-10) for factor in (1, 2))
@@ -183,7 +183,7 @@ def _reference(
 
 
 def _differences(
-    case: Case, simulate: Program, num_rollouts: int, knobs: Knobs, settings: WorkPrecisionSettings
+    case: Case, simulate: Program, num_rollouts: int, knobs: Knobs, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give the slope of the smoothed outcome along each parameter, on samples of its own."""
     dim = len(case.moved)
@@ -216,7 +216,7 @@ def _record(
     simulate: Program,
     noise: np.ndarray,
     knobs: Knobs,
-    settings: WorkPrecisionSettings,
+    settings: Settings,
 ) -> Records:
     sizes = settings.sizes
     batch = simulate.variant.batch
@@ -236,7 +236,7 @@ def _record(
 
 
 def _estimates(
-    case: Case, records: Records, knobs: Knobs, reference: GradientReference, settings: WorkPrecisionSettings
+    case: Case, records: Records, knobs: Knobs, reference: GradientReference, settings: Settings
 ) -> list[Estimate]:
     right = np.array(reference.value)
     size = float(np.linalg.norm(right))

@@ -1,7 +1,6 @@
 """From settings to numbers."""
 
 import itertools
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,20 +10,12 @@ from experiments.work_precision.cases import Case, case
 from experiments.work_precision.native import has_own_implicit
 from experiments.work_precision.outcome import Course, Outcome
 from experiments.work_precision.programs import CONES, FEW_ITERATIONS, Cone, Library, Variant, compiled, own_cone
-from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.work_precision.settings import Settings
 from experiments.workspace import Workspace
 
 
-def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
-    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock.
-
-    Returns:
-        The numbers.
-    """
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed."""
     cases = {name: case(name) for name in settings.scene_names}
     courses = []
     # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.
@@ -38,7 +29,7 @@ def measure(settings: WorkPrecisionSettings, workspace: Workspace) -> Outcome:
     return Outcome(settings, tuple(courses))
 
 
-def variants(one: Case, settings: WorkPrecisionSettings, has_asides: bool) -> list[Variant]:
+def variants(one: Case, settings: Settings, has_asides: bool) -> list[Variant]:
     """Say for what a scene is compiled, the longest compilations first.
 
     A cone makes no difference without friction, and implicitfast none where Euler's implicit damping is all there is.
@@ -86,10 +77,8 @@ def has_friction(one: Case) -> bool:
     return bool((model.geom_condim[touching] > 1).any()) or bool((model.pair_dim > 1).any())
 
 
-def _course(name: str, one: Case, settings: WorkPrecisionSettings, on_each: Callable[[], None]) -> Course:
-    begun = time.perf_counter()
+def _course(name: str, one: Case, settings: Settings, on_each: Callable[[], None]) -> Course:
     programs = compiled(one, variants(one, settings, settings.has_asides(name)), on_each)
-    compiling = time.perf_counter() - begun
     qvel = simulation.starts(one, settings.sizes.batch, settings.seed)
     right = simulation.truths(one, programs, qvel, settings.num_threads)
     points = simulation.measured(one, programs, qvel, right, settings)
@@ -103,6 +92,4 @@ def _course(name: str, one: Case, settings: WorkPrecisionSettings, on_each: Call
         references=tuple(truth.found for truth in right.values()),
         estimates=tuple(estimates),
         gradient_reference=gradient_reference,
-        num_programs=len(programs),
-        compile_wall_seconds=compiling,
     )

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.work_precision.front import pareto_front
-from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.work_precision.settings import Settings
 
 C = "C MuJoCo"
 MG, MJX, ONSET = "mg.step", "mjx.step", "mg.step, onset"
@@ -192,8 +192,6 @@ class Course:
         references: of the motion.
         estimates: of the gradient.
         gradient_reference: what they are compared with.
-        num_programs: that were compiled.
-        compile_wall_seconds: until all were.
     """
 
     name: str
@@ -204,8 +202,6 @@ class Course:
     references: tuple[Reference, ...]
     estimates: tuple[Estimate, ...]
     gradient_reference: GradientReference
-    num_programs: int
-    compile_wall_seconds: float
 
     def reference(self, engine: str, cone: str) -> Reference:
         """Give the reference of an engine with a cone."""
@@ -230,7 +226,7 @@ class Outcome:
         courses: one per scene.
     """
 
-    settings: WorkPrecisionSettings
+    settings: Settings
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:

@@ -1,75 +1,54 @@
 """What an experiment on error against run time can be told; imports nothing heavy."""
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Positive, RunSettings
 from experiments.parallel import num_cores
+from experiments.settings import Positive, RunSettings, SettingsTable
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
 ]
-_DEFAULT_SCENES: tuple[SceneName, ...] = ("pendulum", "bounce", "slide", "cube", "arm", "hopper", "push", "heap")
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    Attributes:
-        scenes: by name.
-        with_asides: scenes in which a state alone, MJX in double precision and the other cone are looked at, too; None for
-            all. Each is one more program to compile.
-        refinements: by what a scene's own time step is divided, coarse to fine.
-        tolerances: of the solver, beside the tight one of every other run.
-        batch: starts that are simulated together, and over which the error is taken.
-        num_rollouts: simulated for the gradient, from which samples are drawn; a multiple of 8 times the batch or a
-            divisor of it.
-        num_samples: of an estimate.
-        gradient_refinements: as `refinements`, of gradients.
-        softenings: factors on the contacts' time constant, beside 1.
-        repeats: at most, of every timing.
-        seconds: after which a timing is not repeated again, once it has been repeated.
-        has_all_variants: whether MJX is run with every integrator, mg.step in single precision with more, and with few
-            iterations.
-    """
+class Sizes(SettingsTable):
+    """How much is measured."""
 
     scenes: tuple[SceneName, ...]
-    with_asides: tuple[SceneName, ...] | None
+    """By name."""
+    with_asides: tuple[SceneName, ...] | None = None
+    """Scenes in which a state alone, MJX in double precision and the other cone are looked at, too; None for all. Each is one
+    more program to compile."""
     refinements: tuple[float, ...]
+    """By what a scene's own time step is divided, coarse to fine."""
     tolerances: tuple[float, ...]
+    """Of the solver, beside the tight one of every other run."""
     batch: int
+    """Starts that are simulated together, and over which the error is taken."""
     num_rollouts: int
+    """Simulated for the gradient, from which samples are drawn; a multiple of 8 times the batch or a divisor of it."""
     num_samples: tuple[int, ...]
+    """Of an estimate."""
     gradient_refinements: tuple[float, ...]
+    """As `refinements`, of gradients."""
     softenings: tuple[float, ...]
+    """Factors on the contacts' time constant, beside 1."""
     repeats: int
+    """At most, of every timing."""
     seconds: float
+    """After which a timing is not repeated again, once it has been repeated."""
     has_all_variants: bool
+    """Whether MJX is run with every integrator, mg.step in single precision with more, and with few iterations."""
 
 
-SIZES = {
-    "quick": Sizes(
-        ("pendulum", "push"), None, (0.5, 1.0, 2.0, 4.0), (1e-2,), 32, 128, (8, 32), (1.0, 2.0), (2.0,), 3, 0.1, False
-    ),
-    "default": Sizes(
-        _DEFAULT_SCENES, ("pendulum", "bounce"), (0.5, 1.0, 2.0, 4.0, 8.0), (1e-2, 1e-4, 1e-6), 32, 256,
-        (8, 32, 128), (0.5, 1.0), (2.0, 4.0), 5, 0.4, False,
-    ),
-    "full": Sizes(
-        (*_DEFAULT_SCENES, "half_cheetah", "walker2d", "ant"), None, (0.5, 1.0, 2.0, 4.0, 8.0),
-        (1e-2, 1e-4, 1e-6), 1024, 4096, (8, 32, 128, 512), (0.5, 1.0, 2.0, 4.0), (2.0, 4.0, 8.0), 5, 1.0, True,
-    ),
-}  # fmt: skip
-
-
-class WorkPrecisionSettings(RunSettings):
+class Settings(RunSettings):
     """Error of motions and gradients against the time that they take, by scene."""
 
     size: Literal["quick", "default", "full"] = "default"
     """How much is measured: two scenes in a minute or two, eight in a quarter of an hour on two cores, all on a GPU."""
+    sizes: Sizes
+    """The numbers that go with the size: those of the file's table of that name."""
     scenes: tuple[SceneName, ...] | None = None
     """Which scenes, in place of those of the size."""
     targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (
@@ -81,11 +60,6 @@ class WorkPrecisionSettings(RunSettings):
     """Of C MuJoCo's rollout; one for every core, if none is given."""
     tight_tolerance: Positive = 1e-8
     """Of the solver where tolerance is not what is varied; in single precision at least 1e-6, which is what it resolves."""
-
-    @property
-    def sizes(self) -> Sizes:
-        """Give the numbers that the size stands for."""
-        return SIZES[self.size]
 
     @property
     def scene_names(self) -> tuple[SceneName, ...]:
@@ -102,7 +76,7 @@ class WorkPrecisionSettings(RunSettings):
         return self.sizes.with_asides is None or name in self.sizes.with_asides
 
     @model_validator(mode="after")
-    def _check(self) -> "WorkPrecisionSettings":
+    def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
         if self.scenes is not None and not self.scenes:

@@ -23,7 +23,7 @@ from experiments.work_precision.programs import (
     own_cone,
     timed,
 )  # fmt: skip
-from experiments.work_precision.settings import WorkPrecisionSettings
+from experiments.work_precision.settings import Settings
 
 # The classical rule for references: where nothing switches it is exact to rounding, elsewhere all rules are of first order.
 # C MuJoCo affords more steps.
@@ -125,7 +125,7 @@ def measured(
     programs: dict[Variant, Program],
     qvel: Float[np.ndarray, "batch nv"],
     right: dict[tuple[str, Cone], Truth],
-    settings: WorkPrecisionSettings,
+    settings: Settings,
 ) -> list[Point]:
     """Simulate in every way.
 
@@ -146,9 +146,7 @@ def measured(
     return points + _of_c(case, qvel, right, settings)
 
 
-def _of_program(
-    program: Program, qvel: Float[np.ndarray, "batch nv"], truth: Truth, settings: WorkPrecisionSettings
-) -> list[Point]:
+def _of_program(program: Program, qvel: Float[np.ndarray, "batch nv"], truth: Truth, settings: Settings) -> list[Point]:
     case, variant, sizes = program.case, program.variant, settings.sizes
     is_own = variant.integrator == "Euler" and variant.cone == own_cone(case)
     is_main = is_own and not variant.onset and variant.batch > 1 and variant.iterations == NUM_ITERATIONS
@@ -179,7 +177,7 @@ def _of_c(
     case: Case,
     qvel: Float[np.ndarray, "batch nv"],
     right: dict[tuple[str, Cone], Truth],
-    settings: WorkPrecisionSettings,
+    settings: Settings,
 ) -> list[Point]:
     plain, varied = (_knobs(case, settings, with_tolerances=flag, is_single=False) for flag in (False, True))
     cones: list[Cone] = [name for name in CONES if (C, name) in right]
@@ -197,7 +195,7 @@ def _c_points(
     case: Case,
     qvel: Float[np.ndarray, "batch nv"],
     truth: Truth,
-    settings: WorkPrecisionSettings,
+    settings: Settings,
     every: Sequence[Knobs],
     *,
     cone: Cone,
@@ -230,7 +228,7 @@ def _c_points(
     return points
 
 
-def _knobs(case: Case, settings: WorkPrecisionSettings, *, with_tolerances: bool, is_single: bool) -> list[Knobs]:
+def _knobs(case: Case, settings: Settings, *, with_tolerances: bool, is_single: bool) -> list[Knobs]:
     tight = max(settings.tight_tolerance, _SINGLE_TOLERANCE) if is_single else settings.tight_tolerance
     own = case.model.opt.timestep
     knobs = [Knobs(own / refinement, tight) for refinement in settings.sizes.refinements]

@@ -11,7 +11,6 @@ from experiments.__main__ import main
 from experiments.artificial_discontinuity.paths import PATHS
 from experiments.artificial_discontinuity.pushes import slopes_at
 from experiments.artificial_discontinuity.reference import overlap_force
-from experiments.artificial_discontinuity.settings import ArtificialDiscontinuitySettings
 from experiments.artificial_discontinuity.shapes import lattice, shape
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
@@ -59,7 +58,7 @@ def test_across_a_step_first_order_says_nothing_and_the_rest_the_density():
     def step(starts, _):
         return 2.0 * (starts > 0.5), np.zeros_like(starts)
 
-    settings = ArtificialDiscontinuitySettings(experiment="artificial_discontinuity", size="default")
+    settings = load_runs("artificial_discontinuity", [])[0].settings
     found = slopes_at(settings, "step", "x", step, 0.5, 0.1, np.random.default_rng(0))
     exact = 2 * norm.pdf(0) / 0.1
     assert found.jump == pytest.approx(exact, rel=1e-3)  # the search divides 6 stddev by 3e5

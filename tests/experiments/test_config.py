@@ -111,6 +111,15 @@ def test_bare_words_in_a_list_are_strings():
     assert found == 'scenes[0]: there is no "hoper"; did you mean "hopper"?'
 
 
+def test_a_size_is_one_of_the_tables_of_its_file_and_single_values_win_over_it():
+    (run,) = load_runs("ablation", ["size=quick", "sizes.batch=7"])
+    assert (run.settings.sizes.batch, run.settings.sizes.horizon) == (7, 10)
+    assert mistakes("ablation", "size=quik", "sizes.bath=3") == (
+        'size: there is no "quik"; did you mean "quick"?',
+        'sizes.bath: unknown key; did you mean "batch"?',
+    )
+
+
 def test_a_sweep_is_every_combination_with_its_last_key_changing_fastest(write):
     runs = load_runs(write(VALID + "[sweep]\nseed = [0, 1]\nstddev = [0.1, 0.2, 0.3]\n"), [])
     assert [(run.settings.seed, run.settings.stddev) for run in runs] == [

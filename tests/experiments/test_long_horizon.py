@@ -15,7 +15,16 @@ from experiments.long_horizon.problems import problem
 from experiments.long_horizon.settings import Sizes
 
 STDDEV = 0.3
-SIZES = Sizes((), 2, 400, 16, 0, 0, 0, 16)
+SIZES = Sizes(
+    problems=(),
+    num_times=2,
+    num_repeats=400,
+    num_samples=16,
+    num_reference=0,
+    num_jacobians=0,
+    num_adaptive=0,
+    batch=16,
+)
 
 
 def costs(noise):

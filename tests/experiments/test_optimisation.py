@@ -15,8 +15,8 @@ from experiments.config import load_runs
 from experiments.optimisation.figures import draw
 from experiments.optimisation.methods import problem
 from experiments.optimisation.outcome import Difference, Outcome, Run
-from experiments.optimisation.settings import MethodSettings, OptimisationSettings
-from experiments.optimisation.verdict import findings, headline, table, verdict, warnings
+from experiments.optimisation.report import findings, headline, tables, verdict, warnings
+from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.overview import HEADLINE, overview
 
 FILES = ("push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis", "six_tasks")
@@ -56,7 +56,7 @@ def rows(finished):
 
 def settings(*methods, **others):
     table = {"experiment": "optimisation", "task": "push_soft", "methods": list(methods), **others}
-    return OptimisationSettings.model_validate_json(json.dumps(table))
+    return Settings.model_validate_json(json.dumps(table))
 
 
 def made_up(name, costs, **options):
@@ -172,7 +172,7 @@ def test_a_lost_run_makes_a_method_worse_however_low_the_others_end():
     found = outcome(made_up("alpha_order", [1.0, 1.1, np.inf]), made_up("zeroth_order", [100.0, 101.0, 102.0]))
     assert found.verdicts[0].is_above
     assert "worse than zeroth order" in verdict(found)
-    assert "1 of 3" in table(found).rows[0]
+    assert "1 of 3" in tables(found)[0].rows[0]
     assert warnings(found) == ["α-order: 1 of 3 runs ended without a finite cost."]
     assert headline(found)["α-order"].endswith("(1 lost)")
 
@@ -211,9 +211,9 @@ def test_figures_are_drawn_where_every_run_of_a_method_is_lost(tmp_path):
     lost = made_up("first_order", [np.inf, np.inf])
     lost = dataclasses.replace(lost, alpha=np.full((2, 3), np.nan), cost=np.full((2, 2), np.inf))
     found = outcome(lost, made_up("alpha_order", [5.0, 6.0]))
-    figures = draw(found, tmp_path, {"final": "", "curves": "", "alpha": ""})
+    figures = draw(found, tmp_path)
     assert [(tmp_path / figure.file).is_file() for figure in figures] == [True] * 3
-    assert "undefined" in table(found).rows[0][1]
+    assert "undefined" in tables(found)[0].rows[0][1]
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,14 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.planning.captions import captions
 from experiments.planning.figures import draw
 from experiments.planning.outcome import Attempt, Outcome
-from experiments.planning.settings import PlanningSettings
-from experiments.planning.verdict import findings, table, verdict
+from experiments.planning.report import findings, tables, verdict
+from experiments.planning.settings import Settings
 
 GOAL = (0.1, 0.0, 0.0)
-TRAJECTORY = PlanningSettings(experiment="planning", method="trajectory", goal=GOAL)
-TREE = PlanningSettings(experiment="planning", method="tree", goal=GOAL)
+TRAJECTORY = Settings(experiment="planning", method="trajectory", goal=GOAL)
+TREE = Settings(experiment="planning", method="tree", goal=GOAL)
 
 
 def attempt(model, reach, *, seed=0, num_steps=4, is_tree=False):
@@ -77,7 +76,7 @@ def test_the_verdict_on_trees_counts_the_seeds():
     said = verdict(outcome(TREE, found + lost))
     assert "With analytic models 1 of 2 trees find a way, the shortest of 4 steps" in said
     assert "With no smoothing none of 2 trees finds a way; in the best the rod ends 90.0 mm and 0.000 rad" in said
-    assert [row[2] for row in table(outcome(TREE, found + lost)).rows] == ["yes", "no", "no", "no"]
+    assert [row[2] for row in tables(outcome(TREE, found + lost))[0].rows] == ["yes", "no", "no", "no"]
 
 
 def test_polishing_is_reported_with_what_it_gained():
@@ -96,7 +95,7 @@ def test_polishing_is_reported_with_what_it_gained():
 def test_every_method_gets_its_figures(tmp_path, settings, is_tree, files):
     attempts = [attempt("analytic", 0.1, is_tree=is_tree), attempt("none", 0.0, is_tree=is_tree)]
     found = outcome(settings, attempts)
-    draw(found, tmp_path, captions(found))
+    draw(found, tmp_path)
     assert sorted(path.stem for path in (tmp_path / "figures").iterdir()) == files
 
 

@@ -10,11 +10,11 @@ import pytest
 import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.policy_gradient.captions import captions
 from experiments.policy_gradient.figures import draw
 from experiments.policy_gradient.measure import estimated
 from experiments.policy_gradient.outcome import Cell, Course, Estimates, Outcome
-from experiments.policy_gradient.settings import PolicyGradientSettings
+from experiments.policy_gradient.report import tables, verdict
+from experiments.policy_gradient.settings import Settings
 from experiments.policy_gradient.statistics import (
     cosine,
     jackknife_error,
@@ -22,9 +22,8 @@ from experiments.policy_gradient.statistics import (
     squared_distance,
     squared_norm,
 )
-from experiments.policy_gradient.verdict import findings, tables, verdict
 
-SETTINGS = PolicyGradientSettings(
+SETTINGS = Settings(
     experiment="policy_gradient", tasks=("hopper",), angles=(0.4,), angle_stddev=0.05, num_estimates=8, num_references=8,
     num_seeds=1, throw_steps=2, hopper_steps=2,
 )  # fmt: skip
@@ -134,14 +133,13 @@ def test_a_jump_is_no_repair_and_no_harm_but_missed():
     assert "without a jump of the cost, by" not in text
 
 
-def test_findings_and_tables_tell_what_alpha_order_makes_of_both():
+def test_the_table_tells_what_alpha_order_makes_of_both():
     """A weight of 0 leaves all of the unbiased part's error, one of 0.8 a fifth; the first order has almost none."""
     one = outcome(cell([3.0, 0.0], [0.0, 0.0]))
-    (sentence,) = findings(one)
-    assert "α goes from 0.00 (discrete) to 0.80 (onset)" in sentence
     assert one.cells[0].error("discrete", "mixed") == pytest.approx(5 * one.cells[0].error("onset", "mixed"), rel=0.01)
     (table,) = tables(one)
     assert table.emphasised == {(0, 3)}
+    assert [row[5][:4] for row in table.rows] == ["0.00", "0.80"]
     assert [row[6] for row in table.rows] == ["contradictory 100%", "trusted 100%"]
 
 
@@ -160,7 +158,7 @@ def test_every_task_gets_its_figure(tmp_path):
     course = Course("hopper", "Task", "alpha", "onset", rng.normal(size=(2, 3)), np.full((2, 3), 0.5), 1.0)
     throws = [named("ball_wall", 1, f"{angle} rad") for angle in (0.4, 0.5)]
     one = outcome(*throws, named("push_soft", 5), named("push_stiff", 5), named("hopper", 21), courses=[course])
-    figures = draw(one, tmp_path, captions(one))
+    figures = draw(one, tmp_path)
     assert [figure.file for figure in figures] == [
         f"figures/{name}.png" for name in ("summary", "throw", "hopper", "push", "descent")
     ]

@@ -2,8 +2,8 @@
 
 import pytest
 
-from experiments.report import quantity
 from experiments.theme import power
+from experiments.words import quantity
 
 
 @pytest.mark.parametrize(

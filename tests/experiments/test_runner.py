@@ -5,18 +5,16 @@ import json
 import re
 import shutil
 import tomllib
-import types
 
 import mujoco
 import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments import environment
+from experiments import environment, video
 from experiments.__main__ import main
-from experiments.bias_variance import video as video_module
-from experiments.bias_variance.settings import BiasVarianceSettings
-from experiments.registry import EXPERIMENTS
+from experiments.bias_variance import measure
+from experiments.settings import VideoSettings
 from experiments.workspace import Workspace
 from mjxgrad.render import RenderingUnavailableError
 
@@ -124,10 +122,10 @@ def test_an_unchanged_run_says_so_and_where_its_report_is(copied, capsys):
 def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch):
     """A run that is reached raises here, and leaves the former result."""
 
-    def reached():
+    def reached(*_):
         raise ValueError("reached")
 
-    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: lambda *_: reached())
+    monkeypatch.setattr(measure, "measure", reached)
     assert run(copied / "steep.toml", copied / "runs") == 0
     assert run(copied / "steep.toml", copied / "runs", "seed=1") == 2
     assert run(copied / "steep.toml", copied / "runs", "--force") == 2
@@ -144,7 +142,7 @@ def test_a_library_refusal_is_a_sentence_and_debug_shows_the_traceback(copied, m
     def refuse(*_):
         raise mg.DivergedError("the rollout diverged at step 3")
 
-    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: refuse)
+    monkeypatch.setattr(measure, "measure", refuse)
     assert run(copied / "steep.toml", copied / "runs", "--force") == 2
     assert capsys.readouterr().err.endswith("\nthe rollout diverged at step 3\n")
     with pytest.raises(mg.DivergedError):
@@ -155,7 +153,7 @@ def test_an_interruption_is_told_and_leaves_the_former_result(copied, monkeypatc
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(type(EXPERIMENTS["bias_variance"]), "load", lambda self: interrupt)
+    monkeypatch.setattr(measure, "measure", interrupt)
     assert run(copied / "steep.toml", copied / "runs", "--force") == 130
     assert "earlier results are as they were" in capsys.readouterr().err
     assert (copied / "runs" / "steep" / "report.html").is_file()
@@ -194,18 +192,10 @@ def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monk
     def refuse(*_, **__):
         raise RenderingUnavailableError("install libosmesa6")
 
-    monkeypatch.setattr(video_module, "frames", refuse)
-    monkeypatch.setattr(video_module, "wall_contact", lambda *_: mg.Softness.sweep(stiffness=[1.0]))
-    scene = types.SimpleNamespace(mj_model=mujoco.MjModel.from_xml_string("<mujoco/>"))
-    thrown = types.SimpleNamespace(trajectory=lambda angle: types.SimpleNamespace(qpos=angle * np.ones((2, 1))))
-    task = types.SimpleNamespace(scene=scene, with_softness=lambda softness: thrown)
-    settings = BiasVarianceSettings.model_validate_json(
-        json.dumps(tomllib.loads(SETTINGS) | {"video": {"angles": [0.5], "stiffness": [1.0]}})
-    )
-    assert video_module.video(types.SimpleNamespace(task=task), settings, Workspace(tmp_path)) == (
-        None,
-        "install libosmesa6",
-    )
+    monkeypatch.setattr(video, "frames", refuse)
+    motion = mujoco.MjModel.from_xml_string("<mujoco/>"), np.ones((2, 0))
+    found = video.film(Workspace(tmp_path), [motion], VideoSettings(), camera="side", caption="A motion.")
+    assert found == (None, "install libosmesa6")
 
 
 @pytest.mark.slow

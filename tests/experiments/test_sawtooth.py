@@ -8,8 +8,9 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
+from experiments.sawtooth.figures import _errors, _teeth
 from experiments.sawtooth.measure import Course
-from experiments.sawtooth.run import _errors, _rows, _teeth, _verdict
+from experiments.sawtooth.report import _rows, _verdict
 from mjxgrad.diagnostics import compare_to_slope, phases
 
 _START = phases((0.0, 1.0), 256)

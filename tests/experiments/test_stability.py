@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.config import load_runs
 from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import PLANES, Points, points
 from experiments.stability.limits import load
@@ -13,9 +14,8 @@ from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOut
 from experiments.stability.program import Steps, errors_of_solves
 from experiments.stability.reasons import UNEXPLAINED, reasons
 from experiments.stability.reference import simulate, unbalanced
+from experiments.stability.report import findings
 from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
-from experiments.stability.settings import SIZES, StabilitySettings
-from experiments.stability.verdict import findings
 
 SCENES = {scene.name: scene for scene in catalogue()}
 
@@ -34,10 +34,11 @@ def _simulate(grid, num_steps):
         return simulate(SCENES["ball"], grid, num_steps, pool).course
 
 
-def test_every_size_names_scenes_that_there_are():
-    for size in SIZES.values():
-        assert set(size.scenes or SCENES) <= set(SCENES)
-        assert set(size.event or SCENES) <= set(SCENES)
+@pytest.mark.parametrize("size", ["quick", "default", "full"])
+def test_every_size_names_scenes_that_there_are(size):
+    sizes = load_runs("stability", [f"size={size}"])[0].settings.sizes
+    assert set(sizes.scenes or SCENES) <= set(SCENES)
+    assert set(sizes.event or SCENES) <= set(SCENES)
 
 
 def test_the_grid_reaches_its_corners_and_coincident_centres():
@@ -136,7 +137,7 @@ def test_what_gains_energy_is_counted_on_either_side_of_the_explicit_limit(count
     grid = _points(3, timestep=[0.002, 0.01, 0.05], time_constant=0.02, damping_ratio=1.0)
     motions = [Motion.GAINS_ENERGY] * count + [Motion.BOUNCES_RIGHT] * (2 - count) + [Motion.GAINS_ENERGY]
     one = _outcome("ball", grid, motions, motions, [0.0, 0.0, 0.0])
-    settings = StabilitySettings(experiment="stability", precisions=("float64",))
+    settings = load_runs("stability", ['precisions=["float64"]'])[0].settings
     sentence = findings(Outcome(settings, [one]))[0]
     assert f"Of 2 single bounces within the explicit limit {said}" in sentence
     assert "of 1 beyond it all do" in sentence

@@ -1,0 +1,363 @@
+"""How fast, against what, and in how much memory: `make bench`, `make costs`, `make throughput`.
+
+Everything of one benchmark is measured in one process on the same work. Compilation is apart. Memory is what XLA sets aside for
+the compiled program besides its arguments.
+
+`bench`: steps and gradients on the same scene, batch and number of steps; each row is the median of several runs, with the range.
+
+- `mjx.step`: MJX as it is, its solver run to the same tolerance.
+- `mg.rollout`: our step, lean carry.
+- `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
+- `mg value_and_grad`: implicit derivative, checkpointed, and not.
+- `C MuJoCo`: `mujoco.rollout` on as many threads as there are cores.
+
+With `--per-core` every core is a device of its own, and each row of JAX's, MJX's included, is split over them by
+`mg.over_devices`.
+
+`costs`: what continuous onset, the event gradient and smoothing cost, as ratios to the plain step and its gradient. Every case is
+compiled first; then all take turns, so that a change of the machine's load meets all alike.
+
+`throughput`: ten stiffness values × 1000 samples × three estimators on `ball_wall`, once with the softness as an argument of one
+compiled program and once as ten programs, as ten runs of a script would make them. Nothing is read from a compilation cache.
+"""
+
+import argparse
+import dataclasses
+import functools
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+import mjxgrad as mg
+from experiments.parallel import num_cores
+from mjxgrad._mjx import mjx
+
+_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+_SCENES = {
+    "two_bodies": Path(__file__).parents[1] / "mjcf" / "two_bodies.xml",
+    "hopper": _ASSETS / "hopper.xml",
+    "half_cheetah": _ASSETS / "half_cheetah.xml",
+}
+_TOLERANCE = 1e-6
+_PATCHED_ITERATIONS = 10
+
+# Of `costs`: from how high above contact a scene starts (m), as index in qpos and height; and how many steps it takes.
+_STARTS = {"two_bodies": (2, 0.02), "hopper": (1, 0.05)}
+_NUM_STEPS = 100
+
+# Of `throughput`.
+_STIFFNESS = np.logspace(1, 5, 10)  # no array of JAX, which would begin before `--per-core` is read
+_ANGLE = 0.65
+_ESTIMATORS = (mg.estimators.first_order, mg.estimators.zeroth_order, mg.estimators.alpha_order)
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One measurement: seconds of each run, seconds to compile, bytes of temporary memory."""
+
+    name: str
+    runs: tuple[float, ...]
+    compilation: float
+    memory: float
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.runs) if self.runs else float("nan")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark that the command line names, and print its tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    bench = commands.add_parser("bench", help="speed and memory against mjx.step")
+    bench.add_argument("--scene", nargs="*", choices=list(_SCENES), default=list(_SCENES))
+    bench.add_argument("--batch", type=int, default=256)
+    bench.add_argument("--steps", type=int, default=100)
+    bench.add_argument(
+        "--runs", type=int, default=5, help="0 compiles and reports memory, which may exceed the machine's"
+    )
+    bench.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
+    bench.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
+    bench.set_defaults(run=_bench)
+    costs = commands.add_parser("costs", help="what onset, event gradient and smoothing cost")
+    costs.add_argument("--batch", type=int, default=256)
+    costs.add_argument("--repeats", type=int, default=7)
+    costs.add_argument("--only", default="", help="word that cases must hold, besides the plain ones")
+    costs.set_defaults(run=_costs)
+    throughput = commands.add_parser("throughput", help="a sweep over softness in one program against ten")
+    throughput.add_argument("--samples", type=int, default=1000)
+    throughput.add_argument(
+        "--separate", type=int, default=10, help="how many of the ten programs to compile one by one"
+    )
+    throughput.add_argument("--most-samples", type=int, default=10**6, help="of the table of memory")
+    throughput.add_argument(
+        "--run-most", action="store_true", help="run the largest number of samples, too, and time it"
+    )
+    throughput.set_defaults(run=_throughput)
+    options = parser.parse_args(arguments)
+    options.run(options)
+
+
+def _announce(work: str) -> None:
+    print(
+        f"{len(jax.devices())} × {jax.devices()[0].device_kind}, {num_cores()} cores, {work}; "
+        f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}"
+    )
+
+
+def _compile(function: Any, *arguments: Any) -> tuple[Any, float]:
+    """Give the compiled program, and the seconds that it took to compile."""
+    begin = time.perf_counter()
+    return jax.jit(function).lower(*arguments).compile(), time.perf_counter() - begin
+
+
+def _seconds(function: Callable, *arguments: Any) -> float:
+    """Time one run."""
+    begin = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - begin
+
+
+def _memory(program: Any) -> float:
+    """Give the bytes of temporary memory."""
+    return program.memory_analysis().temp_size_in_bytes
+
+
+def _bench(options: argparse.Namespace) -> None:
+    """Print one table per scene."""
+    if options.per_core:
+        jax.config.update("jax_num_cpu_devices", num_cores())
+    _announce(
+        f"batch {options.batch}, {options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]"
+    )
+    for name in options.scene:
+        print(f"\n{name}")
+        rows: list[Row] = []
+        for row in _measure(name, options):
+            rows.append(row)
+            print(_format(row, rows, options), flush=True)
+
+
+def _measure(name: str, options: argparse.Namespace) -> Iterator[Row]:
+    mj_model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
+    mj_model.opt.tolerance, mj_model.opt.iterations, mj_model.opt.ls_iterations = _TOLERANCE, 100, 20
+    mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    scene = mg.load_scene(mj_model)
+    states = _states(mj_model, options.batch)
+    runs = options.runs
+    yield _time("mjx.step", mg.over_devices(lambda s: _mjx_outcome(scene, s, options.steps)), states, runs)
+    for checkpoint, label in ((True, ""), (False, ", all kept")):
+
+        def outcome(state: Any, checkpoint: bool = checkpoint) -> Any:
+            return _outcome(scene, state, options.steps, checkpoint)
+
+        if checkpoint:
+            yield _time("mg.rollout", mg.over_devices(outcome), states, runs)
+        yield _time(f"mg value_and_grad{label}", mg.over_devices(jax.value_and_grad(outcome)), states, runs)
+    if not options.skip_patched:
+        yield _patched(scene, states, options)
+    if jax.default_backend() == "cpu" and runs:
+        yield _native(mj_model, states, options)
+
+
+def _states(mj_model: mujoco.MjModel, batch: int) -> tuple[jax.Array, jax.Array]:
+    """Return positions and velocities after the scene has fallen for half a second, stirred a little."""
+    data = mujoco.MjData(mj_model)
+    mujoco.mj_step(mj_model, data, round(0.5 / mj_model.opt.timestep))
+    random = np.random.default_rng(0)
+    qvel = data.qvel + 0.2 * random.normal(size=(batch, mj_model.nv))
+    return jnp.asarray(np.tile(data.qpos, (batch, 1))), jnp.asarray(qvel)
+
+
+def _outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int, checkpoint: bool) -> jax.Array:
+    start = mg.initial_state(scene, *state)
+    final = mg.rollout(scene, start, horizon=steps, checkpoint=checkpoint).final
+    return jnp.sum(final.qpos**2) + jnp.sum(final.qvel**2)
+
+
+def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int) -> jax.Array:
+    data = scene.data.replace(qpos=state[0], qvel=state[1])
+
+    def body(carry: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
+        qpos, qvel, act, warm = carry
+        moved = mjx.step(scene.model, data.replace(qpos=qpos, qvel=qvel, act=act, qacc_warmstart=warm))
+        return (moved.qpos, moved.qvel, moved.act, moved.qacc_warmstart), None
+
+    start = (data.qpos, data.qvel, data.act, data.qacc_warmstart)
+    final, _ = jax.lax.scan(body, start, length=steps)
+    return jnp.sum(final[0] ** 2) + jnp.sum(final[1] ** 2)
+
+
+def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
+    """Measure MJX's own gradient with `while_loop` replaced by a scan that stops counting once it is done."""
+    model = scene.model.tree_replace({"opt.iterations": _PATCHED_ITERATIONS})
+    patched_scene = dataclasses.replace(scene, model=model)
+
+    def scan_loop(goes_on: Callable, body: Callable, start: Any) -> Any:
+        def turn(value: Any, _: None) -> tuple[Any, None]:
+            keep = goes_on(value)
+            moved = body(value)
+            return jax.tree.map(lambda new, old: jnp.where(keep, new, old), moved, value), None
+
+        first = jax.tree.map(jnp.asarray, start)
+        dtypes = jax.eval_shape(body, first)
+        first = jax.tree.map(lambda x, d: jnp.broadcast_to(x, d.shape).astype(d.dtype), first, dtypes)
+        return jax.lax.scan(turn, first, length=_PATCHED_ITERATIONS)[0]
+
+    original, jax.lax.while_loop = jax.lax.while_loop, scan_loop
+    try:
+        function = mg.over_devices(jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps)))
+        return _time("mjx patched, value_and_grad", function, states, min(options.runs, 3))
+    finally:
+        jax.lax.while_loop = original
+
+
+def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
+    program, compilation = _compile(function, states)
+    if runs:
+        _seconds(program, states)
+    return Row(name, tuple(_seconds(program, states) for _ in range(runs)), compilation, _memory(program))
+
+
+def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
+    threads = num_cores()
+    data = [mujoco.MjData(mj_model) for _ in range(threads)]
+    size = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    initial = np.zeros((options.batch, size))
+    state = np.concatenate([np.asarray(x, np.float64) for x in states], axis=1)
+    initial[:, 1 : 1 + state.shape[1]] = state
+    with mujoco.rollout.Rollout(nthread=threads) as pool:
+        run = functools.partial(pool.rollout, nstep=options.steps)
+        seconds = [_seconds(run, [mj_model] * options.batch, data, initial) for _ in range(options.runs + 1)]
+    return Row(f"C MuJoCo, {threads} threads", tuple(seconds[1:]), 0.0, float("nan"))
+
+
+def _format(row: Row, rows: list[Row], options: argparse.Namespace) -> str:
+    steps = options.batch * options.steps
+    span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
+    memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
+    return (
+        f"  {row.name:28s} {row.median * 1e3:9.1f} ms {span}"
+        f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / rows[0].median:6.2f} of mjx.step"
+        f"  compile {row.compilation:5.1f} s {memory}"
+    )
+
+
+def _costs(options: argparse.Namespace) -> None:
+    """Print one table per scene."""
+    _announce(f"batch {options.batch}, {_NUM_STEPS} steps")
+    for name in _STARTS:
+        _cost(name, options)
+
+
+def _cost(name: str, options: argparse.Namespace) -> None:
+    scene = mg.load_scene(_SCENES[name])
+    place, height = _STARTS[name]
+    qpos = scene.data.qpos.at[place].add(height)
+    qvel = 0.3 * jax.random.normal(jax.random.key(0), (options.batch, scene.model.nv))
+
+    def cost(qvel, **settings):
+        state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
+        return jnp.sum(mg.rollout(scene, state, horizon=_NUM_STEPS, **settings).qpos[-1] ** 2)
+
+    def reverse(qvel, **settings):
+        return jax.value_and_grad(functools.partial(cost, **settings))(qvel)
+
+    def forward(qvel, **settings):
+        return jax.jvp(functools.partial(cost, **settings), (qvel,), (jnp.ones_like(qvel),))
+
+    smooth, behind = mg.Smoothing(1e-3), mg.Smoothing(1e-3, mode="backward")
+    cases = {
+        "rollout": (cost, {}),
+        "rollout, onset": (cost, {"onset": mg.Onset()}),
+        "rollout, smoothed": (cost, {"smoothing": smooth}),
+        "value_and_grad": (reverse, {}),
+        "value_and_grad, onset": (reverse, {"onset": mg.Onset()}),
+        "value_and_grad, event": (reverse, {"gradient": "event"}),
+        "value_and_grad, smoothed": (reverse, {"smoothing": smooth}),
+        "value_and_grad, smoothed backward": (reverse, {"smoothing": behind}),
+        "jvp": (forward, {}),
+        "jvp, onset": (forward, {"onset": mg.Onset()}),
+        "jvp, event": (forward, {"gradient": "event"}),
+    }
+    cases = {case: how for case, how in cases.items() if "," not in case or options.only in case}
+    programs = {case: jax.jit(jax.vmap(functools.partial(f, **settings))) for case, (f, settings) in cases.items()}
+    seconds = {case: [] for case in programs}
+    for turn in range(options.repeats + 1):
+        for case, program in programs.items():
+            taken = _seconds(program, qvel)
+            if turn:
+                seconds[case].append(taken)
+    for case, times in seconds.items():
+        base = float(np.median(seconds[case.split(",")[0]]))
+        low, middle, high = (1e3 * float(q) for q in np.quantile(times, [0, 0.5, 1]))
+        print(
+            f"{name:14} {case:34} {middle:8.1f} ms ({low:.1f} to {high:.1f})  ratio {middle / 1e3 / base:.2f}",
+            flush=True,
+        )
+
+
+def _throughput(options: argparse.Namespace) -> None:
+    """Print the time of the sweep, in one program and in ten, and a table of memory."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    _announce(f"{options.samples} samples, float32")
+    task, key = mg.tasks.ball_wall(), jax.random.key(0)
+    compiling, running = _compile_and_run(
+        _estimates(task, options.samples), [(stiffness, key) for stiffness in _STIFFNESS]
+    )
+    print(f"one program, ten stiffness values: compiled in {compiling:.1f} s, ran in {running:.1f} s")
+    separate = [_one_by_one(task, options.samples, stiffness, key) for stiffness in _STIFFNESS[: options.separate]]
+    compiled, ran = (sum(times) for times in zip(*separate, strict=True))
+    print(f"{len(separate)} programs: compiled in {compiled:.1f} s, ran in {ran:.1f} s")
+    # A process of its own would also import and load the scene.
+    total = (compiled + ran) * len(_STIFFNESS) / len(separate)
+    print(f"the sweep in one program is {total / (compiling + running):.1f} times faster than ten programs")
+    _memory_by_samples(task, key, options)
+
+
+def _estimates(task: mg.tasks.BallWall, num_samples: int) -> Callable:
+    def estimates(stiffness: jax.Array, key: jax.Array) -> list:
+        objective = task.objective(0.1, mg.tasks.wall_softness(stiffness))
+        return [estimator(objective, jnp.array([_ANGLE]), key, num_samples=num_samples) for estimator in _ESTIMATORS]
+
+    return estimates
+
+
+def _one_by_one(task: mg.tasks.BallWall, num_samples: int, stiffness: jax.Array, key: jax.Array) -> tuple[float, float]:
+    jax.clear_caches()
+    estimates = _estimates(task, num_samples)
+    return _compile_and_run(lambda key: estimates(stiffness, key), [(key,)])
+
+
+def _compile_and_run(function: Callable, arguments: list[tuple]) -> tuple[float, float]:
+    """Give the seconds to compile for the first arguments, and to run all of them."""
+    program, compilation = _compile(function, *arguments[0])
+    return compilation, sum(_seconds(program, *one) for one in arguments)
+
+
+def _memory_by_samples(task: mg.tasks.BallWall, key: jax.Array, options: argparse.Namespace) -> None:
+    print("samples      memory of the three estimators in one program")
+    count = 1000
+    while count <= options.most_samples:
+        program, _ = _compile(_estimates(task, count), _STIFFNESS[0], key)
+        print(f"{count:8d} {_memory(program) / 1e6:10.2f} MB", flush=True)
+        if options.run_most and count == options.most_samples:
+            runs = [_seconds(program, stiffness, key) for stiffness in _STIFFNESS[:3]]
+            print(
+                f"{count:8d} samples × 3 estimators in {statistics.median(runs):.1f} s, the median of 3 stiffness values"
+            )
+        count *= 10
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""The answer of an optimisation experiment in words, computed from its numbers."""
+
+import json
+
+import numpy as np
+
+from experiments.optimisation.figures import draw
+from experiments.optimisation.outcome import Difference, Outcome, Run
+from experiments.overview import HEADLINE
+from experiments.report import Report, Table
+from experiments.words import quantity
+from experiments.workspace import Workspace
+
+# A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
+_AGREEMENT = 3.0
+
+
+def report(outcome: Outcome, workspace: Workspace) -> Report:
+    """Draw the outcome, and say what follows from it."""
+    (workspace.folder / HEADLINE).write_text(json.dumps(headline(outcome), indent=2) + "\n", encoding="utf-8")
+    return Report(
+        verdict=verdict(outcome),
+        findings=findings(outcome),
+        figures=draw(outcome, workspace.folder),
+        tables=tables(outcome),
+        metrics=outcome.rows(),
+        warnings=warnings(outcome),
+    )
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say whether α-order is worse than the better of first and zeroth order, and which method ends lowest."""
+    return " ".join([*(_comparison(difference) for difference in outcome.verdicts), _lowest(outcome)])
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Single findings, one sentence each."""
+    found = (_reproduction(outcome), _choice(outcome), _time(outcome), _without_progress(outcome))
+    return [sentence for sentence in found if sentence]
+
+
+def warnings(outcome: Outcome) -> list[str]:
+    """Say what was lost or left out."""
+    sentences = []
+    for run in outcome.runs:
+        parts = []
+        if run.is_lost.any():
+            parts.append(f"{run.is_lost.sum()} of {run.is_lost.size} runs ended without a finite cost")
+        if run.num_skipped.any():
+            parts.append(f"{run.num_skipped.sum()} steps were not taken, because the estimate was not finite")
+        if run.finite_share < 1:
+            parts.append(f"{1 - run.finite_share:.2%} of the rollouts were not finite and were left out")
+        if parts:
+            sentences.append(f"{run.method.label}: {'; '.join(parts)}.")
+    return sentences
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all methods."""
+    worse = {difference.ours.method.label for difference in outcome.verdicts if difference.is_above}
+    rows, emphasised = [], set()
+    for i, run in enumerate(outcome.runs):
+        if run.method.label in worse or run.method.label == outcome.best.method.label:
+            emphasised.add((i, 1))
+        if run.is_lost.any():
+            emphasised.add((i, 4))
+        low, high = run.interval(outcome.settings.confidence)
+        error = outcome.relative_error(run)
+        rows.append(
+            [
+                run.method.label,
+                quantity(run.mean, run.spread),
+                f"{quantity(low)} to {quantity(high)}" if low == low else "",
+                _published(outcome, run),
+                f"{run.is_lost.sum()} of {run.is_lost.size}",
+                "" if error is None else quantity(error[0], (error[2] - error[1]) / 2),
+                str(run.rollouts_per_step),
+                f"{1e3 * run.seconds_per_step:.3g}",
+                f"{run.compile_seconds:.1f}",
+            ]
+        )
+    percent = f"{outcome.settings.confidence:.0%}"
+    columns = (
+        "method", "final cost", f"{percent} interval of the mean", "published", "lost runs", "relative error",
+        "rollouts per step", "ms per step", "compilation, s",
+    )  # fmt: skip
+    caption = (
+        f"Cost without noise after {outcome.num_steps} steps, mean ± standard deviation over {outcome.settings.seeds} "
+        f"seeds, from {quantity(outcome.start_cost)} at the start; {outcome.dim} parameters. Lost runs have no finite cost "
+        "in the end; they are not in mean and interval. Bold is the lowest mean, and α-order if it is worse than the "
+        "better of first and zeroth order. The error is that of one estimate at the start. A step's time is that of one "
+        "seed of all that run at once."
+    )
+    return [Table(columns, rows, caption, frozenset(emphasised))]
+
+
+def headline(outcome: Outcome) -> dict[str, str]:
+    """Give the row of this run in the page over a sweep."""
+    cells = {
+        run.method.label: quantity(run.mean, run.spread) + (f" ({run.is_lost.sum()} lost)" if run.is_lost.any() else "")
+        for run in outcome.runs
+    }
+    for difference in outcome.verdicts:
+        kind = "worse" if difference.is_above else "better" if difference.is_below else "no difference"
+        cells["α-order against the better"] = f"{kind}: {_signed(difference)}"
+    return cells
+
+
+def _comparison(difference: Difference) -> str:
+    ours, other = difference.ours, difference.other
+    if not (ours.kept.size and other.kept.size):
+        return f"{ours.is_lost.sum()} runs of α-order and {other.is_lost.sum()} of {other.method.label} were lost."
+    ends = f"{quantity(ours.mean, ours.spread)}, against {quantity(other.mean, other.spread)}"
+    numbers = f"{ends}; difference {_signed(difference)}, rank test p = {difference.p_value:.2g}"
+    lost = f", with {ours.is_lost.sum()} runs lost" if ours.is_lost.any() else ""
+    if difference.is_above:
+        return f"α-order ends worse than {other.method.label}, the better of first and zeroth order{lost} ({numbers})."
+    if difference.is_below:
+        return f"α-order ends better than {other.method.label}, the better of first and zeroth order{lost} ({numbers})."
+    return (
+        f"α-order is not worse than {other.method.label}, the better of first and zeroth order, beyond seed "
+        f"noise{lost} ({numbers})."
+    )
+
+
+def _signed(difference: Difference) -> str:
+    """Write a difference with its interval."""
+    ends = f"{quantity(difference.low)} to {quantity(difference.high)}"
+    sign = "+" if difference.value > 0 else ""
+    return f"{sign}{quantity(difference.value)}, {difference.confidence:.0%} interval {ends}"
+
+
+def _lowest(outcome: Outcome) -> str:
+    best = outcome.best
+    return f"Lowest of all ends {best.method.label}, at {quantity(best.mean, best.spread)}."
+
+
+def _published(outcome: Outcome, run: Run) -> str:
+    found = outcome.published(run)
+    if found is None:
+        return ""
+    return quantity(found[0], found[1] if np.isfinite(found[1]) else None)
+
+
+def _reproduction(outcome: Outcome) -> str | None:
+    """Compare with what was published, within the spreads of both."""
+    pairs = [(run, found) for run in outcome.runs if (found := outcome.published(run)) is not None and run.kept.size]
+    if not pairs:
+        return None
+    apart = []
+    for run, (mean, spread) in pairs:
+        width = np.hypot(np.nan_to_num(run.spread), np.nan_to_num(spread))
+        # Published to three or four digits.
+        if abs(run.mean - mean) > _AGREEMENT * width + 1e-3 * abs(mean):
+            apart.append(f"{run.method.label} ({_number(run.mean)}, published {_number(mean)})")
+    agreeing = f"{len(pairs) - len(apart)} of {len(pairs)} published results are met within three standard deviations"
+    return f"{agreeing}; apart: {', '.join(apart)}." if apart else f"{agreeing}."
+
+
+def _choice(outcome: Outcome) -> str | None:
+    """Say what α-order as it comes did, and why."""
+    ours = [run for run in outcome.runs if run.method.is_default_alpha]
+    if not ours:
+        return None
+    run, total = ours[0], max(int((~np.isnan(ours[0].alpha)).sum()), 1)
+    words = {
+        "inverse_variance": "found no bias",
+        "bias_limit": "found a bias and limited it",
+        "inconsistent": "found that derivatives contradict the costs, and left them out",
+        "not_finite": "had too few finite derivatives",
+    }
+    parts = [f"{words.get(name, name)} in {where.sum() / total:.1%}" for name, where in run.reasons.items()]
+    return f"α-order {', '.join(parts)} of its steps; its mean α is {np.nanmean(run.alpha):.3g}."
+
+
+def _time(outcome: Outcome) -> str | None:
+    times = {run.method.label: run.seconds_per_step for run in outcome.runs}
+    if not {"first order", "α-order"} <= set(times):
+        return None
+    return f"A step of α-order takes {times['α-order'] / times['first order']:.2g} times as long as one of first order."
+
+
+def _without_progress(outcome: Outcome) -> str | None:
+    stuck = [run.method.label for run in outcome.runs if run.kept.size and run.mean >= outcome.start_cost]
+    return f"No better than the start: {', '.join(stuck)}." if stuck else None
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"

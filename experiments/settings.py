@@ -1,0 +1,38 @@
+"""What every kind of experiment can be told, and what its settings are made of; imports nothing heavy."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class SettingsTable(BaseModel):
+    """A table of settings that refuses unknown keys and wrong types."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True)
+
+
+class RunSettings(SettingsTable):
+    """What every kind of experiment has."""
+
+    experiment: str
+    """The kind of experiment, a folder of `experiments`."""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Of every random number in the run."""
+    precision: Literal["float32", "float64"] = "float64"
+    """Of every array in the run."""
+
+
+class VideoSettings(SettingsTable):
+    """How a video is drawn."""
+
+    speed: Positive = 0.25
+    """Simulated over shown time: 1 is real speed."""
+    fps: Positive = 30.0
+    """Frames per second."""
+    width: Annotated[int, Field(ge=64, le=1920)] = 480
+    """Of one motion, in pixels."""
+    height: Annotated[int, Field(ge=64, le=1080)] = 270
+    """Of one motion, in pixels."""
