@@ -3,7 +3,7 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad.contact import Softness
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
 
@@ -86,33 +87,26 @@ def optional_pytree(function: Callable | None) -> Callable | None:
     return None if function is None else as_pytree(function)
 
 
-class SceneTask(Task):
-    """A scene, where it starts, how long it runs, and what the trajectory costs.
+# Not typing.Self, which beartype refuses in methods that are checked one by one.
+Same = TypeVar("Same", bound="InScene")
+
+
+class InScene(eqx.Module):
+    """What moves in a scene, whose contacts may be stepped in several ways.
 
     Attributes:
         scene: from `load_scene`.
-        state: the nominal start.
-        cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
-            and controls up to t, whose sum is the cost; traceable.
-        horizon: number of steps.
-        start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
         gradient: of each step, "discrete" or "event", see `step`.
         onset: lets contacts begin within the step, so that the cost has no jumps but real ones and its plain derivative is right
             sample by sample; None is MuJoCo's motion. A leaf.
-        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
     scene: Scene
-    state: State
-    cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
-    horizon: int = eqx.field(static=True)
-    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
-    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
-    def with_gradient(self, gradient: Gradient) -> "SceneTask":
-        """Give the same task with MuJoCo's own motion and one of its derivatives.
+    def with_gradient(self: Same, gradient: Gradient) -> Same:
+        """Give the same with MuJoCo's own motion and one of its derivatives.
 
         Raises:
             ValueError: if there is no such gradient.
@@ -120,9 +114,36 @@ class SceneTask(Task):
         check_gradient(gradient)
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
-    def with_onset(self, onset: Onset | None) -> "SceneTask":
-        """Give the same task with contacts that begin otherwise."""
+    def with_onset(self: Same, onset: Onset | None) -> Same:
+        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
         return dataclasses.replace(self, gradient="discrete", onset=onset)
+
+    def with_softness(self: Same, softness: Softness) -> Same:
+        """Give the same with other contact softness."""
+        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
+
+
+class SceneTask(Task, InScene):
+    """A scene, where it starts, how long it runs, and what the trajectory costs.
+
+    Attributes:
+        state: the nominal start.
+        cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
+            and controls up to t, whose sum is the cost; traceable.
+        horizon: number of steps.
+        start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
+        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
+    """
+
+    state: State
+    cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
+    horizon: int = eqx.field(static=True)
+    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
+    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
+
+    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
+        """Give the same with contact averaged over noise."""
+        return dataclasses.replace(self, smoothing=smoothing)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

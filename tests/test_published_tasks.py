@@ -42,11 +42,20 @@ def test_no_derivative_is_nan(name, key):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_charged_by_step_adds_up(name, key):
+def test_a_step_is_charged_for_nothing_that_comes_later(name, key):
+    """As the cost to go of a control takes it; what does come from the noise of a step is charged from it on."""
     task = setting(name)
-    outcome = eqx.filter_jit(task.objective.outcome)(task.params, task.objective.sample_noise(key))
-    assert outcome.step_costs.shape == (task.objective.task.horizon + 1,)
-    np.testing.assert_allclose(outcome.step_costs.sum(), outcome.cost, rtol=1e-12)
+    objective, later = task.objective, task.objective.task.horizon // 2
+    actions, start = objective.split(objective.sample_noise(key))
+
+    @eqx.filter_jit
+    def charged(actions):
+        return objective.outcome(task.params, actions if start is None else (actions, start)).step_costs
+
+    before, after = charged(actions), charged(actions.at[later:].add(0.1))
+    assert before.shape == (objective.task.horizon + 1,)
+    np.testing.assert_array_equal(before[:later], after[:later])
+    assert (before[later:] != after[later:]).any()
 
 
 def descend(task, estimator):

@@ -22,11 +22,11 @@ PULLED = jnp.ones((12, 1))  # N: far more than friction passes on
 
 
 @pytest.mark.parametrize("make", [push, friction, motion_planning, tennis])
-def test_a_scene_loads_without_a_warning_and_its_settings_fit(make):
+def test_a_scene_loads_without_a_warning_and_its_start_fits(make):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        problem = make(horizon=3).problem()
-    assert problem.params.shape == (problem.objective.dim,)
+        task = make(horizon=3)
+    assert task.initial_params().shape == (task.objective().dim,)
 
 
 def test_random_starts_have_the_shape_of_the_nominal_one(key):
@@ -210,11 +210,11 @@ def test_a_pad_that_misses_is_blind_to_its_velocity_and_zeroth_order_is_not(key)
 @pytest.mark.slow
 def test_seeds_and_samples_may_be_mapped_over_at_once():
     """Two nested batches of elliptic contacts, differentiated: XLA's CPU backend once died of it (jax 0.10.2)."""
-    problem = motion_planning(horizon=10).problem()
-    params = jnp.stack([problem.params] * 2)
+    task = motion_planning(horizon=10)
+    objective, params = task.objective(), jnp.stack([task.initial_params()] * 2)
 
     def gradient(params, key):
-        return first_order(problem.objective, params, key, num_samples=50).value
+        return first_order(objective, params, key, num_samples=50).value
 
     keys = jax.random.split(jax.random.key(0), 2)
     both = jax.jit(jax.vmap(gradient))(params, keys)

@@ -136,7 +136,7 @@ def _push(name: str) -> Problem:
         title=f"Push, {stiffness:g} N/m",
         scene=task.scene,
         objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
-        stddev=task.settings.stddev,
+        stddev=task.stddev,
         points=[Point("start", task.initial_params())],
         num_samples=16,
         has_jump_of_force=False,

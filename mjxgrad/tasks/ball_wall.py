@@ -8,8 +8,6 @@ References:
     arXiv:2202.00817, figure 2 (there in closed form).
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
@@ -17,52 +15,27 @@ from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Trajectory, initial_state, rollout
 from mjxgrad.contact import Softness
-from mjxgrad.dynamics import Gradient, Onset, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
-from mjxgrad.scene import Scene, load_scene
-from mjxgrad.task import finite_cost
+from mjxgrad.scene import load_scene
+from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.files import scene_path
 
 # The knob is the wall alone: with the floor softened as well, the ball would sink and slide farther, too.
 WALL_CONTACT = (("ball", "wall"),)
 
 
-class BallWall(eqx.Module):
-    """The throw; see `ball_wall`.
+class BallWall(InScene):
+    """The throw; see `ball_wall`. Contacts set in without a jump, so derivatives differ only under another impedance.
 
     Attributes:
-        scene: the ball, the wall and the floor.
         speed: of the throw, in m/s.
         target: where the ball should end, in m from the start.
         horizon: number of steps; long enough for the ball to land and stop.
-        gradient: of each step, "discrete" or "event"; see `mjxgrad.step`. The scene's contacts set in without a jump, so
-            the two differ only after a change of its impedance.
-        onset: of contacts within the step; None is MuJoCo's motion.
     """
 
-    scene: Scene
     speed: Float[Array, ""]
     target: Float[Array, ""]
     horizon: int = eqx.field(static=True)
-    gradient: Gradient = eqx.field(static=True, default="discrete")
-    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
-
-    def with_gradient(self, gradient: Gradient) -> "BallWall":
-        """Give the same throw with MuJoCo's own motion and one of its derivatives.
-
-        Raises:
-            ValueError: if there is no such gradient.
-        """
-        check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient, onset=None)
-
-    def with_onset(self, onset: Onset | None) -> "BallWall":
-        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
-        return dataclasses.replace(self, gradient="discrete", onset=onset)
-
-    def with_softness(self, softness: Softness) -> "BallWall":
-        """Give the same throw with other contact softness."""
-        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
 
     def trajectory(self, angle: Float[Array, " 1"]) -> Trajectory:
         """Throw once.

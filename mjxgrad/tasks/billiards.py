@@ -16,38 +16,31 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Trajectory, initial_state, rollout
-from mjxgrad.contact import Softness
-from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.objective import ParameterNoise, parameter_noise
-from mjxgrad.scene import Scene, load_scene
-from mjxgrad.task import finite_cost
+from mjxgrad.scene import load_scene
+from mjxgrad.smoothing.smoothing import Smoothing
+from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.files import scene_path
 
 BILLIARDS_CONTACT = (("driven", "knocked"),)
 _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)
 
 
-class Billiards(eqx.Module):
+class Billiards(InScene):
     r"""The stroke; see `billiards`.
 
     Attributes:
-        scene: both balls.
         target: where the knocked ball should be in the end, in m.
         effort: $\epsilon$, price of the squared force, in m²/(N² s).
         num_pieces: the force is constant over as many pieces of the time.
         horizon: number of steps, a multiple of `num_pieces`.
-        gradient: "discrete" or "event", as for `rollout`.
-        onset: of contacts within the step; None is MuJoCo's motion.
         smoothing: as for `rollout`.
     """
 
-    scene: Scene
     target: Float[Array, " 2"]
     effort: Float[Array, ""]
     num_pieces: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
-    gradient: Gradient = eqx.field(static=True, default="discrete")
-    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
     smoothing: Smoothing | None = None
 
     def start(self, force: float = 1.0) -> Float[Array, " dim"]:
@@ -78,23 +71,6 @@ class Billiards(eqx.Module):
         model = self.scene.model
         model = model.replace(pair_margin=jnp.full_like(model.pair_margin, margin))
         return eqx.tree_at(lambda task: task.scene.model, self, model)
-
-    def with_softness(self, softness: Softness) -> "Billiards":
-        """Give the same stroke with other contact softness."""
-        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
-
-    def with_onset(self, onset: Onset | None) -> "Billiards":
-        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
-        return dataclasses.replace(self, gradient="discrete", onset=onset)
-
-    def with_gradient(self, gradient: Gradient) -> "Billiards":
-        """Give the same stroke with another derivative; see `rollout`.
-
-        Raises:
-            ValueError: if there is no such gradient.
-        """
-        check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_smoothing(self, smoothing: Smoothing | None) -> "Billiards":
         """Give the same stroke with its contact averaged over noise on the distance; see `rollout`."""

@@ -8,12 +8,12 @@ References:
 import jax.numpy as jnp
 
 from mjxgrad.scene import load_scene
+from mjxgrad.tasks.action_task import ActionTask, quadratic_task
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 
-def friction(*, horizon: int = 400) -> StoryTask:
+def friction(*, horizon: int = 400) -> ActionTask:
     """Load the tray and the puck: both are to be 2 m ahead and at rest, the puck above all.
 
     Masses, time step, friction, start, goal and cost are the published ones. A puck that is off the tray falls, at the
@@ -29,13 +29,10 @@ def friction(*, horizon: int = 400) -> StoryTask:
     scene = load_scene(scene_path("friction"))
     weight = jnp.array([0.1, 10.0, 0.0, 0.1, 0.1, 0.0])
     cost = QuadraticCost(jnp.array([2.0, 2.0, 0.0, 0.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return story_task(
+    return quadratic_task(
         scene,
         cost,
         horizon,
         start_params=jnp.zeros((horizon, 1)),
         gradient="discrete",  # The contact lasts throughout: there is no event to correct.
-        settings=Settings(
-            "friction", stddev=0.1, num_samples=10, learning_rate=1e-4, num_steps=100, gamma=2e4, bound=100.0
-        ),
     )

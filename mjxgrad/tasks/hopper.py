@@ -10,21 +10,18 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import State, Trajectory, initial_state
-from mjxgrad.objective import ActionNoise, closed_loop
-from mjxgrad.policy import Affine, LinearPolicy, linear_policy
+from mjxgrad.policy import linear_policy
 from mjxgrad.scene import load_scene
-from mjxgrad.task import SceneTask
+from mjxgrad.tasks.action_task import ActionTask
 
 # Bent, so that the legs take up the landing; moving down, so that it lands after 70 ms.
 START_POSE = (0.0, 1.22, 0.0, -0.4, -0.5, 0.3)  # m, m, rad
 START_VELOCITY = (0.5, -1.0, 0.0, 0.0, 0.0, 0.0)
 # In actions per rad and per rad/s; the motors turn with 200 Nm for an action of 1.
 STIFFNESS, DAMPING = (0.5, 0.5, 0.3), (0.05, 0.05, 0.03)
-STDDEV = 0.1
 
 
 class JumpCost(eqx.Module):
@@ -41,27 +38,7 @@ class JumpCost(eqx.Module):
         return -trajectory.qpos[-1, 0] - self.height_weight * trajectory.qpos[-1, 1]
 
 
-class Hopper(SceneTask):
-    """The drop; see `hopper`.
-
-    Attributes:
-        policy: from `Affine` parameters and a state to the three actions.
-        start_params: the posture's gains and offsets.
-    """
-
-    policy: LinearPolicy = eqx.field(kw_only=True)
-    start_params: Affine = eqx.field(kw_only=True)
-
-    def objective(self, stddev: float | Float[Array, "..."] = STDDEV) -> ActionNoise:
-        """Give the cost under noise on the actions, as a function of the policy's parameters, flattened."""
-        return closed_loop(self, self.policy, stddev, params=self.start_params)
-
-    def initial_params(self) -> Float[Array, " dim"]:
-        """Give the posture's parameters as the flat vector that estimators take."""
-        return ravel_pytree(self.start_params)[0]
-
-
-def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> Hopper:
+def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
     """Load the drop: the foot lands after 70 ms, and what counts is where the torso is at the end.
 
     Model and contact are gymnasium's; steps are Euler's, not RK4's, which costs a quarter. The policy sees angles and speeds
@@ -82,7 +59,7 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> Hopper:
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
     posture = dataclasses.replace(zero, gain=gain, offset=stiffness * jnp.array(START_POSE[3:]))
     # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
-    return Hopper(  # pyright: ignore[reportCallIssue]
+    return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,
         state=initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY)),
         cost=JumpCost(jnp.asarray(height_weight, float)),

@@ -8,14 +8,14 @@ References:
 import jax.numpy as jnp
 
 from mjxgrad.scene import load_scene
+from mjxgrad.tasks.action_task import ActionTask, quadratic_task
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 START_SPEED = 0.01  # m/s
 
 
-def motion_planning(*, horizon: int = 100) -> StoryTask:
+def motion_planning(*, horizon: int = 100) -> ActionTask:
     """Load the robot and the pillars: it is to reach the point 4 m ahead and stay.
 
     The course, start, goal and cost are the published ones, in half as many steps of twice the length.
@@ -29,18 +29,10 @@ def motion_planning(*, horizon: int = 100) -> StoryTask:
     scene = load_scene(scene_path("motion_planning"))
     weight = jnp.array([1.0, 1.0, 0.0, 0.0])
     cost = QuadraticCost(jnp.array([0.0, 4.0, 0.0, 0.0]), weight, 10 * weight, jnp.array(0.001))
-    return story_task(
+    return quadratic_task(
         scene,
         cost,
         horizon,
         start_params=jnp.full((horizon, 2), START_SPEED),
-        settings=Settings(
-            "motion_planning",
-            stddev=0.3,
-            num_samples=50,
-            learning_rate=0.03,
-            num_steps=100,
-            gamma=150.0,
-            bound=10.0,
-        ),
+        stddev=0.3,
     )

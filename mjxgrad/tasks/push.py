@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 
 from mjxgrad.contact import Softness
 from mjxgrad.scene import load_scene
+from mjxgrad.tasks.action_task import ActionTask, quadratic_task
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
-from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 PUSH_CONTACT = (("pusher", "pushed"),)
 # Two bodies of 0.1 kg move against each other like one of half that mass.
@@ -20,7 +20,7 @@ REDUCED_MASS = 0.05  # kg
 START_FORCE = 0.1  # N
 
 
-def push(stiffness: float = 10.0, *, horizon: int = 200) -> StoryTask:
+def push(stiffness: float = 10.0, *, horizon: int = 200) -> ActionTask:
     """Load the push: both balls are to be 1 m ahead and at rest, the second above all.
 
     Masses, time step, start, goal and cost are the published ones. Those of 10 and 1000 N/m differ there in damping and
@@ -36,15 +36,12 @@ def push(stiffness: float = 10.0, *, horizon: int = 200) -> StoryTask:
     scene = load_scene(scene_path("push"), softness=push_softness(stiffness))
     weight = jnp.array([0.1, 10.0, 0.1, 0.1])
     cost = QuadraticCost(jnp.array([1.0, 1.0, 0.0, 0.0]), weight, weight, jnp.array(1.0))
-    return story_task(
+    return quadratic_task(
         scene,
         cost,
         horizon,
         start_params=jnp.full((horizon, 1), START_FORCE),
         gradient="discrete",  # Contact sets in without a jump: there is nothing to correct.
-        settings=Settings(
-            "push", stddev=0.1, num_samples=10, learning_rate=1e-3, num_steps=200, gamma=1e8, bound=100.0
-        ),
     )
 
 

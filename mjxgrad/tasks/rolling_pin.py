@@ -13,8 +13,6 @@ References:
     Physics. ICLR 2021, arXiv:2104.03311 (the rolling pin, and soft contact of its tools).
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,8 +20,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._rollout import Trajectory, initial_state
-from mjxgrad.contact import Softness
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.objective import ActionNoise, open_loop
 from mjxgrad.scene import load_scene
 from mjxgrad.task import SceneTask
@@ -73,14 +69,6 @@ class RollingPin(SceneTask):
     def target(self) -> Float[Array, " pillars"]:
         """Heights wished for, less those at rest (m)."""
         return self.cost.target  # pyright: ignore[reportFunctionMemberAccess]
-
-    def with_softness(self, softness: Softness) -> "RollingPin":
-        """Give the task with other contact, such as a margin."""
-        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
-
-    def with_smoothing(self, smoothing: Smoothing | None) -> "RollingPin":
-        """Give the task with contact averaged over noise."""
-        return dataclasses.replace(self, smoothing=smoothing)
 
     def with_proximity(self, weight: Float[ArrayLike, ""]) -> "RollingPin":
         """Give the task whose cost draws the pin to the bed."""

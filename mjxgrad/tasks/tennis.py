@@ -12,10 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from mjxgrad._rollout import State, initial_state
 from mjxgrad.policy import linear_policy
 from mjxgrad.scene import load_scene
+from mjxgrad.tasks.action_task import ActionTask, quadratic_task
 from mjxgrad.tasks.files import scene_path
 from mjxgrad.tasks.published import QuadraticCost
 from mjxgrad.tasks.published.tennis import Tennis, tennis_task
-from mjxgrad.tasks.story import Settings, StoryTask, story_task
 
 
 class Starts(eqx.Module):
@@ -43,7 +43,7 @@ class Starts(eqx.Module):
         )
 
 
-def tennis(*, horizon: int = 200) -> StoryTask:
+def tennis(*, horizon: int = 200) -> ActionTask:
     """Load the ball and the pad: the ball is to end at rest 2.5 m from where the pad begins.
 
     Sizes, starts, goal and cost are the published ones.
@@ -61,7 +61,7 @@ def tennis(*, horizon: int = 200) -> StoryTask:
     policy, params = linear_policy(7, 3, bias=False, observe=published_state)
     goal = jnp.zeros(10).at[1].set(2.5)
     final_weight = jnp.zeros(10).at[jnp.array([0, 1, 5, 6])].set(jnp.array([100.0, 100.0, 10.0, 10.0]))
-    return story_task(
+    return quadratic_task(
         scene,
         QuadraticCost(goal, jnp.zeros(10), final_weight, jnp.array(0.001)),
         horizon,
@@ -70,16 +70,6 @@ def tennis(*, horizon: int = 200) -> StoryTask:
         start_params=params,
         policy=policy,
         gradient="discrete",  # Contact sets in without a jump: there is nothing to correct.
-        settings=Settings(
-            "tennis",
-            stddev=0.1,
-            num_samples=100,
-            learning_rate=1e-6,
-            num_steps=60,
-            gamma=1000.0,
-            bound=1000.0,
-            num_starts=500,
-        ),
     )
 
 
