@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Trajectory, initial_state, rollout
+from mjxgrad.dynamics import Smoothing
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import load_scene
-from mjxgrad.smoothing.smoothing import Smoothing
 from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.files import scene_path
 
