@@ -1,6 +1,6 @@
 """Print how large the house is: files, lines, words of the front page, public names, frames from `optimise` to the solve.
 
-    .venv/bin/python .ci/house.py
+Run it by .venv/bin/python .ci/house.py.
 """
 
 import sys
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 
-class Reached(Exception):
+class ReachedError(Exception):
     """Raised where the solve begins, to read the stack there."""
 
 
@@ -27,7 +27,7 @@ def frames() -> int:
     from mjxgrad.dynamics import newton
 
     def reached(*_, **__):
-        raise Reached
+        raise ReachedError
 
     newton.minimise = reached
     task = mg.tasks.ball_wall()
@@ -41,7 +41,7 @@ def frames() -> int:
             optimiser=optax.adam(0.01),
             num_steps=1,
         )
-    except Reached as error:
+    except ReachedError as error:
         library = str(ROOT / "mjxgrad")
         return sum(frame.filename.startswith(library) for frame in traceback.extract_tb(error.__traceback__))
     raise RuntimeError("the solve was not reached")
