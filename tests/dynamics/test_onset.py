@@ -288,7 +288,7 @@ _CORNER = {"half": 0.03, "half_height": 0.02, "start": "-.05 0 .005"}
         ("pyramidal", 3, _THIN, 3),
         ("elliptic", 3, _THIN, 3),
         ("pyramidal", 1, _CORNER, 2),
-        ("elliptic", 3, _CORNER, 3),
+        pytest.param("elliptic", 3, _CORNER, 3, marks=pytest.mark.slow),
     ],
 )
 def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim, wall, num_pushed):
