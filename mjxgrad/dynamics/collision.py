@@ -80,7 +80,7 @@ def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
 def other_sides(
     model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
 ) -> tuple[Any, Float[Array, " contacts"]]:
-    """Return the contacts that take the place of some as bodies move on, and by how much farther they are from doing so (m).
+    """Return the contact that would take the place of each as bodies move on, and by how much the present one is nearer (m).
 
     Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
     where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps.

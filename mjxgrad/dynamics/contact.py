@@ -29,21 +29,22 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     contact = contact.replace(friction=least_friction(contact.friction))
     rows = row_map(model, data, contact, first, dim)
     inverse_weight = jnp.sum(model.body_invweight0[_bodies(model, contact, first), 0], axis=1)
-    if _has_pyramids(model, dim):
+    if has_pyramids(model, dim):
         return _pyramids(model, contact, rows, inverse_weight, dim)
     return _cones(model, contact, rows, inverse_weight, dim)
 
 
 def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
     """Return the map of consecutive contacts of one dimension, the first of which has a number."""
-    friction = contact.friction[:, : dim - 1] if _has_pyramids(model, dim) else None
+    friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
     bodies = _bodies(model, contact, first)
     if isinstance(bodies, np.ndarray):
         return contact_rows(model, data, contact, bodies, dim, friction)
     return DenseRows.of_contacts(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
 
 
-def _has_pyramids(model: mjx.Model, dim: int) -> bool:
+def has_pyramids(model: mjx.Model, dim: int) -> bool:
+    """Return whether contacts of a dimension have the edges of a pyramid as rows."""
     return dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 

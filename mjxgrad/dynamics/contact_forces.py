@@ -1,13 +1,12 @@
 """The force between two geoms, by name."""
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics.collision import slot_geoms
-from mjxgrad.dynamics.contact import least_friction
+from mjxgrad.dynamics.contact import has_pyramids, least_friction
 from mjxgrad.dynamics.jacobian import fold
 
 
@@ -37,7 +36,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
         # MuJoCo's normal points from the first geom to the second, which the force pushes away.
         along, against = (jnp.all(contact.geom[slot] == jnp.array(pair)) for pair in (wanted, wanted[::-1]))
         sign = along.astype(total.dtype) - against
-        has_pyramid = dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        has_pyramid = has_pyramids(model, dim)
         num_rows = 2 * (dim - 1) if has_pyramid else dim
         force = data._impl.efc_force[address : address + num_rows]
         if has_pyramid:
