@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from tests.test_scene_leave_out import SCENE
+from tests.scene.test_leave_out import SCENE
 
 H, G = 0.005, 9.81
 FLOOR = mg.LeaveOut(pairs=(("floor", "ball"),))
