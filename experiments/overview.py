@@ -4,12 +4,10 @@ import html
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from experiments.config import Run
 from experiments.report import document
-
-# A run may leave a file of this name, a heading and a text for each of its main numbers; the page sets them side by side.
-HEADLINE = "headline.json"
 
 
 def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
@@ -34,7 +32,7 @@ def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
 
 def _numbers(runs: Sequence[Run], folders: Sequence[Path]) -> str:
     """Set the main numbers of all runs side by side; nothing if they have none."""
-    found = [_headline(folder) for folder in folders]
+    found = [_summary(folder)["headline"] for folder in folders]
     # In the order of their first appearance.
     headings = list(dict.fromkeys(heading for one in found for heading in one))
     if not headings:
@@ -46,14 +44,12 @@ def _numbers(runs: Sequence[Run], folders: Sequence[Path]) -> str:
     return _table([*runs[0].varied, *headings], rows)
 
 
-def _headline(folder: Path) -> dict[str, str]:
-    path = folder / HEADLINE
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+def _summary(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 
 def _verdict_row(run: Run, folder: Path) -> str:
-    verdict = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["verdict"]
-    cells = [html.escape(str(text)) for text in [*run.varied.values(), verdict]]
+    cells = [html.escape(str(text)) for text in [*run.varied.values(), _summary(folder)["verdict"]]]
     return _row([*cells, f'<a href="{html.escape(folder.name)}/report.html">report</a>'])
 
 

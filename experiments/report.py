@@ -59,6 +59,7 @@ class Report:
         video_caption: what it shows; without a video, why there is none.
         warnings: what a reader must know before trusting the numbers.
         summary: a table to stand before the figures, if there is one.
+        headline: heading -> cell, the run's columns in the page over a sweep.
     """
 
     verdict: str
@@ -70,6 +71,7 @@ class Report:
     video_caption: str = ""
     warnings: Sequence[str] = field(default_factory=tuple)
     summary: Table | None = None
+    headline: dict[str, str] = field(default_factory=dict)
 
 
 def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:

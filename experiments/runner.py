@@ -21,6 +21,9 @@ from experiments.overview import overview
 from experiments.report import Report, page
 from experiments.workspace import CompileClock, Workspace
 
+# What a kind's report.py may say of its outcome, each by a function of that name.
+_SAID = ("verdict", "findings", "tables", "summary", "warnings", "headline")
+
 
 def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> Path:
     """Run a configuration, every combination if it sweeps.
@@ -96,12 +99,20 @@ def _call(run: Run, workspace: Workspace) -> Report:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         # Late, once precision and OpenGL are chosen: these import JAX and MuJoCo.
-        kind = f"experiments.{run.settings.experiment}"
-        outcome = importlib.import_module(f"{kind}.measure").measure(run.settings, workspace)
-        report = importlib.import_module(f"{kind}.report").report(outcome, workspace)
-    said = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+        from experiments.theme import save
+
+        measure, words, pictures = (
+            importlib.import_module(f"experiments.{run.settings.experiment}.{part}")
+            for part in ("measure", "report", "figures")
+        )
+        outcome = measure.measure(run.settings, workspace)
+        said = {part: getattr(words, part)(outcome) for part in _SAID if hasattr(words, part)}
+        video, caption = pictures.video(outcome, workspace) if hasattr(pictures, "video") else (None, "")
+        figures = save(pictures.drawings(outcome), outcome, workspace.folder)
+        report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
+    told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
     # A scene warns of some of it when it is loaded.
-    sentences = dict.fromkeys([*report.warnings, *said, *workspace.warnings])
+    sentences = dict.fromkeys([*report.warnings, *told, *workspace.warnings])
     return Report(**{**vars(report), "warnings": list(sentences)})
 
 
@@ -110,7 +121,8 @@ def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> Non
     write_toml(folder / "config.toml", run.settings.model_dump(mode="json"), header)
     write_csv(folder / "metrics.csv", report.metrics)
     (folder / "environment.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps({"verdict": report.verdict}, indent=2) + "\n", encoding="utf-8")
+    summary = json.dumps({"verdict": report.verdict, "headline": report.headline}, indent=2)
+    write_text(folder / "summary.json", summary + "\n")
     name = " · ".join([run.name, *(f"{key} = {value}" for key, value in run.varied.items())])
     text = page(report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts))
     (folder / "report.html").write_text(text, encoding="utf-8")

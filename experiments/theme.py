@@ -1,6 +1,6 @@
 """How the figures look: one type size, few lines, colours that colour-blind readers can tell apart."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
 DEFAULT, MUTED = "#cc79a7", "#8b94a1"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
 
-Drawing = Callable[[Any], tuple[Picture, str, str]]
+# By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
+Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
 
 RULES: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -72,28 +73,25 @@ def subplots(rows: int, columns: int, *, height: float, **settings):
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 
-def save(drawings: Iterable[Drawing], outcome: Any, folder: Path) -> list[Figure]:
+def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
     """Draw figures, write them, and let go of them.
 
     Args:
-        drawings: each gives a picture made by `subplots`, its title of a few words, and what it shows and how to read it; the
-            file has the drawing's name.
+        drawings: pictures made by `subplots`.
         outcome: the numbers.
         folder: of the run.
 
     Returns:
         The figures of the report.
     """
-    return [save_one(drawing(outcome), folder, drawing.__name__) for drawing in drawings]
-
-
-def save_one(drawn: tuple[Picture, str, str], folder: Path, name: str) -> Figure:
-    """Write a picture with its title and caption under a name of its own, and let go of it."""
-    picture, title, caption = drawn
     (folder / "figures").mkdir(exist_ok=True)
-    picture.savefig(folder / "figures" / f"{name}.png")
-    plt.close(picture)
-    return Figure(f"figures/{name}.png", title, caption)
+    figures = []
+    for name, drawing in drawings.items():
+        picture, title, caption = drawing(outcome)
+        picture.savefig(folder / "figures" / f"{name}.png")
+        plt.close(picture)
+        figures.append(Figure(f"figures/{name}.png", title, caption))
+    return figures
 
 
 def shades(count: int) -> np.ndarray:

@@ -1,14 +1,11 @@
 """The pictures of an experiment on leaving out."""
 
-from pathlib import Path
-
 from matplotlib.lines import Line2D
 
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
 from experiments.parallel import num_compilers
-from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
 _KINDS = {
@@ -18,9 +15,9 @@ _KINDS = {
 }
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figure and save it in the run's folder; none if every variant is the same program."""
-    return save([ratios] if _drawn(outcome) else [], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figure; none if every variant is the same program."""
+    return {"ratios": ratios} if _drawn(outcome) else {}
 
 
 def ratios(outcome: Outcome):

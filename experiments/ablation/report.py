@@ -2,23 +2,10 @@
 
 import numpy as np
 
-from experiments.ablation.figures import draw
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import joined
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,21 +1,18 @@
 """The pictures of an experiment on artificial discontinuities."""
 
-from pathlib import Path
-
 import numpy as np
 
 from experiments.artificial_discontinuity.mating import TILT
 from experiments.artificial_discontinuity.outcome import WAYS, Outcome, worst
-from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
 
 _EVENT = "#009e73"
 _LEAST = 1e-4
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([forces, jumps, refinement, slopes, mating], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"forces": forces, "jumps": jumps, "refinement": refinement, "slopes": slopes, "mating": mating}
 
 
 def forces(outcome: Outcome):

@@ -2,26 +2,13 @@
 
 import numpy as np
 
-from experiments.artificial_discontinuity.figures import draw
 from experiments.artificial_discontinuity.outcome import WAYS, Outcome, largest, worst
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import joined, percent, quantity
-from experiments.workspace import Workspace
 
 # Standard errors from which a bias is beyond chance, of some dozens of estimates.
 _FAR = 4.0
 _SMALL = 1e-4
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,7 +1,5 @@
 """The pictures of a bias and variance experiment."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,17 +9,16 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from experiments.bias_variance.outcome import Interval, Outcome
 from experiments.bias_variance.problems import problem, wall_contact
-from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, power, save, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, shades, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.workspace import Workspace
 
 UNIT = "1/s²"
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([landscape, gradient, bias_variance, choice], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"landscape": landscape, "gradient": gradient, "bias_variance": bias_variance, "choice": choice}
 
 
 def landscape(outcome: Outcome):

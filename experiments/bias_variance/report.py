@@ -5,26 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experiments.bias_variance.figures import draw, video
 from experiments.bias_variance.outcome import Outcome
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.theme import power
 from experiments.words import joined, quantity
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    file, caption = video(outcome, workspace)
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-        video=file,
-        video_caption=caption,
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,14 +1,11 @@
 """The pictures of the experiment on billiards."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.patches import Circle
 
 from experiments.billiards.outcome import IDLE, Outcome, Run
-from experiments.report import Figure
 from experiments.settings import VideoSettings
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 from experiments.video import film
 from experiments.workspace import Workspace
 from mjxgrad.scene import load_scene
@@ -19,9 +16,9 @@ _MARKERS = "osD^vP*X<>"
 _RADIUS = 0.2
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([cost, strokes, forces], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"cost": cost, "strokes": strokes, "forces": forces}
 
 
 def cost(outcome: Outcome):

@@ -2,24 +2,8 @@
 
 from collections.abc import Sequence
 
-from experiments.billiards.figures import draw, video
 from experiments.billiards.outcome import IDLE, Outcome, Run
-from experiments.report import Report, Table
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    file, caption = video(outcome, workspace)
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-        video=file,
-        video_caption=caption,
-    )
+from experiments.report import Table
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,7 +1,5 @@
 """The pictures of an experiment on bounces."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
@@ -9,16 +7,15 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments.bounce.outcome import Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _CONTINUOUS = "#009e73"
 _LOOKS = ((DISCRETE, FIRST, "o"), (EVENT, ZEROTH, "s"), (CONTINUOUS, _CONTINUOUS, "D"))
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([derivative, steps, error], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"derivative": derivative, "steps": steps, "error": error}
 
 
 def derivative(outcome: Outcome):

@@ -4,26 +4,13 @@ import itertools
 
 import numpy as np
 
-from experiments.bounce.figures import draw
 from experiments.bounce.outcome import Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import joined
-from experiments.workspace import Workspace
 
 # Steps in contact by which the outcome is told apart.
 _STEPS = (0, 3, 6, 10, 20, np.inf)
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

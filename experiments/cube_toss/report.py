@@ -2,25 +2,12 @@
 
 import numpy as np
 
-from experiments.cube_toss.figures import draw
 from experiments.cube_toss.outcome import METHODS, Course, Outcome, Point
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import quantity
-from experiments.workspace import Workspace
 from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE
 
 _CONTACTS = {"published": "With a contact that begins continuously", "default": "With MuJoCo's default contact"}
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

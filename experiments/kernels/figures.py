@@ -1,12 +1,9 @@
 """The pictures of an experiment on smoothing kernels."""
 
-from pathlib import Path
-
 import numpy as np
 
 from experiments.kernels.outcome import TITLES, Outcome
-from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 COLOURS = {
     "gaussian": FIRST,
@@ -18,9 +15,9 @@ COLOURS = {
 NAMES = TITLES | {"margin": "margin of one length", "impedance": "impedance from 0.2 to 0.9"}
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([profiles, motion], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"profiles": profiles, "motion": motion}
 
 
 def profiles(outcome: Outcome):

@@ -4,25 +4,13 @@ import re
 
 import numpy as np
 
-from experiments.kernels.figures import NAMES, draw
+from experiments.kernels.figures import NAMES
 from experiments.kernels.outcome import ENTRIES, TITLES, WAYS, Outcome
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import capitalised, quantity
-from experiments.workspace import Workspace
 
 # Beyond it, of some twenty numbers, none is expected by chance.
 _FAR = 4.0
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,13 +1,10 @@
 """The pictures of an experiment on long horizons."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.ticker import NullLocator
 
 from experiments.long_horizon.outcome import ZEROTH, Errors, Outcome
-from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, subplots
 from experiments.theme import ZEROTH as BLUE
 from experiments.words import capitalised
 
@@ -15,9 +12,9 @@ _EVENT, _ONSET = "#cc79a7", "#009e73"
 COLOURS = {"first order, discrete": FIRST, "first order, event": _EVENT, "first order, onset": _ONSET, ZEROTH: BLUE}
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([errors, growth, windows], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"errors": errors, "growth": growth, "windows": windows}
 
 
 def errors(outcome: Outcome):

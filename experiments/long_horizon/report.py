@@ -2,23 +2,10 @@
 
 import numpy as np
 
-from experiments.long_horizon.figures import draw
 from experiments.long_horizon.outcome import Found, Outcome
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.theme import power
 from experiments.words import capitalised, percent, quantity
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

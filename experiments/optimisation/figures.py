@@ -1,15 +1,13 @@
 """The pictures of an optimisation experiment."""
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
-from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.words import quantity
 
 # One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
@@ -46,10 +44,10 @@ _SENTENCES = {
 _DARK = ("inconsistent", "not_finite")
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
     has_alpha = any(run.reasons for run in outcome.runs)
-    return save([final, curves, alpha] if has_alpha else [final, curves], outcome, folder)
+    return {"final": final, "curves": curves} | ({"alpha": alpha} if has_alpha else {})
 
 
 def final(outcome: Outcome):

@@ -1,31 +1,13 @@
 """The answer of an optimisation experiment in words, computed from its numbers."""
 
-import json
-
 import numpy as np
 
-from experiments.optimisation.figures import draw
 from experiments.optimisation.outcome import Difference, Outcome, Run
-from experiments.overview import HEADLINE
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import quantity
-from experiments.workspace import Workspace
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    (workspace.folder / HEADLINE).write_text(json.dumps(headline(outcome), indent=2) + "\n", encoding="utf-8")
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-        warnings=warnings(outcome),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,8 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 
 from experiments.planning.outcome import Attempt, Outcome
-from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, save, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
 from experiments.video import film, shown_speed
 from experiments.workspace import Workspace
 from mjxgrad.tasks.planar_pusher import planar_pusher
@@ -23,9 +21,10 @@ _EVERY = 3  # decisions between the poses drawn
 _DECISION = 0.1  # s
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([cost if outcome.settings.method == "trajectory" else tree, plane, pose], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    first = {"cost": cost} if outcome.settings.method == "trajectory" else {"tree": tree}
+    return first | {"plane": plane, "pose": pose}
 
 
 def cost(outcome: Outcome):

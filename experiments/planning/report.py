@@ -1,25 +1,9 @@
 """What the plans say, in sentences and in a table."""
 
-from experiments.planning.figures import draw, video
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import NAMES
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import quantity
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    file, caption = video(outcome, workspace)
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-        video=file,
-        video_caption=caption,
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,13 +1,10 @@
 """The pictures of an experiment on policy gradients."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Outcome
-from experiments.report import Figure
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
 _MARKERS = {DISCRETE: "o", ONSET: "s"}
@@ -17,12 +14,11 @@ _MOTORS = ("thigh", "leg", "foot")
 _THROWS, _PUSHES = ("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff")
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    drawings = [summary]
-    for drawing, names in ((throw, _THROWS), (hopper, ("hopper",)), (push, _PUSHES)):
-        drawings += [drawing] if outcome.of(*names) else []
-    return save([*drawings, descent] if outcome.courses else drawings, outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    by_problem = {"throw": (throw, _THROWS), "hopper": (hopper, ("hopper",)), "push": (push, _PUSHES)}
+    found = {name: drawing for name, (drawing, problems) in by_problem.items() if outcome.of(*problems)}
+    return {"summary": summary, **found} | ({"descent": descent} if outcome.courses else {})
 
 
 def summary(outcome: Outcome):

@@ -2,26 +2,13 @@
 
 import numpy as np
 
-from experiments.policy_gradient.figures import draw
 from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import joined, quantity
-from experiments.workspace import Workspace
 from mjxgrad.estimators import Reason
 
 NEGLIGIBLE = 0.05
 """Of the gradient's norm: a bias below it matters to no descent."""
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

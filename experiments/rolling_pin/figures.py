@@ -1,12 +1,9 @@
 """The pictures of the rolling pin's experiment."""
 
-from pathlib import Path
-
 import numpy as np
 
-from experiments.report import Figure
 from experiments.rolling_pin.outcome import Outcome
-from experiments.theme import FIRST, MUTED, ZEROTH, save, subplots
+from experiments.theme import FIRST, MUTED, ZEROTH, Drawings, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.workspace import Workspace
 
@@ -16,9 +13,9 @@ _OTHERS = ("#009e73", "#cc79a7", "#22262e", "#56b4e9", "#8c6d31")
 _DASHES = ("-", (0, (5, 2)), (0, (2, 1.5)))
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    return save([descent, bed], outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"descent": descent, "bed": bed}
 
 
 def descent(outcome: Outcome):

@@ -1,24 +1,8 @@
 """The answer of the rolling pin's experiment in words, computed from its numbers."""
 
-from experiments.report import Report, Table
-from experiments.rolling_pin.figures import draw, video
+from experiments.report import Table
 from experiments.rolling_pin.outcome import Descent, Outcome
 from experiments.words import quantity
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    file, caption = video(outcome, workspace)
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-        video=file,
-        video_caption=caption,
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,23 +1,23 @@
 """The pictures of the sawtooth."""
 
-from pathlib import Path
+import functools
 from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
-from experiments.report import Figure
-from experiments.sawtooth.measure import Course
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, save_one, subplots
+from experiments.sawtooth.measure import Course, Outcome
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _COLOURS = {DISCRETE: FIRST, EVENT: ZEROTH, CONTINUOUS: "#009e73"}
 
 
-def draw(courses: list[Course], folder: Path) -> list[Figure]:
-    """Draw the figures and save them in the run's folder, in order of reading."""
-    own = [_teeth(course, folder, is_first=k == 0) for k, course in enumerate(_own(courses))]
-    return [*own, _errors(courses, folder)]
+def drawings(outcome: Outcome) -> Drawings:
+    """Name a figure per motion, and the errors of all."""
+    own = _own(outcome.courses)
+    teeth = {f"teeth_{course.name}": functools.partial(_teeth, course, is_first=k == 0) for k, course in enumerate(own)}
+    return {**teeth, "error": _errors}
 
 
 def _own(courses: list[Course]) -> list[Course]:
@@ -31,7 +31,7 @@ def _error(course: Course, arm: str) -> np.ndarray:
     return np.abs(found.error[0]) / np.maximum(np.abs(found.slope), found.resolution)
 
 
-def _teeth(course: Course, folder: Path, *, is_first: bool) -> Figure:
+def _teeth(course: Course, _: Outcome, *, is_first: bool):
     """Draw the outcome less its trend and single derivatives over the start, and their mean over time."""
     count = len(course.labels)
     figure, axes = subplots(3, count, height=7.4)
@@ -55,7 +55,7 @@ def _teeth(course: Course, folder: Path, *, is_first: bool) -> Figure:
         "single rollout; the line is the slope of the outcome. Below, their mean against time. Derivatives far off are cut."
     )
     text = caption if is_first else "As the figure before."
-    return save_one((figure, course.title, text), folder, f"teeth_{course.name}")
+    return figure, course.title, text
 
 
 def _draw_starts(upper: Any, lower: Any, course: Course, j: int) -> None:
@@ -93,8 +93,9 @@ def _show(axis: Any, values: np.ndarray) -> None:
     axis.set_ylim(values.min() - pad, values.max() + pad)
 
 
-def _errors(courses: list[Course], folder: Path) -> Figure:
+def _errors(outcome: Outcome):
     """Draw how far each mean derivative is off the slope of its own outcome, motion by motion."""
+    courses = outcome.courses
     figure, axes = subplots(1, 1, height=1.6 + 0.32 * len(courses))
     axis = axes[0, 0]
     for place, course in enumerate(courses):
@@ -114,4 +115,4 @@ def _errors(courses: list[Course], folder: Path) -> Figure:
         "One dot per time and coordinate after the first impact, large ones the medians. Dotted, 5%. Sampling errors are part "
         "of it: where the slope is near zero all arms lie far to the right."
     )
-    return save_one((figure, "Error of the mean derivative", caption), folder, "error")
+    return figure, "Error of the mean derivative", caption

@@ -1,6 +1,7 @@
 """From settings to numbers."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -79,6 +80,42 @@ class Course:
         return None if self.reference is None else np.abs(self.arms[arm].outcomes - self.reference).mean(axis=0)
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """All motions at all time steps."""
+
+    courses: list[Course]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give one row per reading, for metrics.csv."""
+        return [row for course in self.courses for row in _rows(course)]
+
+
+def _rows(course: Course) -> list[dict[str, Any]]:
+    rows = []
+    for i, j in np.ndindex(course.has_impact.shape):
+        row: dict[str, Any] = {
+            "case": course.name,
+            "timestep": course.timestep,
+            "time": float(course.times[i]),
+            "outcome": course.labels[j],
+            "has_impact": bool(course.has_impact[i, j]),
+            "shift": float(course.shift[i, j]),
+        }
+        for arm, found in course.arms.items():
+            error = course.error(arm)
+            row |= {
+                f"{arm} slope": float(found.slope[i, j]),
+                f"{arm} mean": float(found.mean[0, i, j]),
+                f"{arm} standard error": float(found.standard_error[0, i, j]),
+                f"{arm} spread": float(course.spread(arm)[i, j]),
+                f"{arm} sawtooth": float(course.sawtooth(arm)[i, j]),
+                f"{arm} error": float("nan") if error is None else float(error[i, j]),
+            }
+        rows.append(row)
+    return rows
+
+
 class _Simulate(eqx.Module):
     """From the parameter to the readings; time steps differ in arrays alone, so one compilation serves them all."""
 
@@ -112,7 +149,7 @@ def _sample(simulate: _Simulate, parameters: Float[Array, " phases"]) -> tuple[A
     return jax.vmap(one)(parameters)
 
 
-def measure(settings: Settings, workspace: Workspace) -> list[Course]:
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Sample outcomes and derivatives of every motion at every time step."""
     courses = []
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
@@ -120,7 +157,7 @@ def measure(settings: Settings, workspace: Workspace) -> list[Course]:
             own = float(case(name).model.opt.timestep)
             courses += [_course(name, h, settings) for h in sorted({own, *settings.timesteps}, reverse=True)]
             advance_to(number + 1)
-    return courses
+    return Outcome(courses)
 
 
 def _course(name: str, timestep: float, settings: Settings) -> Course:

@@ -5,24 +5,13 @@ from typing import Any
 import numpy as np
 
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
-from experiments.report import Report, Table
-from experiments.sawtooth.figures import draw
-from experiments.sawtooth.measure import Course
-from experiments.workspace import Workspace
+from experiments.report import Table
+from experiments.sawtooth.measure import Course, Outcome
 
 
-def report(courses: list[Course], workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=_verdict(courses),
-        findings=_findings(courses),
-        figures=draw(courses, workspace.folder),
-        tables=[_table(courses)],
-        metrics=[row for course in courses for row in _rows(course)],
-    )
-
-
-def _verdict(courses: list[Course]) -> str:
+def verdict(outcome: Outcome) -> str:
+    """Say whether teeth are gone, and whose mean derivative is the slope."""
+    courses = outcome.courses
     ratio, spread = _pooled(courses, _ratio), _pooled(courses, lambda c: c.spread(CONTINUOUS))
     if not ratio.size:
         return "Nothing touches in these motions: there are no teeth."
@@ -35,7 +24,9 @@ def _verdict(courses: list[Course]) -> str:
     )
 
 
-def _findings(courses: list[Course]) -> list[str]:
+def findings(outcome: Outcome) -> list[str]:
+    """Single findings, one sentence each."""
+    courses = outcome.courses
     sentences = []
     beyond = [(course, _excess(course, CONTINUOUS)) for course in courses]
     worst = [f"{c.title}, {1e3 * c.timestep:g} ms" for c, e in beyond if (e[c.has_impact] > 0.05).any()]
@@ -52,9 +43,10 @@ def _findings(courses: list[Course]) -> list[str]:
     return sentences
 
 
-def _table(courses: list[Course]) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all motions."""
     rows = []
-    for c in courses:
+    for c in outcome.courses:
         if not c.has_impact.any():
             continue
         pick = c.has_impact
@@ -67,39 +59,14 @@ def _table(courses: list[Course]) -> Table:
         rows.append([*row, error])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
     columns += [f"spread, {arm}" for arm in ARMS] + [f"within 2 errors, {arm}" for arm in ARMS]
-    return Table(
-        (*columns, "shift of the mean", "error"),
-        rows,
+    columns += ["shift of the mean", "error"]
+    caption = (
         "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
         "single derivatives about their trend, over the slope. Within 2 errors: readings where the mean derivative is the slope "
         "of its own outcome. Shift of the mean outcome over MuJoCo's sawtooth. Error beside the converged motion over "
-        "MuJoCo's own.",
+        "MuJoCo's own."
     )
-
-
-def _rows(course: Course) -> list[dict[str, Any]]:
-    rows = []
-    for i, j in np.ndindex(course.has_impact.shape):
-        row: dict[str, Any] = {
-            "case": course.name,
-            "timestep": course.timestep,
-            "time": float(course.times[i]),
-            "outcome": course.labels[j],
-            "has_impact": bool(course.has_impact[i, j]),
-            "shift": float(course.shift[i, j]),
-        }
-        for arm, found in course.arms.items():
-            error = course.error(arm)
-            row |= {
-                f"{arm} slope": float(found.slope[i, j]),
-                f"{arm} mean": float(found.mean[0, i, j]),
-                f"{arm} standard error": float(found.standard_error[0, i, j]),
-                f"{arm} spread": float(course.spread(arm)[i, j]),
-                f"{arm} sawtooth": float(course.sawtooth(arm)[i, j]),
-                f"{arm} error": float("nan") if error is None else float(error[i, j]),
-            }
-        rows.append(row)
-    return rows
+    return [Table(columns, rows, caption)]
 
 
 def _pooled(courses: list[Course], values: Any) -> np.ndarray:

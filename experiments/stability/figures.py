@@ -1,6 +1,6 @@
 """The pictures of an experiment on stability."""
 
-from pathlib import Path
+import functools
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,12 +8,11 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
-from experiments.report import Figure
 from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.grid import AXES
 from experiments.stability.limits import limit_curve
 from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
-from experiments.theme import REFERENCE, power, save_one, subplots
+from experiments.theme import REFERENCE, Drawings, power, subplots
 
 _LIMITS = {
     "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",
@@ -57,10 +56,10 @@ _NAMES = {
 }
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw a figure per kind of scene, the planes of its first scene, and save them in the run's folder."""
+def drawings(outcome: Outcome) -> Drawings:
+    """Name a figure per kind of scene, the planes of its first scene."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    return [save_one(_planes(one, outcome), folder, _file(one)) for one in reversed(shown.values())]
+    return {_file(one): functools.partial(_planes, one) for one in reversed(shown.values())}
 
 
 def _file(one: SceneOutcome) -> str:

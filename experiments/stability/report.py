@@ -5,26 +5,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.stability.classes import Derivative, Motion
-from experiments.stability.figures import draw
 from experiments.stability.limits import load
 from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
 from experiments.stability.reasons import UNEXPLAINED, reasons
-from experiments.workspace import Workspace
 
 _FAILS = Motion.GAINS_ENERGY
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,14 +1,13 @@
 """The pictures of an experiment on a textbook problem."""
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from experiments.report import Figure
 from experiments.textbook.outcome import Outcome
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, power, save, shades, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, shades, subplots
 from mjxgrad.diagnostics import Comparison
 
 # For further estimators, in the order of the settings; told apart by their markers, too.
@@ -16,12 +15,11 @@ _OTHERS = ("#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", "#8
 _MARKERS = "osD^vP*X<>"
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw the figures, and save them in order of reading."""
-    drawings = [problem, samples]
-    drawings += [stiffness] if outcome.by_stiffness else []
-    drawings += [missing] if outcome.missing is not None else []
-    return save(drawings, outcome, folder)
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    found: dict[str, Any] = {"problem": problem, "samples": samples}
+    found |= {"stiffness": stiffness} if outcome.by_stiffness else {}
+    return found | ({"missing": missing} if outcome.missing is not None else {})
 
 
 def stiffness_name(outcome: Outcome) -> str:

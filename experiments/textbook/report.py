@@ -2,23 +2,11 @@
 
 import numpy as np
 
-from experiments.report import Report, Table
-from experiments.textbook.figures import draw, stiffness_name
+from experiments.report import Table
+from experiments.textbook.figures import stiffness_name
 from experiments.textbook.outcome import Outcome
 from experiments.theme import power
 from experiments.words import joined, quantity
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        tables=tables(outcome),
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -1,7 +1,7 @@
 """The pictures: error against run time, one panel per scene, with what no other way beats."""
 
+import functools
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from experiments.report import Figure
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, power, save_one, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.work_precision.front import pareto_front
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Estimate, Outcome, Point
 
@@ -32,13 +31,13 @@ _ANY = (1e-3, 1.0)
 _RESOLVED = 1e-6
 
 
-def draw(outcome: Outcome, folder: Path) -> list[Figure]:
-    """Draw two figures per scene, and save them in the run's folder."""
-    return [
-        save_one(drawing(course, outcome), folder, f"{drawing.__name__}_{course.name}")
+def drawings(outcome: Outcome) -> Drawings:
+    """Name two figures per scene."""
+    return {
+        f"{drawing.__name__}_{course.name}": functools.partial(drawing, course)
         for course in outcome.courses
         for drawing in (motion, gradient)
-    ]
+    }
 
 
 def motion(course: Course, outcome: Outcome):

@@ -3,24 +3,10 @@
 import numpy as np
 
 from experiments.parallel import num_compilers
-from experiments.report import Report, Table
+from experiments.report import Table
 from experiments.words import quantity
 from experiments.work_precision.choice import Choice, cheapest, fastest
-from experiments.work_precision.figures import draw
 from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Outcome, Point
-from experiments.workspace import Workspace
-
-
-def report(outcome: Outcome, workspace: Workspace) -> Report:
-    """Draw the outcome, and say what follows from it."""
-    return Report(
-        verdict=verdict(outcome),
-        findings=findings(outcome),
-        figures=draw(outcome, workspace.folder),
-        summary=summary(outcome),
-        tables=[batches(outcome)],
-        metrics=outcome.rows(),
-    )
 
 
 def verdict(outcome: Outcome) -> str:

@@ -12,12 +12,13 @@ from scipy import stats
 
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.optimisation.figures import draw
+from experiments.optimisation.figures import drawings
 from experiments.optimisation.methods import problem
 from experiments.optimisation.outcome import Difference, Outcome, Run
 from experiments.optimisation.report import findings, headline, tables, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.overview import HEADLINE, overview
+from experiments.overview import overview
+from experiments.theme import save
 
 FILES = ("push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis", "six_tasks")
 SETTINGS = """\
@@ -113,7 +114,7 @@ def test_every_run_begins_at_the_cost_of_the_task(rows):
 
 
 def test_the_page_of_a_sweep_sets_final_costs_side_by_side(finished, rows):
-    cells = json.loads((finished / "seed=0" / HEADLINE).read_text())
+    cells = json.loads((finished / "seed=0" / "summary.json").read_text())["headline"]
     ends = [float(row["cost"]) for row in rows if row["method"] == "α-order" and row["is_final"] == "True"]
     page = (finished / "report.html").read_text()
     assert cells["α-order"].startswith(f"{np.mean(ends):.0f}")
@@ -127,8 +128,7 @@ def test_a_sweep_whose_runs_have_other_methods_leaves_cells_empty(tmp_path):
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder, cells in zip(folders, ({"first": "1", "second": "2"}, {"first": "3"}), strict=True):
         folder.mkdir()
-        (folder / "summary.json").write_text('{"verdict": "yes"}')
-        (folder / HEADLINE).write_text(json.dumps(cells))
+        (folder / "summary.json").write_text(json.dumps({"verdict": "yes", "headline": cells}))
     page = overview(runs, folders)
     assert "<tr><td>a</td><td>1</td><td>2</td></tr><tr><td>b</td><td>3</td><td></td></tr>" in page
 
@@ -211,7 +211,7 @@ def test_figures_are_drawn_where_every_run_of_a_method_is_lost(tmp_path):
     lost = made_up("first_order", [np.inf, np.inf])
     lost = dataclasses.replace(lost, alpha=np.full((2, 3), np.nan), cost=np.full((2, 2), np.inf))
     found = outcome(lost, made_up("alpha_order", [5.0, 6.0]))
-    figures = draw(found, tmp_path)
+    figures = save(drawings(found), found, tmp_path)
     assert [(tmp_path / figure.file).is_file() for figure in figures] == [True] * 3
     assert "undefined" in tables(found)[0].rows[0][1]
 

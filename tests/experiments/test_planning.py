@@ -9,10 +9,11 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.planning.figures import draw
+from experiments.planning.figures import drawings
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.report import findings, tables, verdict
 from experiments.planning.settings import Settings
+from experiments.theme import save
 
 GOAL = (0.1, 0.0, 0.0)
 TRAJECTORY = Settings(experiment="planning", method="trajectory", goal=GOAL)
@@ -95,8 +96,8 @@ def test_polishing_is_reported_with_what_it_gained():
 def test_every_method_gets_its_figures(tmp_path, settings, is_tree, files):
     attempts = [attempt("analytic", 0.1, is_tree=is_tree), attempt("none", 0.0, is_tree=is_tree)]
     found = outcome(settings, attempts)
-    draw(found, tmp_path)
-    assert sorted(path.stem for path in (tmp_path / "figures").iterdir()) == files
+    figures = save(drawings(found), found, tmp_path)
+    assert sorted((tmp_path / figure.file).stem for figure in figures) == files
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.policy_gradient.figures import draw
+from experiments.policy_gradient.figures import drawings
 from experiments.policy_gradient.measure import estimated
 from experiments.policy_gradient.outcome import Cell, Course, Estimates, Outcome
 from experiments.policy_gradient.report import tables, verdict
@@ -22,6 +22,7 @@ from experiments.policy_gradient.statistics import (
     squared_distance,
     squared_norm,
 )
+from experiments.theme import save
 
 SETTINGS = Settings(
     experiment="policy_gradient", tasks=("hopper",), angles=(0.4,), angle_stddev=0.05, num_estimates=8, num_references=8,
@@ -158,7 +159,7 @@ def test_every_task_gets_its_figure(tmp_path):
     course = Course("hopper", "Task", "alpha", "onset", rng.normal(size=(2, 3)), np.full((2, 3), 0.5), 1.0)
     throws = [named("ball_wall", 1, f"{angle} rad") for angle in (0.4, 0.5)]
     one = outcome(*throws, named("push_soft", 5), named("push_stiff", 5), named("hopper", 21), courses=[course])
-    figures = draw(one, tmp_path)
+    figures = save(drawings(one), one, tmp_path)
     assert [figure.file for figure in figures] == [
         f"figures/{name}.png" for name in ("summary", "throw", "hopper", "push", "descent")
     ]

@@ -8,9 +8,10 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.sawtooth.figures import _errors, _teeth
-from experiments.sawtooth.measure import Course
-from experiments.sawtooth.report import _rows, _verdict
+from experiments.sawtooth.figures import drawings
+from experiments.sawtooth.measure import Course, Outcome
+from experiments.sawtooth.report import verdict
+from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases
 
 _START = phases((0.0, 1.0), 256)
@@ -40,10 +41,10 @@ def test_teeth_are_what_the_trend_leaves():
 
 
 def test_the_verdict_counts_the_readings_where_the_mean_derivative_is_the_slope():
-    sentence = _verdict([_course(0.05)])
+    sentence = verdict(Outcome([_course(0.05)]))
     assert "100 times smaller in the median" in sentence
     assert "at 100% of 2 readings (0% without, 0% for the event gradient)" in sentence
-    assert "at 0% of 2 readings" in _verdict([_course(0.05, continuous=2.5)])
+    assert "at 0% of 2 readings" in verdict(Outcome([_course(0.05, continuous=2.5)]))
 
 
 def test_a_motion_without_teeth_is_said_to_have_none():
@@ -53,7 +54,7 @@ def test_a_motion_without_teeth_is_said_to_have_none():
         arm: compare_to_slope(_START, 2 * found.outcomes * 0, list(found.derivatives), (arm,))
         for arm, found in smooth.items()
     }
-    assert _verdict([Course("a", "A", ("z",), 2e-3, course.times, flat, None)]).startswith("Nothing touches")
+    assert verdict(Outcome([Course("a", "A", ("z",), 2e-3, course.times, flat, None)])).startswith("Nothing touches")
 
 
 def test_the_error_beside_the_converged_motion_is_that_of_each_arm():
@@ -63,10 +64,11 @@ def test_the_error_beside_the_converged_motion_is_that_of_each_arm():
 
 def test_every_motion_gets_its_figure(tmp_path):
     course = _course(0.05)
-    figures = [_teeth(course, tmp_path, is_first=True), _errors([course], tmp_path)]
+    outcome = Outcome([course])
+    figures = save(drawings(outcome), outcome, tmp_path)
     assert [figure.file for figure in figures] == ["figures/teeth_ball.png", "figures/error.png"]
     assert all((tmp_path / figure.file).is_file() for figure in figures)
-    assert len(_rows(course)) == 2
+    assert len(outcome.rows()) == 2
 
 
 @pytest.mark.parametrize("name", ["sawtooth", "bounce"])
