@@ -40,7 +40,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad._rollout import Trajectory
 from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.dynamics.collision import collide
-from mjxgrad.dynamics.contact import contact_jacobian
+from mjxgrad.dynamics.rows import contact_jacobian
 from mjxgrad.scene import Scene
 
 STEPS_NEEDED = 2.0

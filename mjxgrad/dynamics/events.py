@@ -65,9 +65,9 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
-from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
-from mjxgrad.dynamics.implicit import System
+from mjxgrad.dynamics.newton import System
+from mjxgrad.dynamics.rows import Block, joined
 
 # Nodes and weights of Gauss and Legendre on (0, 1).
 _NODES = 0.5 + 0.5 * np.polynomial.legendre.leggauss(3)[0]
@@ -79,8 +79,6 @@ class _Plan:
     """What is static about the events of a step.
 
     Attributes:
-        layout: the laws of the rows.
-        max_iterations: of a solve.
         owner: the contact or limit that each row belongs to, -1 if it never begins or ends.
         is_spread: whether an event lies within the step, so that the contact damps its impulse for the rest of it.
     """
@@ -103,8 +101,6 @@ class _Events(eqx.Module):
         speed: of approach or retreat (m/s or rad/s).
         creep: speed below which gravity presses a contact together faster than it approaches (m/s).
         start: acceleration to start from.
-        timestep: h (s).
-        tolerance: of a solve.
     """
 
     system: System
@@ -120,16 +116,7 @@ class _Events(eqx.Module):
 
 
 def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
-    """Return data with acceleration and constraint force to which the tangents of a semi-implicit step's events are added.
-
-    Args:
-        model: gives the time step.
-        data: of the present state, solved.
-        blocks: its constraint rows.
-
-    Returns:
-        Data of the same values.
-    """
+    """Return solved data with the tangents of a semi-implicit step's events added to acceleration and constraint force."""
     if not any(block.rows_each for block in blocks):
         return data
     distance, normal = contacts_of(blocks)
@@ -147,16 +134,9 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
 def impulse(
     model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: Float[Array, " nv"]
 ) -> Float[Array, " nv"]:
-    """Return a change of velocity of value zero with the tangents of the events between two states.
+    """Return a change of velocity after a step, of value zero, with the tangents of the events within it.
 
-    Args:
-        model: gives the time step.
-        data: of the state before, solved.
-        blocks: its constraint rows.
-        mean_velocity: displacement until the state after, divided by the time step.
-
-    Returns:
-        To be added to the velocity after the step.
+    `data` is solved for the state before; the mean velocity leads from there to the state after.
     """
     if not any(block.rows_each for block in blocks):
         return jnp.zeros_like(data.qvel)
@@ -185,7 +165,8 @@ def contacts_of(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[A
     for block in blocks:
         if not block.rows_each:
             continue
-        jacobian = block.jacobian.reshape(-1, block.rows_each, block.jacobian.shape[1])
+        matrix = block.map.matrix()
+        jacobian = matrix.reshape(-1, block.rows_each, matrix.shape[1])
         distance.append(block.residual[:: block.rows_each])
         normal.append(jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0])
     return jnp.concatenate(distance), jnp.concatenate(normal)
@@ -202,7 +183,7 @@ def _events(
     ends: Bool[Array, " contacts"],
 ) -> _Events:
     is_event = _per_row(plan, begins | ends)
-    touching = _in_contact(assembly.joined(blocks), is_event)
+    touching = _in_contact(joined(blocks), is_event)
     damping = model.opt.timestep * stiffness_damping(model, touching.solref, touching.impedance.full)[1]
     return _Events(
         system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),

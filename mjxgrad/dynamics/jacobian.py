@@ -367,10 +367,10 @@ def _spread(
     if len(dofs) == num_dofs:
         return entries
     columns, at = [], 0
-    for run in linear.runs(dofs):
-        columns.append(jnp.zeros((*entries.shape[:2], run.target.start - at, *entries.shape[3:]), entries.dtype))
-        columns.append(entries[:, :, run.source])
-        at = run.target.stop
+    for target, source in linear.runs(dofs):
+        columns.append(jnp.zeros((*entries.shape[:2], target.start - at, *entries.shape[3:]), entries.dtype))
+        columns.append(entries[:, :, source])
+        at = target.stop
     columns.append(jnp.zeros((*entries.shape[:2], num_dofs - at, *entries.shape[3:]), entries.dtype))
     return jnp.concatenate(columns, axis=2)
 

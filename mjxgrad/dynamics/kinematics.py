@@ -16,6 +16,7 @@ References:
 
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -32,15 +33,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Place bodies, joints, geoms and sites; a drop-in for `mjx.kinematics`.
-
-    Args:
-        model: joints of any type and number.
-        data: `qpos` and the poses of mocap bodies. Quaternions need not be normalised.
-
-    Returns:
-        Data with positions (m) and orientations in the world, and normalised quaternions in `qpos`.
-    """
+    """Place bodies, joints, geoms and sites, and normalise the quaternions of `qpos`; a drop-in for `mjx.kinematics`."""
     frames = tree.frames(model)
     qpos, turn, way, origin = _joint_motion(model, data.qpos)
     turned = orientation(model, data, frames, turn)
@@ -119,15 +112,7 @@ def _place(
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find centres of mass, inertias about them, and joint axes as motions; a drop-in for `mjx.com_pos`.
-
-    Args:
-        model: masses (kg) and principal inertias (kg m²). Bodies may have no mass.
-        data: with poses, as `kinematics` leaves them.
-
-    Returns:
-        Data with `subtree_com` (m), `cinert` and `cdof`.
-    """
+    """Find `subtree_com`, `cinert` and `cdof` of posed bodies, with mass or without; a drop-in for `mjx.com_pos`."""
     mass = model.body_mass
     moments = jnp.concatenate([spatial.scale(mass, data.xipos), mass[:, None]], axis=1)
     sums = combine(tree.descendants(model), moments)
@@ -168,15 +153,7 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
 
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find velocities of bodies and rates of joint axes; a drop-in for `mjx.com_vel`.
-
-    Args:
-        model: gives the tree.
-        data: `qvel`, and `cdof` as `com_pos` leaves it.
-
-    Returns:
-        Data with `cvel` and `cdof_dot`.
-    """
+    """Find velocities of bodies `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
     motion = spatial.scale(data.qvel, data.cdof)
     sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
     velocity, before = sums[: model.nbody], sums[model.nbody :]
@@ -186,14 +163,8 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find the mass matrix from composite inertias; a drop-in for `mjx.crb`.
 
-    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself.
-
-    Args:
-        model: `dof_armature` is added to the diagonal (kg or kg m²).
-        data: with `cinert` and `cdof`, as `com_pos` leaves them.
-
-    Returns:
-        Data with `crb` and `M`, in whichever of MJX's two formats the data has.
+    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself. `M` is in
+    whichever of MJX's two formats the data has.
     """
     if data._impl.M.ndim == 1:
         return mjx.crb(model, data)
@@ -211,15 +182,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find gravity, Coriolis and centrifugal forces; a drop-in for `mjx.rne`.
-
-    Args:
-        model: `opt.gravity` (m/s²).
-        data: with `cinert`, `cdof`, `cvel` and `cdof_dot`.
-
-    Returns:
-        Data with `qfrc_bias` (N or N m), the joint forces that keep the acceleration at zero.
-    """
+    """Find gravity, Coriolis and centrifugal forces, `qfrc_bias`, which keep the acceleration at zero; as `mjx.rne`."""
     acceleration = combine(tree.moving_dofs(model), spatial.scale(data.qvel, data.cdof_dot))
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
@@ -234,3 +197,106 @@ def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbo
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
     return spatial.dot(data.cdof, carried)
+
+
+class Bodies(eqx.Module):
+    """Bodies in motion, by which the mass matrix is applied without being formed.
+
+    M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
+    ancestors, a product with each body's inertia, sums over descendants, as in `rne`. Its derivative is of the same kind,
+    where that of the matrix is a matrix.
+
+    Attributes:
+        inertia: of each body about the centre of mass of its tree, as MuJoCo keeps it.
+        axes: motion of unit joint velocities about it.
+        armature: inertia of the joints' drives (kg or kg m²).
+        moves: for each body the joint velocities that move it.
+    """
+
+    inertia: Float[Array, "nbody 10 *batch"]
+    axes: Float[Array, "nv 6 *batch"]
+    armature: Float[Array, "nv *batch"]
+    moves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def apply(self, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """Return M a."""
+        moves = np.zeros((len(self.moves), len(self.axes)))
+        for row, dofs in zip(moves, self.moves, strict=True):
+            row[list(dofs)] = 1
+        motion = combine(moves, spatial.scale(acceleration, self.axes))
+        force = spatial.momentum(self.inertia, motion)
+        return spatial.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
+
+
+class Inertia(eqx.Module):
+    """M.
+
+    Attributes:
+        matrix: its entries.
+        bodies: what it is made of, if nothing else adds to it: then derivatives go through them and not through the
+            entries.
+    """
+
+    matrix: Float[Array, "nv nv *batch"]
+    bodies: Bodies | None = None
+
+    def apply(self, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """Return M a."""
+        if self.bodies is None:
+            return contract("ij,j->i", self.matrix, acceleration)
+        return self.bodies.apply(acceleration)
+
+
+def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
+    """Return M of data with its mass matrix filled in."""
+    matrix = mjx.full_m(model, data)
+    if model.ntendon or data._impl.M.ndim == 1:
+        # Tendons have armature of their own; the sparse format is MJX's.
+        return Inertia(matrix)
+    moves = tuple(tuple(int(dof) for dof in np.nonzero(row)[0]) for row in tree.moving_dofs(model))
+    armature = jnp.asarray(model.dof_armature, matrix.dtype)
+    return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
+
+
+def integrate_position(
+    model: mjx.Model, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], duration: Float[Array, ""] | float
+) -> Float[Array, " nq"]:
+    """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
+    turning, first, dofs = _addresses(model)
+    if not turning.size:
+        return qpos + duration * qvel
+    moved = qpos.at[first].add(duration * qvel[dofs])
+    quaternions = qpos[turning[:, :1] + np.arange(4)]
+    turned = spatial.multiply(quaternions, spatial.exponential(duration * qvel[turning[:, 1:] + np.arange(3)]))
+    turned = turned / jnp.sqrt(jnp.sum(turned * turned, axis=-1, keepdims=True))
+    return moved.at[turning[:, :1] + np.arange(4)].set(turned)
+
+
+def position_change(model: mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Return the velocity that moves one position to another in unit time, by the shorter turns of quaternions.
+
+    The inverse of `integrate_position`.
+    """
+    turning, first, dofs = _addresses(model)
+    if not turning.size:
+        return end - start
+    quaternions = turning[:, :1] + np.arange(4)
+    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(start[quaternions]), end[quaternions]))
+    change = jnp.zeros(model.nv, start.dtype).at[dofs].set((end - start)[first])
+    return change.at[turning[:, 1:] + np.arange(3)].set(turned)
+
+
+def _addresses(model: mjx.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (qpos, dof) addresses of quaternions, and those of the coordinates that simply add."""
+    turning, first, dofs = [], [], []
+    for kind, address, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        if kind == _Joint.mjJNT_FREE:
+            first += range(address, address + 3)
+            dofs += range(dof, dof + 3)
+            turning.append((address + 3, dof + 3))
+        elif kind == _Joint.mjJNT_BALL:
+            turning.append((address, dof))
+        else:
+            first.append(address)
+            dofs.append(dof)
+    return np.array(turning, int).reshape(-1, 2), np.array(first, int), np.array(dofs, int)

@@ -72,12 +72,10 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import Impedance, stiffness_damping
-from mjxgrad.dynamics import assembly
-from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import other_sides, slot_geoms
-from mjxgrad.dynamics.contact import row_map
-from mjxgrad.dynamics.implicit import Variant
 from mjxgrad.dynamics.jacobian import RowMap
+from mjxgrad.dynamics.newton import Variant
+from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
@@ -112,12 +110,9 @@ class Onset(eqx.Module):
         Raises:
             ValueError: if the width is negative or not finite.
         """
-        if is_known(self.width):
-            known = np.asarray(self.width)
-            if not np.all((known >= 0) & np.isfinite(known)):
-                raise ValueError(
-                    f"width must be finite and not negative, got {known!s}: 0.1 is the default, 0 no floor"
-                )
+        if is_known(self.width) and not np.all((np.asarray(self.width) >= 0) & np.isfinite(self.width)):
+            given = np.asarray(self.width)
+            raise ValueError(f"width must be finite and not negative, got {given!s}: 0.1 is the default, 0 no floor")
 
     def check(self, gradient: str) -> None:
         """Refuse what a single step cannot take.
@@ -153,13 +148,7 @@ class Shares(eqx.Module):
 
 
 class Partial(eqx.Module):
-    """Contacts that act for a part of the step, as two solves take them.
-
-    Attributes:
-        variants: of the rows, with p₊ and with p₋.
-        share: Φ, the weight of the former.
-        is_split: whether they differ.
-    """
+    """Contacts that act for a part of the step, as two solves take them: with p₊, whose weight is Φ, and with p₋."""
 
     variants: Variant
     share: Float[Array, ""]
@@ -167,24 +156,11 @@ class Partial(eqx.Module):
 
 
 def begin(
-    model: mjx.Model,
-    data: mjx.Data,
-    blocks: list[Block],
-    onset: Onset,
-    *,
-    without: tuple[bool, bool] = (False, False),
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], onset: Onset, *, without: tuple[bool, bool] = (False, False)
 ) -> tuple[list[Block], Shares | None]:
-    """Return constraint rows present wherever they act for a part of the step, and for which part.
+    """Return constraint rows present wherever they act for a part of the step, and for which; None if none begins or ends.
 
-    Args:
-        model: gives the time step and gravity.
-        data: with contacts, positions and velocities.
-        blocks: the rows of this state.
-        onset: the width.
-        without: whether contacts, and limits, are left as they are, averaged over noise on their distance.
-
-    Returns:
-        The rows and their shares; no shares if nothing begins or ends.
+    `without` says whether contacts, and limits, are left as they are, averaged over noise on their distance.
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
@@ -199,7 +175,7 @@ def begin(
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
         share, side = _share(model, data, block, onset, geoms)
-        share = jnp.repeat(share, each, total_repeat_length=each * count)
+        share = per_row(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
@@ -209,22 +185,15 @@ def begin(
 
 
 def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> Partial | None:
-    """Return in what the solves of a step differ.
-
-    Args:
-        model: gives the laws of the rows.
-        data: with velocities.
-        blocks: rows from `begin`, or these under noise.
-        shares: from `begin`; None for rows of which none begins or ends.
-    """
+    """Return in what the solves of a step differ, from what `begin` gives, or these rows under noise."""
     if shares is None:
         return None
-    rows = assembly.joined(blocks)
+    rows = joined(blocks)
     weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
     if shares.parts is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
     turned = eqx.tree_at(lambda block: block.map, rows, rows.map.with_parts(shares.parts))
-    references = [assembly.law(model, data.qvel, block)[0] for block in (rows, turned)]
+    references = [law(model, data.qvel, block)[0] for block in (rows, turned)]
     parts = tuple(
         None if other is None else jax.tree.map(lambda *x: jnp.stack(x), block.map, other)
         for block, other in zip(blocks, shares.parts, strict=True)
@@ -232,22 +201,8 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
     return Partial(Variant(weight, jnp.stack(references), parts), shares.weight, shares.is_split)
 
 
-def _firsts(block: Block) -> np.ndarray:
-    """Return which rows stand for a contact or limit: the first of each."""
-    return (
-        np.arange(len(block.residual)) % block.rows_each == 0
-        if block.rows_each
-        else np.zeros(len(block.residual), bool)
-    )
-
-
 class _Side(eqx.Module):
-    """What may push instead of the contacts of a block.
-
-    Attributes:
-        share: ψ, for which part of the step the present side pushes.
-        map: of the rows from the other side.
-    """
+    """What may push instead of the contacts of a block: ψ, for which part the present side pushes, and the other's rows."""
 
     share: Float[Array, " contacts"]
     map: RowMap
@@ -342,14 +297,14 @@ def _side(
 
 def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_Side | None]) -> Shares:
     """Return the shares in two solves, from φ of the rows and what may push instead of them."""
-    is_first = np.concatenate([_firsts(block) for block in blocks])
+    # The first row of each stands for a contact or limit.
+    each = [(np.arange(len(block.residual)), block.rows_each) for block in blocks]
+    is_first = np.concatenate([row % num == 0 if num else np.zeros(len(row), bool) for row, num in each])
     whole, present = jnp.concatenate(shares), 1.0
     if any(side is not None for side in sides):
         present = jnp.concatenate(
             [
-                jnp.ones_like(share)
-                if side is None
-                else jnp.repeat(side.share, block.rows_each, total_repeat_length=len(share))
+                jnp.ones_like(share) if side is None else per_row(side.share, block.rows_each)
                 for block, share, side in zip(blocks, shares, sides, strict=True)
             ]
         )
@@ -392,6 +347,4 @@ def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMa
 def _weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
     """Return D of rows that act with a part of their impedance; zero for those without."""
     least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
-    impedance = least * block.impedance.present
-    weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
-    return jnp.where(share > 0, weight, 0.0)
+    return jnp.where(share > 0, weight_of(block, least * block.impedance.present), 0.0)

@@ -9,9 +9,9 @@ choose the better start.
 Matrix products ask for full precision, since NVIDIA GPUs otherwise round their factors to ten bits, contact Jacobians included.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, Literal, get_args
+import contextlib
+from collections.abc import Iterator
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +22,13 @@ from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known_to_be
 from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
-from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.implicit import System, Variant
-from mjxgrad.dynamics.inertia import Inertia, inertia_of
-from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
+from mjxgrad.dynamics.kinematics import Inertia, inertia_of, integrate_position
+from mjxgrad.dynamics.newton import System, Variant
 from mjxgrad.dynamics.onset import Onset, Partial, Shares
+from mjxgrad.dynamics.rows import Block, joined
 from mjxgrad.dynamics.smoothing import Smoothing, smoothed
 
 _Disable = mujoco.mjtDisableBit
@@ -38,18 +37,15 @@ _Integrator = mujoco.mjtIntegrator
 Gradient = Literal["discrete", "event"]
 
 
-def _at_full_precision(function: Callable[..., mjx.Data]) -> Callable[..., mjx.Data]:
-    @functools.wraps(function)
-    def wrapped(model: mjx.Model, data: mjx.Data, **settings: Any) -> mjx.Data:
-        if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
-            raise ValueError(
-                "model and data must be of MJX's JAX implementation, got "
-                f"{model.impl} and {data.impl}: create them with impl='jax'"
-            )
-        with jax.default_matmul_precision("highest"):
-            return function(model, data, **settings)
-
-    return wrapped
+@contextlib.contextmanager
+def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
+    if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
+        raise ValueError(
+            "model and data must be of MJX's JAX implementation, got "
+            f"{model.impl} and {data.impl}: create them with impl='jax'"
+        )
+    with jax.default_matmul_precision("highest"):
+        yield
 
 
 def check_gradient(gradient: str) -> None:
@@ -62,7 +58,6 @@ def check_gradient(gradient: str) -> None:
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
 
 
-@_at_full_precision
 def step(
     model: mjx.Model,
     data: mjx.Data,
@@ -100,18 +95,18 @@ def step(
     if onset is not None:
         onset.check(gradient)
     integrator = model.opt.integrator
-    if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, gradient, onset, smoothing)
-    data, blocks = _forward(model, data, onset, smoothing)
-    moving = events.correct(model, data, blocks) if gradient == "event" else data
-    if integrator == _Integrator.mjINT_EULER:
-        return _advance(model, data, _euler_acceleration(model, moving), None)
-    if integrator == _Integrator.mjINT_IMPLICITFAST:
-        return _advance(model, data, _implicit_acceleration(model, moving), None)
+    with _at_full_precision(model, data):
+        if integrator == _Integrator.mjINT_RK4:
+            return _runge_kutta(model, data, gradient, onset, smoothing)
+        data, blocks = _forward(model, data, onset, smoothing)
+        moving = events.correct(model, data, blocks) if gradient == "event" else data
+        if integrator == _Integrator.mjINT_EULER:
+            return _advance(model, data, _euler_acceleration(model, moving), None)
+        if integrator == _Integrator.mjINT_IMPLICITFAST:
+            return _advance(model, data, _implicit_acceleration(model, moving), None)
     raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>")
 
 
-@_at_full_precision
 def forward(
     model: mjx.Model, data: mjx.Data, *, onset: Onset | None = None, smoothing: Smoothing | None = None
 ) -> mjx.Data:
@@ -135,7 +130,8 @@ def forward(
         smoothing.check("discrete")
     if onset is not None:
         onset.check("discrete")
-    return _forward(model, data, onset, smoothing)[0]
+    with _at_full_precision(model, data):
+        return _forward(model, data, onset, smoothing)[0]
 
 
 def _forward(
@@ -161,7 +157,6 @@ def _forward(
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
-@_at_full_precision
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find the acceleration and the constraint forces; a drop-in for `mjx.solve`.
 
@@ -177,18 +172,19 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX.
     """
-    layout, impl = assembly.row_layout(model, data), data._impl
-    rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
-    entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
-    active = jnp.ones(layout.num_rows, bool)
-    system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
-    return _minimum(model, data, layout, system, _start(model, data))
+    with _at_full_precision(model, data):
+        layout, impl = assembly.row_layout(model, data), data._impl
+        rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
+        entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
+        active = jnp.ones(layout.num_rows, bool)
+        system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
+        return _minimum(model, data, layout, system, _start(model, data))
 
 
 def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowLayout, System | None]:
     """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
     layout = assembly.row_layout(model, data)
-    return layout, assembly.system_of(model, data, layout, assembly.joined(blocks)) if blocks else None
+    return layout, assembly.system_of(model, data, layout, joined(blocks)) if blocks else None
 
 
 def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -206,13 +202,7 @@ def _smoothed_solve(
 ) -> mjx.Data:
     """Solve with rows under noise; in backward mode without it, but for the derivative.
 
-    Args:
-        model: with the solver's options.
-        data: with all smooth forces.
-        blocks: the rows as MuJoCo has them.
-        begun: as they act for a part of the step, and
-        shares: for which.
-        smoothing: the noise.
+    `blocks` are the rows as MuJoCo has them, `begun` as they act for a part of the step, and `shares` for which.
     """
     is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
@@ -221,7 +211,7 @@ def _smoothed_solve(
     if uncertain is None or not model.nv:
         return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)
     soft = assembly.make_constraint(model, data, blocks)
-    system = assembly.system_of(model, data, layout, assembly.joined(blocks), uncertain)
+    system = assembly.system_of(model, data, layout, joined(blocks), uncertain)
     if is_forward:
         return _minimum(model, soft, layout, system, _start(model, data), partial)
     fixed_model, fixed_data, given, partial = jax.lax.stop_gradient((model, data, begun, partial))
@@ -335,10 +325,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " n
 
 
 def _advance(
-    model: mjx.Model,
-    data: mjx.Data,
-    acceleration: Float[Array, " nv"],
-    velocity: Float[Array, " nv"] | None,
+    model: mjx.Model, data: mjx.Data, acceleration: Float[Array, " nv"], velocity: Float[Array, " nv"] | None
 ) -> mjx.Data:
     """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
     # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.

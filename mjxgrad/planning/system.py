@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State
 from mjxgrad.dynamics import Smoothing, step
-from mjxgrad.dynamics.integrate import integrate_position, position_change
+from mjxgrad.dynamics.kinematics import integrate_position, position_change
 from mjxgrad.scene import Scene
 from mjxgrad.task import as_pytree
 

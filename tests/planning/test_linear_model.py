@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from mjxgrad.dynamics import Smoothing
-from mjxgrad.dynamics.integrate import position_change
+from mjxgrad.dynamics.kinematics import position_change
 from mjxgrad.planning.linear_model import analytic, first_order, mean_step, zeroth_order
 from mjxgrad.planning.system import FunctionSystem, SceneSystem
 
