@@ -24,6 +24,10 @@ from mjxgrad._math import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
 from mjxgrad.dynamics.spatial import contract, dot, pick
 
+_PerPair = Float[Array, " pairs"]
+_Frames = Float[Array, "pairs 3 3"]
+_Points = Float[Array, "pairs 3"]
+_Pairs = Int[np.ndarray, "pairs 2"]
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER")
@@ -83,13 +87,8 @@ def other_sides(
     """Return the contact that would take the place of each as bodies move on, and by how much the present one is nearer (m).
 
     Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
-    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps.
-
-    Args:
-        model: with the geoms.
-        data: with their poses.
-        contact: as `collide` found them.
-        geoms: of each; constants where they are known. Faces of boxes change sides only there.
+    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
+    boxes change sides only where the geoms are constants.
     """
     towards = data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
@@ -102,9 +101,7 @@ def other_sides(
     return contact.replace(pos=pos, frame=frame), nearer
 
 
-def _next_face(
-    model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]
-) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"], Float[Array, " pairs"]]:
+def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points, _Frames, _PerPair]:
     """Return position and frame of a ball's contact with the second nearest face of a box, and how much farther that is."""
     distance, outward, beyond, sign = _from_box(model, data, geoms)
     nearest = _largest(beyond)
@@ -129,13 +126,13 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
     return jax.tree.map(lambda x: x[index], contact)
 
 
-def _gaps(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> Float[Array, " pairs"]:
+def _gaps(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> _PerPair:
     """Return the distances of bounding spheres."""
     first, second = data.geom_xpos[geoms.T]
     return jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
 
 
-def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
     plane, box = geoms.T
     normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
@@ -151,7 +148,7 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pair
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
-def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> _Found:
     """Return MJX's contacts with the derivative of the distance that it drops."""
     dist, pos, frame = COLLISION_FUNCTIONS[key.types](model, data, key, geoms)
     on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
@@ -160,14 +157,14 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray
     return jax.lax.stop_gradient(dist - height) + height, pos, frame
 
 
-def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
     distance, outward, *_ = _from_box(model, data, geoms)
     pos, frame = _towards_box(model, data, geoms, distance, outward)
     return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
 
 
-def _from_box(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> tuple[Array, Array, Array, Array]:
+def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
     """Return how far a ball's centre lies outside a box, in which direction, and its distances and sides along the axes."""
     sphere, box = geoms.T
     away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
@@ -183,12 +180,8 @@ def _from_box(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"
 
 
 def _towards_box(
-    model: mjx.Model,
-    data: mjx.Data,
-    geoms: Int[np.ndarray, "pairs 2"],
-    distance: Float[Array, " pairs"],
-    outward: Float[Array, "pairs 3"],
-) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"]]:
+    model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
+) -> tuple[_Points, _Frames]:
     """Return position and frame of contacts, half-way between both surfaces."""
     sphere, box = geoms.T
     normal = contract("pij,pj->pi", pick(box, data.geom_xmat), -outward)
@@ -196,7 +189,7 @@ def _towards_box(
     return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
 
 
-def _largest(x: Float[Array, "pairs 3"]) -> Array:
+def _largest(x: _Points) -> Array:
     """Return which is the largest of three."""
     return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
 

@@ -13,6 +13,8 @@ from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.rows import Block, contact_jacobian, per_row
 
+_Ends = Float[Array, "constraints 2 3"]
+
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     """Return one block per type that the model has."""
@@ -62,9 +64,7 @@ def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return is_site, objects, bodies
 
 
-def _points(
-    model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: Float[Array, "constraints 2 3"]
-) -> Float[Array, "constraints 2 3"]:
+def _points(model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: _Ends) -> _Ends:
     """Return the world positions of both ends: sites, or anchors in the frames of their bodies."""
     is_site, objects, bodies = _ends(model, ids)
     points = data.xpos[bodies] + jnp.sum(data.xmat[bodies] * anchors[:, :, None, :], axis=-1)
@@ -75,7 +75,7 @@ def _points(
 
 
 def _translation(
-    model: mjx.Model, data: mjx.Data, points: Float[Array, "constraints 2 3"], bodies: np.ndarray
+    model: mjx.Model, data: mjx.Data, points: _Ends, bodies: np.ndarray
 ) -> Float[Array, "constraints 3 nv"]:
     """Return the Jacobian of the first end's position less the second's."""
     frame = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), (len(points), 3, 3))

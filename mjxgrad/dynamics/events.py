@@ -69,6 +69,10 @@ from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
 from mjxgrad.dynamics.newton import System
 from mjxgrad.dynamics.rows import Block, joined
 
+_PerRow = Float[Array, " rows"]
+_Truths = Bool[Array, " contacts"]
+_PerContact = Float[Array, " contacts"]
+_Vector = Float[Array, " nv"]
 # Nodes and weights of Gauss and Legendre on (0, 1).
 _NODES = 0.5 + 0.5 * np.polynomial.legendre.leggauss(3)[0]
 _SHARES = 0.5 * np.polynomial.legendre.leggauss(3)[1]
@@ -104,13 +108,13 @@ class _Events(eqx.Module):
     """
 
     system: System
-    damping: Float[Array, " rows"]
-    begins: Bool[Array, " contacts"]
-    ends: Bool[Array, " contacts"]
+    damping: _PerRow
+    begins: _Truths
+    ends: _Truths
     normal: Float[Array, "contacts nv"]
-    speed: Float[Array, " contacts"]
-    creep: Float[Array, " contacts"]
-    start: Float[Array, " nv"]
+    speed: _PerContact
+    creep: _PerContact
+    start: _Vector
     timestep: Float[Array, ""]
     tolerance: Float[Array, ""]
 
@@ -131,9 +135,7 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
     return data.replace(qacc=data.qacc + change, qfrc_constraint=pushed)
 
 
-def impulse(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
+def impulse(model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: _Vector) -> _Vector:
     """Return a change of velocity after a step, of value zero, with the tangents of the events within it.
 
     `data` is solved for the state before; the mean velocity leads from there to the state after.
@@ -159,7 +161,7 @@ def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: b
     return _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
 
 
-def contacts_of(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[Array, "contacts nv"]]:
+def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contacts nv"]]:
     """Return distance less margin, and normal row, of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
@@ -175,12 +177,12 @@ def contacts_of(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[A
 def _events(
     model: mjx.Model,
     data: mjx.Data,
-    velocity: Float[Array, " nv"],
+    velocity: _Vector,
     plan: _Plan,
     blocks: list[Block],
     normal: Float[Array, "contacts nv"],
-    begins: Bool[Array, " contacts"],
-    ends: Bool[Array, " contacts"],
+    begins: _Truths,
+    ends: _Truths,
 ) -> _Events:
     is_event = _per_row(plan, begins | ends)
     touching = _in_contact(joined(blocks), is_event)
@@ -199,7 +201,7 @@ def _events(
     )
 
 
-def _creep(model: mjx.Model, blocks: list[Block]) -> Float[Array, " contacts"]:
+def _creep(model: mjx.Model, blocks: list[Block]) -> _PerContact:
     """Return g / 2(B + √K) of each contact, and zero for limits, whose coordinate gravity may not be an acceleration of."""
     gravity, speeds = safe_sqrt(jnp.sum(model.opt.gravity**2)), []
     for block in blocks:
@@ -221,19 +223,13 @@ def _per_row(plan: _Plan, values: Array) -> Array:
 def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
     """Return rows with some of them at zero distance, in contact."""
     impedance = jnp.where(which, block.impedance.onset, block.impedance.present)
-    return eqx.tree_at(
-        lambda b: (b.residual, b.impedance, b.is_active),
-        block,
-        (
-            jnp.where(which, 0.0, block.residual),
-            Impedance(impedance, block.impedance.full, block.impedance.onset),
-            block.is_active | which,
-        ),
-    )
+    impedance = Impedance(impedance, block.impedance.full, block.impedance.onset)
+    residual = jnp.where(which, 0.0, block.residual)
+    return dataclasses.replace(block, residual=residual, impedance=impedance, is_active=block.is_active | which)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _impulse(plan: _Plan, events: _Events, distance: Float[Array, " contacts"]) -> Float[Array, " nv"]:
+def _impulse(plan: _Plan, events: _Events, distance: _PerContact) -> _Vector:
     """Return zero, whose tangent is the change of velocity by what later events leave out."""
     # Not a constant: under nested batches JAX (0.10.2) fails on a rule whose value has no batch and whose tangent has one.
     return 0 * events.start
@@ -255,7 +251,7 @@ def _impulse_jvp(plan, primals, tangents):
     return 0 * events.start, change
 
 
-def _delay(events: _Events, free: Float[Array, " nv"]) -> Float[Array, " contacts"]:
+def _delay(events: _Events, free: _Vector) -> _PerContact:
     """Return by how much an event comes later per distance (s/m), less where the speed is not resolved."""
     drift = events.timestep * (events.normal @ free)
     square = events.speed**2 + jnp.maximum(drift**2, events.creep**2)
@@ -266,7 +262,7 @@ def _without(system: System, which: Bool[Array, " rows"]) -> System:
     return eqx.tree_at(lambda s: s.rows.weight, system, jnp.where(which, 0.0, system.rows.weight))
 
 
-def _secant_bend(layout: RowLayout, rows: Rows, start: Float[Array, " rows"], stop: Float[Array, " rows"]) -> Bend:
+def _secant_bend(layout: RowLayout, rows: Rows, start: _PerRow, stop: _PerRow) -> Bend:
     """Return the curvature averaged between two points, by which the forces at both differ."""
     moved = stop - start
     is_far = jnp.abs(moved) > jnp.sqrt(jnp.finfo(moved.dtype).eps) * (jnp.abs(start) + jnp.abs(stop))
@@ -281,9 +277,7 @@ def _secant_bend(layout: RowLayout, rows: Rows, start: Float[Array, " rows"], st
     return Bend(jnp.where(is_far[simple], secant[simple], curved.simple), tuple(means))
 
 
-def _damped(
-    plan: _Plan, events: _Events, acceleration: Float[Array, " nv"], change: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
+def _damped(plan: _Plan, events: _Events, acceleration: _Vector, change: _Vector) -> _Vector:
     """Return what contacts leave of a change of velocity in half a time step, by the implicit midpoint rule."""
     after = _without(events.system, _per_row(plan, events.ends))
     bend = constraint.bend(plan.layout, after.rows, after.rates(acceleration) - after.rows.reference)
@@ -293,7 +287,7 @@ def _damped(
     return change - implicit.respond(plan.layout, after, whole, resistance)
 
 
-def _damped_bend(layout: RowLayout, bend: Bend, damping: Float[Array, " rows"]) -> Bend:
+def _damped_bend(layout: RowLayout, bend: Bend, damping: _PerRow) -> Bend:
     """Return the curvature times the damping of the rows, symmetric."""
     cones = []
     for group, matrix in zip(layout.cones, bend.cones, strict=True):

@@ -29,13 +29,16 @@ from mjxgrad.dynamics import cholesky, constraint, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.newton import System, Variant
 
+_Truth = Bool[Array, ""]
+_Scalar = Float[Array, ""]
+_Vector = Float[Array, " nv"]
 CHECKPOINT_NAME = "acceleration"
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def solve(
-    layout: RowLayout, max_iterations: int, system: System, start: Float[Array, " nv"], tolerance: Float[Array, ""]
-) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
+    layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar
+) -> tuple[_Vector, Int[Array, ""]]:
     """Return what `newton.minimise` does, differentiable with respect to the system."""
     return linear.batch_last(functools.partial(newton.minimise, layout, max_iterations))(system, start, tolerance)
 
@@ -58,9 +61,9 @@ def solve_both(
     max_iterations: int,
     system: System,
     variants: Variant,
-    differ: Bool[Array, ""],
-    start: Float[Array, " nv"],
-    tolerance: Float[Array, ""],
+    differ: _Truth,
+    start: _Vector,
+    tolerance: _Scalar,
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
     """Solve in two variants, on CPUs the second time only where they differ.
 
@@ -110,19 +113,13 @@ def _takes_few() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def respond(
-    layout: RowLayout,
-    system: System,
-    bend: Bend,
-    force: Float[Array, " nv"],
-    is_needed: Bool[Array, ""] | None = None,
-) -> Float[Array, " nv"]:
+def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_needed: _Truth | None = None) -> _Vector:
     """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force.
 
     Where it is not needed it is zero.
     """
 
-    def apply(x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def apply(x: _Vector) -> _Vector:
         return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
 
     def run(system, bend, force):

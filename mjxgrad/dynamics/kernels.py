@@ -38,6 +38,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import special
 
+_Shape = Float[Array, "*shape"]
 # The mean of |w| that all kernels share.
 _MEAN_SIZE = math.sqrt(2 / math.pi)
 _LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
@@ -63,18 +64,18 @@ class Kernel(abc.ABC):
     stddev: float
 
     @abc.abstractmethod
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def ramp(self, distance: _Shape) -> _Shape:
         r"""Return the mean push, $\mathbb{E} \max(-r - w, 0)$."""
 
     @abc.abstractmethod
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def share(self, distance: _Shape) -> _Shape:
         """Return the probability of contact, that r + w is negative."""
 
     @abc.abstractmethod
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def density(self, noise: _Shape) -> _Shape:
         """Return the density of the noise, the derivative of `share` but for its sign."""
 
-    def depth(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def depth(self, distance: _Shape) -> _Shape:
         """Return the mean penetration, given that there is contact; held beyond `reach`, where there is next to none."""
         near = jnp.minimum(distance, self.reach)
         return self.ramp(near) / self.share(near)
@@ -83,50 +84,42 @@ class Kernel(abc.ABC):
 class Gaussian(Kernel):
     """Normal noise."""
 
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return φ(r) - r Φ(-r)."""
+    def ramp(self, distance):
         return _normal_ramp(distance)
 
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return Φ(-r)."""
+    def share(self, distance):
         return _normal_share(distance)
 
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return φ(w)."""
+    def density(self, noise):
         return jnp.exp(-0.5 * noise**2) * (1 / math.sqrt(2 * math.pi))
 
 
 class Logistic(Kernel):
     """Noise with the logistic distribution."""
 
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return b softplus(-r/b)."""
+    def ramp(self, distance):
         return _LOGISTIC_SCALE * jax.nn.softplus(-distance / _LOGISTIC_SCALE)
 
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return 1 / (1 + exp(r/b))."""
+    def share(self, distance):
         return jax.nn.sigmoid(-distance / _LOGISTIC_SCALE)
 
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return share (1 - share) / b."""
+    def density(self, noise):
         return self.share(noise) * self.share(-noise) / _LOGISTIC_SCALE
 
 
 class LogBarrier(Kernel):
     """Noise with Student's t distribution of two degrees of freedom, which is what a log barrier averages over."""
 
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return (-r + √(r² + 4/κ)) / 2, written so that nothing cancels."""
+    def ramp(self, distance):
+        # Written so that nothing cancels.
         root = jnp.sqrt(distance**2 + _BARRIER_SQUARE)
         is_far = distance > 0
         return jnp.where(is_far, 0.5 * _BARRIER_SQUARE / (root + jnp.abs(distance)), 0.5 * (root - distance))
 
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return S(r) / √(r² + 4/κ)."""
+    def share(self, distance):
         return self.ramp(distance) / jnp.sqrt(distance**2 + _BARRIER_SQUARE)
 
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return 2√κ / (4 + κ w²)^(3/2)."""
+    def density(self, noise):
         root = jnp.sqrt(noise**2 + _BARRIER_SQUARE)
         return 0.5 * _BARRIER_SQUARE / root / root / root
 
@@ -143,7 +136,7 @@ def _tail_coefficients(degree: int) -> tuple[float, ...]:
 
 
 @jax.custom_jvp
-def _normal_share(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _normal_share(r: _Shape) -> _Shape:
     """Return Φ(-r), to rounding relative to itself on both sides.
 
     Not by `jax.lax.erfc`: that ends in polynomials, which XLA takes for so cheap that it evaluates them again for every
@@ -163,7 +156,7 @@ def _normal_share_jvp(primals, tangents):
 
 
 @jax.custom_jvp
-def _normal_ramp(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _normal_ramp(r: _Shape) -> _Shape:
     """Return φ(r) - r Φ(-r), which holds its digits to a few units of rounding times r²."""
     return KERNELS["gaussian"].density(r) - r * _normal_share(r)
 

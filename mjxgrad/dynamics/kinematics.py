@@ -27,6 +27,8 @@ from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.orientation import Orientation, orientation
 from mjxgrad.dynamics.spatial import combine, contract, pick
 
+_Position = Float[Array, " nq"]
+_Vector = Float[Array, " nv"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _UP = np.array([0.0, 0.0, 1.0])
@@ -68,8 +70,8 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _joint_motion(
-    model: mjx.Model, qpos: Float[Array, " nq"]
-) -> tuple[Float[Array, " nq"], Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
+    model: mjx.Model, qpos: _Position
+) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
     """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
     dtype = qpos.dtype
     kept, turns, ways, origins = [], [], [], []
@@ -193,7 +195,7 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qfrc_bias=generalised_force(model, data, force))
 
 
-def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> Float[Array, " nv"]:
+def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> _Vector:
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
     return spatial.dot(data.cdof, carried)
@@ -218,7 +220,7 @@ class Bodies(eqx.Module):
     armature: Float[Array, "nv *batch"]
     moves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
-    def apply(self, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def apply(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
         moves = np.zeros((len(self.moves), len(self.axes)))
         for row, dofs in zip(moves, self.moves, strict=True):
@@ -240,7 +242,7 @@ class Inertia(eqx.Module):
     matrix: Float[Array, "nv nv *batch"]
     bodies: Bodies | None = None
 
-    def apply(self, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def apply(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
         if self.bodies is None:
             return contract("ij,j->i", self.matrix, acceleration)
@@ -259,8 +261,8 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
 
 
 def integrate_position(
-    model: mjx.Model, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], duration: Float[Array, ""] | float
-) -> Float[Array, " nq"]:
+    model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
+) -> _Position:
     """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
     turning, first, dofs = _addresses(model)
     if not turning.size:
@@ -272,7 +274,7 @@ def integrate_position(
     return moved.at[turning[:, :1] + np.arange(4)].set(turned)
 
 
-def position_change(model: mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]) -> Float[Array, " nv"]:
+def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
     """Return the velocity that moves one position to another in unit time, by the shorter turns of quaternions.
 
     The inverse of `integrate_position`.

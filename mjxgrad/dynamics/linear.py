@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+_Items = Float[Array, "n *rest"]
+_Matrix = Float[Array, "n n *batch"]
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
 # What only some of a batch need is computed for this part of it at a time.
@@ -46,7 +48,7 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     return add(a * b for a, b in zip(x, y, strict=True))
 
 
-def diagonal(matrix: Float[Array, "n n *batch"]) -> Float[Array, "n *batch"]:
+def diagonal(matrix: _Matrix) -> Float[Array, "n *batch"]:
     """Return the diagonal."""
     return jnp.stack([matrix[i, i] for i in range(len(matrix))])
 
@@ -60,7 +62,7 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
     return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
-def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
+def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> _Matrix:
     """Return leftᵀ right."""
     if left.ndim > 2 and len(left) <= LONGEST_SUM:
         return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
@@ -167,24 +169,20 @@ def runs(chosen: tuple[int, ...]) -> list[tuple[slice, slice]]:
     return [(slice(chosen[a], chosen[a] + b - a), slice(a, b)) for a, b in ends if b > a]
 
 
-def take(x: Float[Array, "n *rest"], chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
+def take(x: _Items, chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
     """Return entries at ascending constant indices."""
     parts = [x[target] for target, _ in runs(chosen)]
     return parts[0] if len(parts) == 1 else jnp.concatenate([x[:0], *parts])
 
 
-def add_at(
-    x: Float[Array, "n *rest"], chosen: tuple[int, ...], part: Float[Array, "m *rest"]
-) -> Float[Array, "n *rest"]:
+def add_at(x: _Items, chosen: tuple[int, ...], part: Float[Array, "m *rest"]) -> _Items:
     """Return x with something added to entries at ascending constant indices."""
     for target, source in runs(chosen):
         x = _add_block(x, (target,), part[source])
     return x
 
 
-def add_to_block(
-    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m m *batch"]
-) -> Float[Array, "n n *batch"]:
+def add_to_block(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m m *batch"]) -> _Matrix:
     """Return a matrix with something added to some rows and the same columns."""
     for down, left in runs(chosen):
         for across, right in runs(chosen):
@@ -192,9 +190,7 @@ def add_to_block(
     return matrix
 
 
-def add_to_diagonal(
-    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m *batch"]
-) -> Float[Array, "n n *batch"]:
+def add_to_diagonal(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m *batch"]) -> _Matrix:
     """Return a matrix with something added to some entries of the diagonal."""
     for place, k in enumerate(chosen):
         matrix = _add_block(matrix, (slice(k, k + 1), slice(k, k + 1)), part[place][None, None])

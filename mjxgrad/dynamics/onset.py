@@ -59,6 +59,7 @@ References:
     and control? arXiv:2207.05060 (time of impact). Kong, Payne, Zhu, Johnson. Saltation matrices. arXiv:2306.06862.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -77,6 +78,8 @@ from mjxgrad.dynamics.jacobian import RowMap
 from mjxgrad.dynamics.newton import Variant
 from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
+_PerRow = Float[Array, " rows"]
+_PerContact = Float[Array, " contacts"]
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
 )
@@ -140,8 +143,8 @@ class Shares(eqx.Module):
         parts: of J, block by block, in the solve with p₋, where some push from another side; None where none ever does.
     """
 
-    before: Float[Array, " rows"]
-    after: Float[Array, " rows"]
+    before: _PerRow
+    after: _PerRow
     weight: Float[Array, ""]
     is_split: Bool[Array, ""]
     parts: tuple[RowMap | None, ...] | None
@@ -178,7 +181,7 @@ def begin(
         share = per_row(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
-        rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
+        rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
         found.append(share)
         sides.append(side)
     return rows, _split(blocks, found, sides)
@@ -192,7 +195,7 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
     weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
     if shares.parts is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
-    turned = eqx.tree_at(lambda block: block.map, rows, rows.map.with_parts(shares.parts))
+    turned = dataclasses.replace(rows, map=rows.map.with_parts(shares.parts))  # pyright: ignore[reportAttributeAccessIssue]
     references = [law(model, data.qvel, block)[0] for block in (rows, turned)]
     parts = tuple(
         None if other is None else jax.tree.map(lambda *x: jnp.stack(x), block.map, other)
@@ -204,13 +207,13 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
 class _Side(eqx.Module):
     """What may push instead of the contacts of a block: ψ, for which part the present side pushes, and the other's rows."""
 
-    share: Float[Array, " contacts"]
+    share: _PerContact
     map: RowMap
 
 
 def _share(
     model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None
-) -> tuple[Float[Array, " contacts"], _Side | None]:
+) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and what may push instead of it; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
@@ -237,20 +240,18 @@ def _share(
     return share, _side(model, data, block, contacts, geoms, rate, least)
 
 
-def _normal(block: Block, rates: Float[Array, "contacts each"]) -> Float[Array, " contacts"]:
+def _normal(block: Block, rates: Float[Array, "contacts each"]) -> _PerContact:
     """Return the rates along the normal."""
     return jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
 
 
-def _is_slow(rate: Float[Array, " contacts"], speed: Float[Array, "..."]) -> Float[Array, " contacts"]:
+def _is_slow(rate: _PerContact, speed: Float[Array, "..."]) -> _PerContact:
     """Return 1 for what is much slower than a speed, and 0 for impacts."""
     own, other = speed**4, rate**4
     return own / jnp.where(own + other > 0, own + other, 1.0)
 
 
-def _ramp(
-    distance: Float[Array, " contacts"], width: Float[Array, " contacts"], centre: Float[Array, "..."] | float
-) -> Float[Array, " contacts"]:
+def _ramp(distance: _PerContact, width: _PerContact, centre: Float[Array, "..."] | float) -> _PerContact:
     # `where`, not `clip`: at a tie its derivative is one half. Without a width there is MuJoCo's step.
     has_width = width > 0
     share = centre - distance / jnp.where(has_width, width, 1.0)
@@ -278,8 +279,8 @@ def _side(
     block: Block,
     contacts: slice,
     geoms: Array | np.ndarray,
-    rate: Float[Array, " contacts"],
-    least: Float[Array, " contacts"],
+    rate: _PerContact,
+    least: _PerContact,
 ) -> _Side | None:
     """Return for how long each contact pushes from its present side, and how it does from another; None if none can."""
     can_turn = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
@@ -344,7 +345,7 @@ def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMa
     return jax.tree.map(choose, other, own)
 
 
-def _weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
+def _weights(block: Block, share: _PerRow) -> _PerRow:
     """Return D of rows that act with a part of their impedance; zero for those without."""
     least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
     return jnp.where(share > 0, weight_of(block, least * block.impedance.present), 0.0)

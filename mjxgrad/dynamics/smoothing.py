@@ -210,12 +210,9 @@ def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothi
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
     gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
-    is_present = spread(known)
-    present = eqx.tree_at(
-        lambda b: (b.impedance, b.inverse_weight, b.is_active),
-        block,
-        (jax.tree.map(spread, resistance), jnp.where(is_present, block.inverse_weight, _WEIGHTLESS), is_present),
-    )
+    is_present, impedances = spread(known), jax.tree.map(spread, resistance)
+    weight = jnp.where(is_present, block.inverse_weight, _WEIGHTLESS)
+    present = dataclasses.replace(block, impedance=impedances, inverse_weight=weight, is_active=is_present)
     return present, Noise(spread(rate * length), spread(gate))
 
 

@@ -22,6 +22,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+_Quaternions = Float[Array, "*batch 4"]
+_Matrices = Float[Array, "n 3 3"]
+_Vectors = Float[Array, "n 3"]
 # (entry of the result, entry of the first factor, entry of the second, coefficient)
 _Term = tuple[int, int, int, float]
 
@@ -208,12 +211,12 @@ def _scale_jvp(primals, tangents):
     return _scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
 
 
-def rotate(matrix: Float[Array, "n 3 3"], x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
     """Return matrix times vector of each item."""
     return contract("nij,nj->ni", matrix, x)
 
 
-def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+def compose(p: _Matrices, q: _Matrices) -> _Matrices:
     """Return the matrix product of each item.
 
     Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices
@@ -223,7 +226,7 @@ def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, 
 
 
 @jax.custom_jvp
-def _compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+def _compose(p: _Matrices, q: _Matrices) -> _Matrices:
     return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
 
@@ -239,7 +242,7 @@ def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Floa
     return _multiply(*jnp.broadcast_arrays(jnp.asarray(p, dtype), jnp.asarray(q, dtype)))
 
 
-def rotation_matrix(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
+def rotation_matrix(q: Float[Array, "n 4"]) -> _Matrices:
     """Return the matrix of v ↦ q v q*, a rotation if q has norm one; quadratic in q whatever its norm."""
     return _rotation(q, q).reshape(-1, 3, 3)
 
@@ -250,9 +253,7 @@ def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
     return scale(jax.lax.rsqrt(jnp.where(square == 0, 1.0, square)), q)
 
 
-def inertia_about(
-    offset: Float[Array, "n 3"], mass: Float[Array, " n"], central: Float[Array, "n 3 3"]
-) -> Float[Array, "n 10"]:
+def inertia_about(offset: _Vectors, mass: Float[Array, " n"], central: _Matrices) -> Float[Array, "n 10"]:
     """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset (from the point), and mass.
 
     `central` is the rotational inertia about the centre of mass, in world axes (kg m²).
@@ -263,12 +264,12 @@ def inertia_about(
     return jnp.concatenate([entries + _steiner(offset, moment), moment, mass[:, None]], axis=1)
 
 
-def conjugate(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def conjugate(q: _Quaternions) -> _Quaternions:
     """Return the conjugate quaternion, the inverse rotation of a unit quaternion."""
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
-def exponential(rotation: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
+def exponential(rotation: Float[Array, "*batch 3"]) -> _Quaternions:
     """Return the unit quaternion of a rotation vector (axis times angle, rad)."""
     square = jnp.sum(rotation * rotation, axis=-1, keepdims=True)
     small = square < _SERIES
@@ -278,7 +279,7 @@ def exponential(rotation: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
     return jnp.concatenate([cosine, half_sinc * rotation], axis=-1)
 
 
-def logarithm(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3"]:
+def logarithm(q: _Quaternions) -> Float[Array, "*batch 3"]:
     """Return the rotation vector (rad) of a unit quaternion, of the shorter of the two turns."""
     q = jnp.where(q[..., :1] < 0, -q, q)
     sine = jnp.sum(q[..., 1:] ** 2, axis=-1, keepdims=True)

@@ -31,6 +31,7 @@ from mjxgrad.dynamics.onset import Onset, Partial, Shares
 from mjxgrad.dynamics.rows import Block, joined
 from mjxgrad.dynamics.smoothing import Smoothing, smoothed
 
+_Vector = Float[Array, " nv"]
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
@@ -187,9 +188,8 @@ def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowL
     return layout, assembly.system_of(model, data, layout, joined(blocks)) if blocks else None
 
 
-def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
-    return data.qacc_smooth if cold else data.qacc_warmstart
+def _start(model: mjx.Model, data: mjx.Data) -> _Vector:
+    return data.qacc_smooth if model.opt.disableflags & _Disable.mjDSBL_WARMSTART else data.qacc_warmstart
 
 
 def _smoothed_solve(
@@ -218,11 +218,8 @@ def _smoothed_solve(
     hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), partial)
     soft = _minimum(model, soft, layout, system, hard.qacc)
 
-    def forces_of(data: mjx.Data) -> dict[str, Array]:
-        return {"qacc": data.qacc, "qfrc_constraint": data.qfrc_constraint, "_impl.efc_force": data._impl.efc_force}
-
-    changed = _with_derivative_of(forces_of(hard), forces_of(soft))
-    return data.tree_replace({**changed, "_impl.solver_niter": hard._impl.solver_niter})  # pyright: ignore[reportReturnType]
+    forces = [(found.qacc, found.qfrc_constraint, found._impl.efc_force) for found in (hard, soft)]
+    return _solved(data, *_with_derivative_of(*forces), hard._impl.solver_niter)
 
 
 @jax.custom_jvp
@@ -241,7 +238,7 @@ def _minimum(
     data: mjx.Data,
     layout: RowLayout,
     system: System | None,
-    start: Float[Array, " nv"],
+    start: _Vector,
     partial: Partial | None = None,
 ) -> mjx.Data:
     """Return data with the acceleration, and the forces of the rows, at which all are in balance."""
@@ -270,14 +267,12 @@ def _minimum(
         acceleration, force, total = (
             x[1] + partial.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(partial.variants, both))
         )
-    return data.tree_replace(  # pyright: ignore[reportReturnType]
-        {
-            "qacc": acceleration,
-            "qfrc_constraint": total,
-            "_impl.efc_force": force,
-            "_impl.solver_niter": num_iterations.astype(data._impl.solver_niter.dtype),
-        }
-    )
+    return _solved(data, acceleration, total, force, num_iterations.astype(data._impl.solver_niter.dtype))
+
+
+def _solved(data: mjx.Data, acceleration: Array, total: Array, force: Array, num_iterations: Array) -> mjx.Data:
+    found = {"_impl.efc_force": force, "_impl.solver_niter": num_iterations}
+    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **found})  # pyright: ignore[reportReturnType]
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
@@ -298,7 +293,7 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
-def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
 
     (M + h D) a' = M a, and M a the sum of all forces, is a' = a - (M + h D)⁻¹ h D a: so the forces need not be added up, nor
@@ -315,7 +310,7 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     return data.qacc - slowed
 
 
-def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with the velocity derivative of the smooth forces taken implicitly."""
     derivative = mjx.deriv_smooth_vel(model, data)
     if derivative is None:
@@ -324,9 +319,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " n
     return cholesky.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
 
 
-def _advance(
-    model: mjx.Model, data: mjx.Data, acceleration: Float[Array, " nv"], velocity: Float[Array, " nv"] | None
-) -> mjx.Data:
+def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: _Vector | None) -> mjx.Data:
     """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
     # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.
     bare = model.tree_replace({"opt.disableflags": model.opt.disableflags | _Disable.mjDSBL_EULERDAMP})
