@@ -234,18 +234,14 @@ def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients p
         return np.nan, np.nan, nothing, nothing, nothing, count
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
-    lever = _lever(u, weight)
+    # Its product with an outcome is the slope of the weighted straight line.
+    centred = u - (weight @ u) / weight.sum()
+    lever = weight * centred / (weight @ centred**2)
     # A trend of degree 3, for curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
     kernel = weight**2 / (weight**2).sum()
     errors = np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes])
     return lever @ y, _clustered(lever * rest), slopes @ kernel, errors, slopes.std(axis=1, ddof=1), count
-
-
-def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Give the numbers whose product with an outcome is the slope of the weighted straight line."""
-    centred = u - (weight @ u) / weight.sum()
-    return weight * centred / (weight @ centred**2)
 
 
 def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:

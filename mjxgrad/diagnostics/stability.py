@@ -254,14 +254,12 @@ class StabilityReport:
         speed = self._speed_of(spring)
         if speed is None or spring.depth(speed) < spring.size or speed * self.timestep >= spring.size:
             return None
+        # At the same damping ratio the depth goes as one over the root of the stiffness.
+        needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
         return (
             f"at {speed:g} a bounce goes {spring.depth(speed):.3g} deep, more than the {spring.size:.3g} from which bodies "
-            f"are pushed back the way they came; take a stiffness of at least {format_number(self._needed(spring, speed))} 1/s²"
+            f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
         )
-
-    def _needed(self, spring: Spring, speed: float) -> float:
-        # At the same damping ratio the depth goes as one over the root of the stiffness.
-        return spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
 
     def _steep(self, spring: Spring) -> str | None:
         if self.precision == "float64" or spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:

@@ -53,7 +53,9 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     for key, contact in contact_groups(model, data).items():
         geoms = np.array(members[key])[:, :2]
         if len(geoms) > most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types):
-            contact = _greatest(contact, -_gaps(model, data, geoms), most_pairs)
+            first, second = data.geom_xpos[geoms.T]
+            gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
+            contact = _greatest(contact, -gaps, most_pairs)
             geoms = contact.geom
         find = _FUNCTIONS.get(key.types) or COLLISION_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
         dist, pos, frame = find(model, data, key, geoms)
@@ -124,12 +126,6 @@ def _joined(contacts: list):
 def _greatest(contact, score: Float[Array, " contacts"], count: int):
     index = jax.lax.top_k(score, k=count)[1]
     return jax.tree.map(lambda x: x[index], contact)
-
-
-def _gaps(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> _PerPair:
-    """Return the distances of bounding spheres."""
-    first, second = data.geom_xpos[geoms.T]
-    return jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
 
 
 def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:

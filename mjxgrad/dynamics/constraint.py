@@ -137,12 +137,7 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
 
 
 class Bend(eqx.Module):
-    """The second derivative of the cost with respect to x.
-
-    Attributes:
-        simple: of each row that stands for itself.
-        cones: of each elliptic contact, a matrix, by group.
-    """
+    """The second derivative of the cost by x: of rows that stand for themselves, and a matrix for each elliptic contact."""
 
     simple: Float[Array, "_ *batch"]
     cones: tuple[Float[Array, "_ _ _ *batch"], ...]

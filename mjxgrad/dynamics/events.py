@@ -99,12 +99,9 @@ class _Events(eqx.Module):
     Attributes:
         system: whose balance is the acceleration.
         damping: h B of each row that acts after the events; zero of others.
-        begins: whether a contact or limit begins.
-        ends: whether it ends.
         normal: from joint velocities to the rate of distance.
         speed: of approach or retreat (m/s or rad/s).
         creep: speed below which gravity presses a contact together faster than it approaches (m/s).
-        start: acceleration to start from.
     """
 
     system: System
@@ -124,14 +121,10 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
     if not any(block.rows_each for block in blocks):
         return data
     distance, normal = contacts_of(blocks)
-    speed = normal @ data.qvel
-    before = distance - model.opt.timestep * speed
-    begins = (distance < 0) & (before >= 0) & (speed < 0)
-    ends = (distance >= 0) & (before < 0) & (speed > 0)
-    plan = _plan(model, data, blocks, is_spread=False)
-    events = _events(model, data, data.qvel, plan, blocks, normal, begins, ends)
-    change = _impulse(plan, events, distance) / model.opt.timestep
-    pushed = data.qfrc_constraint + events.system.inertia.apply(change)
+    before = distance - model.opt.timestep * (normal @ data.qvel)
+    change, system = _change(model, data, blocks, normal, data.qvel, before, distance, is_spread=False)
+    change = change / model.opt.timestep
+    pushed = data.qfrc_constraint + system.inertia.apply(change)
     return data.replace(qacc=data.qacc + change, qfrc_constraint=pushed)
 
 
@@ -145,20 +138,7 @@ def impulse(model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity
     distance, normal = contacts_of(blocks)
     after = distance + model.opt.timestep * (normal @ mean_velocity)
     velocity = data.qvel + 0.5 * model.opt.timestep * data.qacc
-    speed = normal @ velocity
-    begins = (distance >= 0) & (after < 0) & (speed < 0)
-    ends = (distance < 0) & (after >= 0) & (speed > 0)
-    plan = _plan(model, data, blocks, is_spread=True)
-    return _impulse(plan, _events(model, data, velocity, plan, blocks, normal, begins, ends), distance)
-
-
-def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: bool) -> _Plan:
-    owner, count = [], 0
-    for block in blocks:
-        num_rows, each = len(block.residual), block.rows_each
-        owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
-        count += num_rows // each if each else 0
-    return _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
+    return _change(model, data, blocks, normal, velocity, distance, after, is_spread=True)[0]
 
 
 def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contacts nv"]]:
@@ -174,31 +154,42 @@ def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contact
     return jnp.concatenate(distance), jnp.concatenate(normal)
 
 
-def _events(
+def _change(
     model: mjx.Model,
     data: mjx.Data,
-    velocity: _Vector,
-    plan: _Plan,
     blocks: list[Block],
     normal: Float[Array, "contacts nv"],
-    begins: _Truths,
-    ends: _Truths,
-) -> _Events:
-    is_event = _per_row(plan, begins | ends)
-    touching = _in_contact(joined(blocks), is_event)
+    velocity: _Vector,
+    before: _PerContact,
+    after: _PerContact,
+    *,
+    is_spread: bool,
+) -> tuple[_Vector, System]:
+    """Return the change by events between two distances, and the state in which all of them are just in contact."""
+    speed = normal @ velocity
+    begins = (before >= 0) & (after < 0) & (speed < 0)
+    ends = (before < 0) & (after >= 0) & (speed > 0)
+    owner, count = [], 0
+    for block in blocks:
+        num_rows, each = len(block.residual), block.rows_each
+        owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
+        count += num_rows // each if each else 0
+    plan = _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
+    touching = _in_contact(joined(blocks), _per_row(plan, begins | ends))
     damping = model.opt.timestep * stiffness_damping(model, touching.solref, touching.impedance.full)[1]
-    return _Events(
+    events = _Events(
         system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),
         damping=jnp.where(_per_row(plan, ends), 0.0, damping),
         begins=begins,
         ends=ends,
         normal=normal,
-        speed=jnp.abs(normal @ velocity),
+        speed=jnp.abs(speed),
         creep=_creep(model, blocks),
         start=data.qacc,
         timestep=jnp.asarray(model.opt.timestep, velocity.dtype),
         tolerance=jnp.asarray(model.opt.tolerance, velocity.dtype),
     )
+    return _impulse(plan, events, before if is_spread else after), events.system
 
 
 def _creep(model: mjx.Model, blocks: list[Block]) -> _PerContact:
@@ -242,20 +233,17 @@ def _impulse_jvp(plan, primals, tangents):
     without = _without(system, is_event)
     held, _ = implicit.solve(plan.layout, plan.max_iterations, system, events.start, events.tolerance)
     free, _ = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
-    late = jnp.where(events.begins | events.ends, tangents[1] * _delay(events, free), 0.0)
+    # By how much an event comes later per distance (s/m), less where the speed is not resolved.
+    drift = events.timestep * (events.normal @ free)
+    square = events.speed**2 + jnp.maximum(drift**2, events.creep**2)
+    delay = events.speed / jnp.where(square > 0, square, 1.0)
+    late = jnp.where(events.begins | events.ends, tangents[1] * delay, 0.0)
     lost = system.pull(system.row_force(plan.layout, held) * _per_row(plan, late))
     start, stop = (without.rates(a) - without.rows.reference for a in (free, held))
     change = -implicit.respond(plan.layout, without, _secant_bend(plan.layout, without.rows, start, stop), lost)
     if plan.is_spread:
         change = _damped(plan, events, held, change)
     return 0 * events.start, change
-
-
-def _delay(events: _Events, free: _Vector) -> _PerContact:
-    """Return by how much an event comes later per distance (s/m), less where the speed is not resolved."""
-    drift = events.timestep * (events.normal @ free)
-    square = events.speed**2 + jnp.maximum(drift**2, events.creep**2)
-    return events.speed / jnp.where(square > 0, square, 1.0)
 
 
 def _without(system: System, which: Bool[Array, " rows"]) -> System:
@@ -281,16 +269,12 @@ def _damped(plan: _Plan, events: _Events, acceleration: _Vector, change: _Vector
     """Return what contacts leave of a change of velocity in half a time step, by the implicit midpoint rule."""
     after = _without(events.system, _per_row(plan, events.ends))
     bend = constraint.bend(plan.layout, after.rows, after.rates(acceleration) - after.rows.reference)
-    resisting = _damped_bend(plan.layout, bend, 0.5 * events.damping)
+    # The curvature times the damping of the rows, symmetric.
+    damping, cones = 0.5 * events.damping, []
+    for group, matrix in zip(plan.layout.cones, bend.cones, strict=True):
+        own = damping[group.start : group.stop].reshape(group.count, group.dim)
+        cones.append(0.5 * matrix * (own[:, :, None] + own[:, None]))
+    resisting = Bend(bend.simple * damping[: plan.layout.simple_stop], tuple(cones))
     whole = jax.tree.map(operator.add, bend, resisting)
     resistance = after.pull(constraint.bend_product(plan.layout, resisting, after.rates(change)))
     return change - implicit.respond(plan.layout, after, whole, resistance)
-
-
-def _damped_bend(layout: RowLayout, bend: Bend, damping: _PerRow) -> Bend:
-    """Return the curvature times the damping of the rows, symmetric."""
-    cones = []
-    for group, matrix in zip(layout.cones, bend.cones, strict=True):
-        own = damping[group.start : group.stop].reshape(group.count, group.dim)
-        cones.append(0.5 * matrix * (own[:, :, None] + own[:, None]))
-    return Bend(bend.simple * damping[: layout.simple_stop], tuple(cones))

@@ -83,12 +83,7 @@ class RowMap(eqx.Module):
 
 
 class DenseRows(RowMap):
-    """Rows that are few, or that may move every joint.
-
-    Attributes:
-        entries: J.
-        cones: number and dimension of elliptic contacts among them, in order of rows; rows before stand for themselves.
-    """
+    """Rows that are few, or that may move every joint: J, and number and dimension of its elliptic contacts, which are last."""
 
     entries: Float[Array, "rows nv *batch"]
     cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
@@ -167,15 +162,14 @@ class ContactRows(RowMap):
     """Rows of contacts of one dimension.
 
     A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
-    on a joint velocity at the rate (axis · wrench).
+    on a joint velocity at the rate (axis · wrench). All contacts have as many sides, those that do not move without joint
+    velocities.
 
     Attributes:
         lever: from that centre of each side to the point of contact (m).
         frame: normal and tangents.
         axes: motion of unit joint velocities.
         friction: μ of each tangent of a pyramid, n ± μ t its edges; None for frictionless and elliptic contacts.
-        sides: of each contact; as many for all, those that do not move without joint velocities.
-        dim: directions of each contact.
     """
 
     lever: Float[Array, "contacts sides 3 *batch"]

@@ -14,8 +14,6 @@ References:
     MuJoCo documentation, "Computation", "General framework".
 """
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
@@ -24,7 +22,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import spatial, tree
-from mjxgrad.dynamics.orientation import Orientation, orientation
+from mjxgrad.dynamics.orientation import orientation
 from mjxgrad.dynamics.spatial import combine, contract, pick
 
 _Position = Float[Array, " nq"]
@@ -54,7 +52,12 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     steps = jnp.concatenate([from_parent, to_anchor, moved])
     positions = combine(np.concatenate([of_bodies, of_anchors]), steps)
     xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
-    place = functools.partial(_place, turned, frames, xpos)
+
+    def place(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
+        """Return world position and orientation of what is fixed to bodies."""
+        last = frames.of_body[body]
+        return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
+
     xmat = turned.compose(frames.of_body, jnp.broadcast_to(jnp.eye(3, dtype=xpos.dtype), (model.nbody, 3, 3)))
     xquat = turned.quaternions(frames.of_body)
     xipos, ximat = place(np.arange(model.nbody), model.body_ipos, model.body_iquat)
@@ -98,19 +101,6 @@ def _joint_motion(
     if not kept:
         return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))  # pyright: ignore[reportReturnType]
     return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
-
-
-def _place(
-    turned: Orientation,
-    frames: tree.Frames,
-    xpos: Float[Array, "nbody 3"],
-    body: np.ndarray,
-    pos: Float[Array, "n 3"],
-    quat: Float[Array, "n 4"],
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
-    """Return world position and orientation of what is fixed to bodies."""
-    last = frames.of_body[body]
-    return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -206,13 +196,7 @@ class Bodies(eqx.Module):
 
     M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
     ancestors, a product with each body's inertia, sums over descendants, as in `rne`. Its derivative is of the same kind,
-    where that of the matrix is a matrix.
-
-    Attributes:
-        inertia: of each body about the centre of mass of its tree, as MuJoCo keeps it.
-        axes: motion of unit joint velocities about it.
-        armature: inertia of the joints' drives (kg or kg m²).
-        moves: for each body the joint velocities that move it.
+    where that of the matrix is a matrix. `moves` has the joint velocities that move each body.
     """
 
     inertia: Float[Array, "nbody 10 *batch"]
@@ -231,13 +215,7 @@ class Bodies(eqx.Module):
 
 
 class Inertia(eqx.Module):
-    """M.
-
-    Attributes:
-        matrix: its entries.
-        bodies: what it is made of, if nothing else adds to it: then derivatives go through them and not through the
-            entries.
-    """
+    """M: its entries, and the bodies it is made of, if nothing else adds to it. Derivatives go through these."""
 
     matrix: Float[Array, "nv nv *batch"]
     bodies: Bodies | None = None

@@ -124,14 +124,7 @@ class System(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """Everything that determines the acceleration of one state.
-
-    Attributes:
-        mass: M, joint-space inertia.
-        force: f_smooth = M a_s, all forces but those of constraints (N or N m).
-        jacobian: J, from joint velocities to constraint rows.
-        rows: parameters of the rows' laws.
-    """
+    """A system whose M and J are entries. Arrays may carry the batch as trailing axes."""
 
     mass: Float[Array, "nv nv *batch"]
     force: _Vector
@@ -171,22 +164,9 @@ class Problem(eqx.Module):
         """The diagonal of M, positive."""
         return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
-    def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
-        """Return the second derivative of the cost, M + Jᵀ s'' J."""
-        return self.jacobian.gram(self.mass, layout, constraint.bend(layout, self.rows, x))
-
 
 class Point(eqx.Module):
-    """A problem evaluated at one acceleration.
-
-    Attributes:
-        acceleration: a.
-        x: J a - a_ref.
-        row_force: f(x), the constraint forces.
-        inertia: M a.
-        pull: Jᵀ f, the constraint forces in joint space.
-        gradient: M a - f_smooth - Jᵀ f.
-    """
+    """A problem evaluated at one acceleration a: x = J a - a_ref, f(x), M a, Jᵀ f, and M a - f_smooth - Jᵀ f."""
 
     acceleration: _Vector
     x: Float[Array, "rows *batch"]
@@ -218,16 +198,10 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     """Return the acceleration of least cost and the number of iterations that it took.
 
     It goes on until every member of the batch is done; those that are do not move any more. Once an eighth of them are left,
-    they are taken out and finished among themselves.
+    they are taken out and finished among themselves. A start that is not finite is replaced by zero.
 
-    Args:
-        layout: the laws of the rows.
-        max_iterations: upper bound.
-        system: gives the cost.
-        start: where to begin, usually the last acceleration. A non-finite start is replaced by zero.
-        tolerance: on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
-            single body the root mean square error of its acceleration (m/s²). The search also ends where the step is
-            rounding.
+    The tolerance is on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
+    single body the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding.
 
     Returns:
         The acceleration, NaN where the problem is not finite, and the number of iterations: one more than
@@ -269,7 +243,6 @@ class _Solver(eqx.Module):
     max_iterations: int = eqx.field(static=True)
 
     def measure(self, acceleration: _Vector, is_near: _Truth, num_iterations: Int[Array, "*batch"]) -> _Iterate:
-        """Evaluate the problem at an acceleration."""
         return _Iterate(self.problem.at(self.layout, acceleration), is_near, num_iterations)
 
     def is_solved(self, state: _Iterate) -> _Truth:
@@ -297,7 +270,11 @@ class _Solver(eqx.Module):
         """Take one step of Newton's method, those that are done excepted."""
         layout, problem = self.layout, self.problem
         point, stays = state.point, self.is_done(state)
-        direction = _descent(problem.hessian(layout, point.x), point.gradient)
+        hessian = problem.jacobian.gram(problem.mass, layout, constraint.bend(layout, problem.rows, point.x))
+        newton = -cholesky.cholesky_solve(hessian, point.gradient)
+        # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
+        scaled = -point.gradient / linear.diagonal(hessian)
+        direction = jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, scaled)
         decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
         noise = jnp.sqrt(jnp.maximum(decrement, 0.0) * floor)
         length = _line_search(layout, problem, point, direction, noise, stays)
@@ -314,20 +291,10 @@ class _Solver(eqx.Module):
         return jnp.where(is_sound, state.point.acceleration, jnp.nan), num_iterations
 
 
-def _descent(hessian: Float[Array, "nv nv *batch"], gradient: _Vector) -> _Vector:
-    """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
-    newton = -cholesky.cholesky_solve(hessian, gradient)
-    return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / linear.diagonal(hessian))
-
-
 class _Search(eqx.Module):
-    """Where the minimiser along a line is known to be.
+    """Where the minimiser along a line is known to be: between `low`, up to which the cost has only fallen, and `high`.
 
-    Attributes:
-        low: up to here the cost has only fallen.
-        high: the minimiser is not beyond.
-        length: where to look next; once the slope is flat, where it is.
-        is_flat: whether the slope was, at the last look.
+    `length` is where to look next; once the slope is flat, as it was at the last look, it is the minimiser.
     """
 
     low: _Scalar

@@ -133,14 +133,9 @@ class Onset(eqx.Module):
 
 
 class Shares(eqx.Module):
-    """For which part of the step each row acts; see the module.
+    """For which part of the step each row acts: p₋ and p₊, 1 for rows that never begin or end, Φ, and whether these differ.
 
-    Attributes:
-        before: p₋ of each row; 1 for rows that never begin or end.
-        after: p₊ of each row, likewise.
-        weight: Φ, the weight of the solve with p₊.
-        is_split: whether the two solves differ.
-        parts: of J, block by block, in the solve with p₋, where some push from another side; None where none ever does.
+    `parts` of J, block by block, are those of the solve with p₋ where some push from another side; None where none ever does.
     """
 
     before: _PerRow
@@ -192,7 +187,12 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
     if shares is None:
         return None
     rows = joined(blocks)
-    weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
+
+    def weigh(share: _PerRow) -> _PerRow:
+        least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
+        return jnp.where(share > 0, weight_of(rows, least * rows.impedance.present), 0.0)
+
+    weight = jax.vmap(weigh)(jnp.stack([shares.after, shares.before]))
     if shares.parts is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
     turned = dataclasses.replace(rows, map=rows.map.with_parts(shares.parts))  # pyright: ignore[reportAttributeAccessIssue]
@@ -343,9 +343,3 @@ def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMa
         return jnp.where(is_other[:: len(is_other) // len(a)].reshape(-1, *(1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(choose, other, own)
-
-
-def _weights(block: Block, share: _PerRow) -> _PerRow:
-    """Return D of rows that act with a part of their impedance; zero for those without."""
-    least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
-    return jnp.where(share > 0, weight_of(block, least * block.impedance.present), 0.0)

@@ -12,7 +12,6 @@ C the constant product of the fixed rotations and φ the sum of the angles, whic
 products. To know that, axes and fixed rotations must be known when the program is traced.
 """
 
-import abc
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -35,24 +34,8 @@ _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _PARALLEL = 16
 
 
-class Orientation(eqx.Module):
-    """Where frames point, one after each turn. An index of -1 is the world."""
-
-    @abc.abstractmethod
-    def quaternions(self, index: np.ndarray) -> Float[Array, "n 4"]:
-        """Return the orientations of chosen frames as quaternions."""
-
-    @abc.abstractmethod
-    def compose(self, index: np.ndarray, matrices: _Matrices) -> _Matrices:
-        """Return the orientation of what is turned by matrices in chosen frames."""
-
-    @abc.abstractmethod
-    def rotate(self, index: np.ndarray, vectors: _Vectors) -> _Vectors:
-        """Return vectors of chosen frames in the world."""
-
-
-class Products(Orientation):
-    """Products of the turns from the root.
+class Products(eqx.Module):
+    """Products of the turns from the root: where frames point, one after each turn. An index of -1 is the world.
 
     Both quaternions and matrices are carried through the products, so that XLA can remove the quaternions where nobody
     reads them.
@@ -61,17 +44,20 @@ class Products(Orientation):
     quat: Float[Array, "turns 4"]
     mat: Float[Array, "turns 3 3"]
 
-    def quaternions(self, index):
+    def quaternions(self, index: np.ndarray) -> Float[Array, "n 4"]:
+        """Return the orientations of chosen frames as quaternions."""
         return pick(index, self.quat, _IDENTITY)
 
-    def compose(self, index, matrices):
+    def compose(self, index: np.ndarray, matrices: _Matrices) -> _Matrices:
+        """Return the orientation of what is turned by matrices in chosen frames."""
         return spatial.compose(pick(index, self.mat, np.eye(3)), matrices)
 
-    def rotate(self, index, vectors):
+    def rotate(self, index: np.ndarray, vectors: _Vectors) -> _Vectors:
+        """Return vectors of chosen frames in the world."""
         return spatial.rotate(pick(index, self.mat, np.eye(3)), vectors)
 
 
-class Angles(Orientation):
+class Angles(eqx.Module):
     """Sums of angles about the axes of chains: φ after each turn (rad), and the constants of the formula."""
 
     angle: Float[Array, " turns"]
@@ -128,7 +114,9 @@ class Chains:
     turned_quaternion: np.ndarray
 
 
-def orientation(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]) -> Orientation:
+def orientation(
+    model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
+) -> Products | Angles:
     """Return the orientations after all turns of a state, from the quaternion of each joint."""
     found = chains(model, frames)
     if found is None:

@@ -22,11 +22,7 @@ _MOST_GROUPS = 24
 class SparseRows(eqx.Module):
     """The entries of a Jacobian, group by group, without those that are always zero.
 
-    Attributes:
-        pieces: entries of each group, by item, direction and joint velocity.
-        tilts: μ of each tangent of a pyramid; None for other groups.
-        groups: which joint velocities, and what the directions mean.
-        num_dofs: nv.
+    `pieces` are by item, direction and joint velocity, `tilts` μ of each tangent of a pyramid.
     """
 
     pieces: tuple[Float[Array, "_ _ _ *batch"], ...]

@@ -55,12 +55,7 @@ class GoalCost(Cost):
 
 
 class Quadratic(eqx.Module):
-    """A convex quadratic model in changes of state and control; the terminal one has no control.
-
-    Attributes:
-        gradient: of all coordinates, those of the state first.
-        hessian: likewise, positive semidefinite.
-    """
+    """A convex quadratic model in changes of state and then control; the terminal one has no control."""
 
     gradient: Float[Array, " both"]
     hessian: Float[Array, "both both"]

@@ -89,14 +89,9 @@ class Plan(eqx.Module):
 
 
 class Feedback(eqx.Module):
-    """The law du = step k + K dx around a trajectory.
+    """The law du = step k + K dx around a trajectory; rows of K of controls that a limit holds are zero.
 
-    Attributes:
-        change: k, of the controls.
-        gain: K; rows of controls that a limit holds are zero.
-        slope: derivative of the cost by the step at 0, which is below 0.
-        curvature: its second derivative.
-        is_sound: whether every step's program was solved.
+    `slope` and `curvature` are the derivatives of the cost by the step at 0; it is sound if every step's program was solved.
     """
 
     change: _Controls
@@ -211,7 +206,9 @@ def optimise_trajectory(
     horizon = len(controls)
     problem = _Problem(system, cost, smoother, jax.random.split(key, horizon), lower, upper)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
-    rest = _no_law(system, horizon, start.dtype)
+    zero, m = jnp.zeros((), start.dtype), system.num_controls
+    no_gain = jnp.zeros((horizon, m, system.num_changes), start.dtype)
+    rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, zero, jnp.asarray(True))
     at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
     given = _Course(at_start, jnp.clip(controls, lower, upper), jnp.asarray(jnp.inf, start.dtype))
 
@@ -273,12 +270,6 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
 
     moved, _ = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models.A, models.B))
     return (gain > _TOLERANCE * jnp.abs(cost)) & (moved <= _ROUNDINGS * jnp.finfo(moved.dtype).eps * jnp.max(moved))
-
-
-def _no_law(system: System, horizon: int, dtype: jnp.dtype) -> Feedback:
-    m, zero = system.num_controls, jnp.zeros((), dtype)
-    gain = jnp.zeros((horizon, m, system.num_changes), dtype)
-    return Feedback(jnp.zeros((horizon, m), dtype), gain, zero, zero, jnp.asarray(True))
 
 
 def _check(
@@ -348,13 +339,7 @@ def backward_pass(
 
 
 class BoxMinimum(eqx.Module):
-    """The minimiser of a quadratic function in a box.
-
-    Attributes:
-        value: where.
-        is_free: which coordinates are not held by a bound.
-        is_sound: whether it is finite and stationary: the gradient of the free coordinates vanishes, up to rounding.
-    """
+    """The minimiser in a box, which coordinates no bound holds, and whether the gradient of these vanishes, up to rounding."""
 
     value: ControlVector
     is_free: Bool[Array, " m"]

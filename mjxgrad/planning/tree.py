@@ -28,10 +28,8 @@ class Reach(eqx.Module):
     coordinate that does not count has infinite resolution, so that its inverse, the weight, is zero; and by Woodbury's identity
     only an m by m inverse is needed, one per set of weights.
 
-    Attributes:
-        c: the mean next state.
-        B: of positions, times the reach of each control.
-        inverse: (I + Bᵀ W B)⁻¹ for each set W of weights.
+    Here c is the mean next state, B that of positions times the reach of each control, and `inverse` (I + Bᵀ W B)⁻¹ for each
+    set W of weights.
     """
 
     c: StateVector
@@ -219,7 +217,8 @@ def search(
     weight = 1 / sampling.resolution**2
     weights = jnp.stack([jnp.where(matters, weight, 0.0), weight])
     grower = _Grower(system, smoother, sampling, start, goal, jnp.asarray(tolerance), weights, low, high)
-    root = _planted(grower.root(), capacity)
+    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x), grower.root())
+    root = eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
 
     def may_go_on(carry: tuple) -> Bool[Array, ""]:
         nodes, _, turn, _ = carry
@@ -350,16 +349,6 @@ class _Grower(eqx.Module):
         at = jax.tree.map(lambda x: x[nearest], (nodes.states, nodes.reaches))
         _, (new, is_valid) = jax.lax.scan(advance, (*at, jnp.asarray(True)), jnp.arange(most))
         return new, is_valid
-
-
-def _planted(root: Nodes, capacity: int) -> Nodes:
-    """Return a tree of one node with room for others."""
-
-    def spread(x: Array) -> Array:
-        return jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x)
-
-    rows = jax.tree.map(spread, root)
-    return eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
 
 
 def _check(

@@ -246,7 +246,7 @@ def test_smoothing_that_reaches_the_floor_under_a_resting_body_is_warned_about(h
     start = jnp.concatenate([system.scene.data.qpos, system.scene.data.qvel])
     found = Analytic(Smoothing(0.01)).warnings(system, start)
     assert len(found) == expected
-    assert all("smoothing also reaches floor × ball, which touch at the start" in sentence for sentence in found)
+    assert all("smoothing also reaches floor – ball, which touch at the start" in sentence for sentence in found)
     assert not Exact().warnings(system, start)
     # Under a trace nothing is known of the start.
     jax.eval_shape(lambda x: Analytic(Smoothing(0.01)).warnings(system, x), start)
