@@ -29,9 +29,10 @@ _Frames = Float[Array, "pairs 3 3"]
 _Points = Float[Array, "pairs 3"]
 _Pairs = Int[np.ndarray, "pairs 2"]
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
-_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER")
+_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
 )
+CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
@@ -81,6 +82,20 @@ def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
         by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
     slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
     return np.concatenate(slots) if slots else np.zeros((0, 2), int)
+
+
+def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
+    """Return of which pairs the distance is known only where they overlap."""
+    is_plane, is_sphere, is_box, is_convex = (
+        are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
+    )
+    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1))
+
+
+def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
+    """Return which geoms are of some kinds; known while tracing where the geoms are."""
+    table = np.isin(np.asarray(model.geom_type), kinds)
+    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
 
 
 def other_sides(

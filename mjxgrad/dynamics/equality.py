@@ -109,7 +109,9 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
         second = jnp.where(is_site[:, None], of_sites[:, 1], second)
     back = spatial.conjugate(second)
     error = spatial.multiply(back, first)[:, 1:] * scale
-    turning = _turning(model, data, bodies)  # constraints, nv, 3
+    moves = tree.moving_dofs(model)
+    sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
+    turning = sign[:, :, None] * data.cdof[:, :3]  # constraints, nv, 3
     axis = jnp.concatenate([jnp.zeros_like(turning[..., :1]), turning], axis=-1)
     rate = spatial.multiply(spatial.multiply(back[:, None], axis), first[:, None])[..., 1:]
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
@@ -117,13 +119,6 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     jacobian = jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1)
     residual = jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1)
     return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1))
-
-
-def _turning(model: mjx.Model, data: mjx.Data, bodies: np.ndarray) -> Float[Array, "constraints nv 3"]:
-    """Return each joint velocity's part in the first body's angular velocity less the second's."""
-    moves = tree.moving_dofs(model)
-    sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
-    return sign[:, :, None] * data.cdof[:, :3]
 
 
 def _polynomial(

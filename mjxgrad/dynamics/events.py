@@ -175,7 +175,12 @@ def _change(
         owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
         count += num_rows // each if each else 0
     plan = _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
-    touching = _in_contact(joined(blocks), _per_row(plan, begins | ends))
+    rows, which = joined(blocks), _per_row(plan, begins | ends)
+    # All events at zero distance, in contact.
+    present = jnp.where(which, rows.impedance.onset, rows.impedance.present)
+    impedance = Impedance(present, rows.impedance.full, rows.impedance.onset)
+    residual = jnp.where(which, 0.0, rows.residual)
+    touching = dataclasses.replace(rows, residual=residual, impedance=impedance, is_active=rows.is_active | which)
     damping = model.opt.timestep * stiffness_damping(model, touching.solref, touching.impedance.full)[1]
     events = _Events(
         system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),
@@ -209,14 +214,6 @@ def _per_row(plan: _Plan, values: Array) -> Array:
     """Return per row what is given per contact, zero where rows never begin or end."""
     owner = np.asarray(plan.owner)
     return jnp.where(owner >= 0, values[np.maximum(owner, 0)], jnp.zeros((), values.dtype))
-
-
-def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
-    """Return rows with some of them at zero distance, in contact."""
-    impedance = jnp.where(which, block.impedance.onset, block.impedance.present)
-    impedance = Impedance(impedance, block.impedance.full, block.impedance.onset)
-    residual = jnp.where(which, 0.0, block.residual)
-    return dataclasses.replace(block, residual=residual, impedance=impedance, is_active=block.is_active | which)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -65,7 +65,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -73,16 +72,13 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import Impedance, stiffness_damping
-from mjxgrad.dynamics.collision import other_sides, slot_geoms
+from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
 from mjxgrad.dynamics.jacobian import RowMap
 from mjxgrad.dynamics.newton import Variant
 from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
 _PerRow = Float[Array, " rows"]
 _PerContact = Float[Array, " contacts"]
-_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
-)
 # Impedance of a partial contact is no smaller than this part of its own: a weight of zero has no logarithm's derivative.
 _LEAST_SHARE = 1e-9
 # What a pyramid's slip adds to the width. Derivatives of a box pushed along the floor at 4 ms are 10⁷ with 1, 1 to 4 with 2 or 3.
@@ -236,7 +232,7 @@ def _share(
         return _ramp(distance, width, 0.5), None
     slots = slot_geoms(model)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
-    share = _ramp(distance, width, jnp.where(_is_blind(model, geoms), 0.0, 0.5))
+    share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
     return share, _side(model, data, block, contacts, geoms, rate, least)
 
 
@@ -259,20 +255,6 @@ def _ramp(distance: _PerContact, width: _PerContact, centre: Float[Array, "..."]
     return jnp.where(has_width, share, (distance < 0).astype(distance.dtype))
 
 
-def _is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
-    """Return of which pairs the distance is known only where they overlap."""
-    is_plane, is_sphere, is_box, is_convex = (
-        _are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), (_BOX, _MESH, _HEIGHT_FIELD))
-    )
-    return jnp.asarray(is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1)))
-
-
-def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
-    """Return which geoms are of some kinds; known while tracing where the geoms are."""
-    table = np.isin(np.asarray(model.geom_type), kinds)
-    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
-
-
 def _side(
     model: mjx.Model,
     data: mjx.Data,
@@ -283,7 +265,7 @@ def _side(
     least: _PerContact,
 ) -> _Side | None:
     """Return for how long each contact pushes from its present side, and how it does from another; None if none can."""
-    can_turn = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
+    can_turn = ~are(model, geoms, WITHOUT_CENTRE).any(axis=1)
     if isinstance(can_turn, np.ndarray) and not can_turn.any():
         return None
     contact = jax.tree.map(lambda x: x[contacts], data._impl.contact)

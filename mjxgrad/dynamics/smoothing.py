@@ -46,6 +46,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.dynamics.collision import CONVEX, are, is_blind
 from mjxgrad.dynamics.constraint import Noise, RowLayout
 from mjxgrad.dynamics.kernels import KERNELS, Kernel
 from mjxgrad.dynamics.rows import Block, per_row
@@ -58,8 +59,6 @@ _SOFTEST = 1e-3
 # Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
 # derivative.
 _WEIGHTLESS = 1e30
-_BALL_ON_BOX = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)}
-_CONVEX = {int(kind) for kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)}
 
 
 def _as_length(value: Any) -> Any:
@@ -144,7 +143,8 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
     pairs = contact_pairs(model)
     if not pairs:
         messages.append(f"smoothing of {smoothing.kernel} contact has no effect: no two geoms of the scene can touch")
-    blind = [str(pair) for pair in pairs if _is_blind(model, pair.geom1, pair.geom2)]
+    geoms = np.array([(pair.geom1, pair.geom2) for pair in pairs], int).reshape(-1, 2)
+    blind = [str(pairs[i]) for i in np.flatnonzero(is_blind(model, geoms))]
     if blind:
         shown = ", ".join(blind[:4]) + (f" and {len(blind) - 4} more" if len(blind) > 4 else "")
         messages.append(
@@ -161,11 +161,6 @@ def has_limits(model: mjx.Model) -> bool:
     if int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
         return False
     return bool(np.any(model.jnt_limited) or np.any(model.tendon_limited))
-
-
-def _is_blind(model: mjx.Model, geom1: int, geom2: int) -> bool:
-    kinds = {int(model.geom_type[geom1]), int(model.geom_type[geom2])}
-    return bool(kinds & _CONVEX) and int(mujoco.mjtGeom.mjGEOM_PLANE) not in kinds and kinds != _BALL_ON_BOX
 
 
 def smoothed(
@@ -218,8 +213,7 @@ def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothi
 
 def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
     contact = data._impl.contact
-    is_convex = np.isin(model.geom_type, list(_CONVEX))
-    if not is_convex.any() or not len(contact.dist):
+    if not np.isin(model.geom_type, CONVEX).any() or not len(contact.dist):
         return jnp.ones(len(contact.dist), bool)
     # Of a ball on a box it is known, and of no interest beyond a metre.
-    return ~(jnp.any(jnp.asarray(is_convex)[contact.geom], axis=1) & (contact.dist >= 1))
+    return ~(are(model, contact.geom, CONVEX).any(axis=1) & (contact.dist >= 1))
