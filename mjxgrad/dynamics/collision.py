@@ -89,7 +89,8 @@ def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
     is_plane, is_sphere, is_box, is_convex = (
         are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
     )
-    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1))
+    is_ball_on_box = is_sphere.any(axis=1) & is_box.any(axis=1)
+    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~is_ball_on_box  # pyright: ignore[reportReturnType]
 
 
 def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:

@@ -197,7 +197,9 @@ def smoothed(
 def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
     """Return a block that is present at any known distance, and its noise."""
     each, kernel = block.rows_each, smoothing.noise
-    length = (smoothing.length if block.is_contact else smoothing.limit_length).astype(block.residual.dtype)
+    length = smoothing.length if block.is_contact else smoothing.limit_length
+    assert length is not None
+    length = length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
     # The mean of -(r + w) where it is positive (m or rad).
     resistance = impedance(block.solimp[::each], length * kernel.depth(distance / length))
@@ -216,4 +218,4 @@ def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
     if not np.isin(model.geom_type, CONVEX).any() or not len(contact.dist):
         return jnp.ones(len(contact.dist), bool)
     # Of a ball on a box it is known, and of no interest beyond a metre.
-    return ~(are(model, contact.geom, CONVEX).any(axis=1) & (contact.dist >= 1))
+    return ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))

@@ -218,8 +218,9 @@ def _smoothed_solve(
     hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), partial)
     soft = _minimum(model, soft, layout, system, hard.qacc)
 
-    forces = [(found.qacc, found.qfrc_constraint, found._impl.efc_force) for found in (hard, soft)]
-    return _solved(data, *_with_derivative_of(*forces), hard._impl.solver_niter)
+    found = [(one.qacc, one.qfrc_constraint, one._impl.efc_force) for one in (hard, soft)]
+    acceleration, total, force = _with_derivative_of(*found)
+    return _solved(data, acceleration, total, force, hard._impl.solver_niter)
 
 
 @jax.custom_jvp

@@ -105,8 +105,8 @@ def frames(model: mjx.Model) -> Frames:
     while (before >= 0).any():
         jumps.append(before)
         before = np.where(before >= 0, before[before], -1)
-    turns = (np.array(x, int) for x in (body, joint, mocap))
-    return Frames(*turns, tuple(jumps), of_body, before_body, before_joint, is_first, after_joint)
+    body, joint, mocap = (np.array(x, int) for x in (body, joint, mocap))
+    return Frames(body, joint, mocap, tuple(jumps), of_body, before_body, before_joint, is_first, after_joint)
 
 
 def joints_of(model: mjx.Model, body: int) -> range:

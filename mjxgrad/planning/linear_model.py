@@ -121,7 +121,7 @@ class Analytic(Smoother):
 class Exact(Analytic):
     """No smoothing: the system as it is."""
 
-    smoothing: None = None
+    smoothing: Smoothing | None = None
 
 
 class Sampled(Smoother):

@@ -104,7 +104,8 @@ class Nodes(eqx.Module):
 
         size = jnp.minimum(self.size + valid.sum(), len(self.parents))
         old = (self.states, self.controls, self.parents, self.errors, self.reaches)
-        return Nodes(*jax.tree.map(put, old, (new.states, new.controls, parents, new.errors, new.reaches)), size)
+        rows = jax.tree.map(put, old, (new.states, new.controls, parents, new.errors, new.reaches))
+        return Nodes(*rows, size)  # pyright: ignore[reportCallIssue]
 
 
 class Search(eqx.Module):
