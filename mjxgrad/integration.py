@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from mjxgrad._rollout import State, data_of
 from mjxgrad.dynamics import forward
-from mjxgrad.dynamics.integrate import integrate_position
+from mjxgrad.dynamics.kinematics import integrate_position
 from mjxgrad.scene import Scene
 
 Rates = tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " na"]]

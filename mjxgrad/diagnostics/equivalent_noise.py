@@ -10,6 +10,7 @@ impedance is no noise: where it rises with depth, the force is for a while steep
 Nor is a force that jumps at the surface, as MuJoCo's does where the bodies accelerate against each other.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,11 +21,11 @@ from jaxtyping import Array, Float
 
 from mjxgrad.contact.law import impedance
 from mjxgrad.contact.parameters import contact_parameters
-from mjxgrad.dynamics import assembly, constraint
-from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics import constraint
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import DenseRows
-from mjxgrad.dynamics.smoothing import Smoothing, noisy_rows
+from mjxgrad.dynamics.rows import Block, law
+from mjxgrad.dynamics.smoothing import Smoothing, noisy
 from mjxgrad.scene import Scene
 
 Profile = Callable[[Float[Array, " n"]], Float[Array, " n"]]
@@ -161,8 +162,9 @@ def contact_profile(
         )
         layout, row_noise = RowLayout(0, 0, len(distance)), None
         if smoothing is not None:
-            block, row_noise, layout = noisy_rows(scene.model, block, smoothing, layout)
-        reference, weight = assembly.law(scene.model, jnp.zeros(1, distance.dtype), block)
+            block, row_noise = noisy(scene.model, block, jnp.ones(len(distance), bool), smoothing)
+            layout = dataclasses.replace(layout, kernel=smoothing.noise)
+        reference, weight = law(scene.model, jnp.zeros(1, distance.dtype), block)
         rows = Rows(reference, weight, zero, (), row_noise)
         return constraint.force(layout, rows, jnp.where(block.is_active, acceleration, 0.0) - reference)
 

@@ -23,13 +23,9 @@ _TOLERANCE, _ITERATIONS = 1e-12, 200
 
 @dataclass(frozen=True)
 class Missed:
-    """An omitted contact or limit that a recorded motion reached.
+    """An omitted contact or limit, by the names of geoms or joint, that a recorded motion reached.
 
-    Attributes:
-        what: the pair of geoms or the joint, by name.
-        time: of the first state in which it acts, after the start of its rollout (s).
-        num_states: in which it acts, over all rollouts.
-        depth: largest, beyond the margin (m or rad).
+    First at a time after the start of its rollout (s), in some of all states, at most so deep beyond the margin (m or rad).
     """
 
     what: str
@@ -226,7 +222,7 @@ def _beyond_limit(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def _rollouts(model: mujoco.MjModel, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, velocities and controls with one leading axis of rollouts."""
+    """Return positions, velocities and controls with one leading axis of rollouts."""
     parts = []
     for name, size in (("qpos", model.nq), ("qvel", model.nv), ("ctrl", model.nu)):
         value = np.asarray(getattr(trajectory, name), dtype=float)

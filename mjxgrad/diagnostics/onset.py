@@ -40,7 +40,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad._rollout import Trajectory
 from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.dynamics.collision import collide
-from mjxgrad.dynamics.contact import contact_jacobian
+from mjxgrad.dynamics.rows import contact_jacobian
 from mjxgrad.scene import Scene
 
 STEPS_NEEDED = 2.0
@@ -103,23 +103,22 @@ class OnsetResolution(eqx.Module):
             raise ValueError("messages needs known values, got traced ones; call it outside of jax.jit")
         sentences = []
         for i, pair in enumerate(self.pairs):
-            count = int(np.sum(self.num_onsets[..., i]))
             if np.all(self.is_resolved[..., i]):
                 continue
-            speed = float(np.max(self.speed[..., i]))
+            count, speed = int(np.sum(self.num_onsets[..., i])), float(np.max(self.speed[..., i]))
             # In a batch of scenes the sentence is of the pair's worst.
             width, step = float(np.min(self.width[..., i])), float(np.max(self.timestep))
             steps, jump = float(np.min(self.worst[..., i])), float(np.max(self.jump[..., i]))
+            reasons = [f"the force begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
+            if steps < STEPS_NEEDED:
+                reasons.append(
+                    f"its rise over {width:.3g} m is crossed in {steps:.2g} steps of {STEPS_NEEDED:g} needed"
+                )
+            shorter = f", or a time step of at most {width / (STEPS_NEEDED * speed):.2g} s" * (jump <= LARGEST_JUMP)
             sentences.append(
                 f"{count} onset{'s' if count > 1 else ''} of {pair}, at up to {speed:.3g} m/s, "
-                f"{'are' if count > 1 else 'is'} not resolved: {_reason(steps, jump, width)}; take onset=mg.Onset(), "
-                f"or an impedance from 0 (at most {LARGEST_JUMP:g}) over a width of at least "
-                f"{STEPS_NEEDED * speed * step:.2g} m"
-                + (
-                    f", or a time step of at most {width / (STEPS_NEEDED * speed):.2g} s"
-                    if jump <= LARGEST_JUMP
-                    else ""
-                )
+                f"{'are' if count > 1 else 'is'} not resolved: {' and '.join(reasons)}; take onset=mg.Onset(), or an impedance "
+                f"from 0 (at most {LARGEST_JUMP:g}) over a width of at least {STEPS_NEEDED * speed * step:.2g} m{shorter}"
             )
         return sentences
 
@@ -169,12 +168,3 @@ def _pair_states(
     # A slot without a contact has a distance of MJX's own choice, beyond every margin.
     distances = jnp.where(is_of, residual, jnp.inf)
     return distances.min(axis=1), -(normals @ qvel)[distances.argmin(axis=1)]
-
-
-def _reason(steps: float, jump: float, width: float) -> str:
-    reasons = []
-    if jump > LARGEST_JUMP:
-        reasons.append(f"the force begins with a jump, at an impedance of {jump:.3g}")
-    if steps < STEPS_NEEDED:
-        reasons.append(f"its rise over {width:.3g} m is crossed in {steps:.2g} steps of {STEPS_NEEDED:g} needed")
-    return " and ".join(reasons)

@@ -12,7 +12,7 @@ $1 / d_w$ times, where a row gets the whole of the acceleration that it asks for
 
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,22 +133,14 @@ class Spring:
         return float(self._bounce.duration) / self.timestep
 
     def depth(self, speed: float) -> float:
-        r"""Give how deep a bounce at a speed goes, $v \sqrt e / \omega_0$, $e$ the restitution (m, or rad).
-
-        Args:
-            speed: of approach, in m/s (rad/s).
-        """
+        r"""Give how deep a bounce at a speed of approach goes, $v \sqrt e / \omega_0$, $e$ the restitution (m, or rad)."""
         if self.stiffness <= 0:
             return np.inf
         restitution = 1.0 if self.damping <= 0 else float(self._bounce.restitution)
         return speed * np.sqrt(restitution / self.stiffness)
 
     def rise_steps(self, speed: float) -> float:
-        """Give the time steps in which the impedance rises at a speed of approach; infinite if it does not rise.
-
-        Args:
-            speed: of approach, in m/s (rad/s).
-        """
+        """Give the time steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
         first, last = self.impedance
         return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
 
@@ -179,11 +171,6 @@ class StabilityReport:
     precision: str = "float64"
 
     @property
-    def largest_load(self) -> float:
-        """Time step over the largest stable one, of the worst spring; unstable from 1 on, 0 without springs."""
-        return max((spring.load for spring in self.springs), default=0.0)
-
-    @property
     def is_stable(self) -> bool:
         """Whether no spring gains energy, even where all contacts of a pair act at once."""
         return all(spring.coupled_load < 1 for spring in self.springs)
@@ -191,16 +178,8 @@ class StabilityReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence per finding, for all springs alike; none if the time step follows everything."""
-        rules: tuple[Callable[[Spring], str | None], ...] = (
-            _hidden,
-            _unstable,
-            _unstable_together,
-            _short,
-            self._passed,
-            self._deep,
-            self._unresolved,
-            self._steep,
-        )
+        rules = (_hidden, _unstable, _unstable_together, _short)
+        rules += (self._passed, self._deep, self._unresolved, self._steep)
         found: dict[tuple[str, str], list[Spring]] = {}
         for spring in self.springs:
             for text in filter(None, (rule(spring) for rule in rules)):
@@ -208,11 +187,7 @@ class StabilityReport:
         return tuple(f"{kind} of {name_pairs(same)}: {text}" for (kind, text), same in found.items())
 
     def summary(self) -> str:
-        """Describe it for a human: a line for all springs alike, then the warnings.
-
-        Returns:
-            Text of several lines, fit for a terminal about 120 characters wide.
-        """
+        """Describe it for a human, in some 120 columns: a line for all springs alike, then the warnings."""
         speeds = "".join(
             f", at {value:g} {unit}"
             for value, unit in ((self.speed, "m/s"), (self.joint_speed, "rad/s at limits"))
@@ -279,14 +254,12 @@ class StabilityReport:
         speed = self._speed_of(spring)
         if speed is None or spring.depth(speed) < spring.size or speed * self.timestep >= spring.size:
             return None
+        # At the same damping ratio the depth goes as one over the root of the stiffness.
+        needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
         return (
             f"at {speed:g} a bounce goes {spring.depth(speed):.3g} deep, more than the {spring.size:.3g} from which bodies "
-            f"are pushed back the way they came; take a stiffness of at least {format_number(self._needed(spring, speed))} 1/s²"
+            f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
         )
-
-    def _needed(self, spring: Spring, speed: float) -> float:
-        # At the same damping ratio the depth goes as one over the root of the stiffness.
-        return spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
 
     def _steep(self, spring: Spring) -> str | None:
         if self.precision == "float64" or spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:

@@ -1,7 +1,7 @@
 """One step that can be differentiated."""
 
-from mjxgrad.dynamics.contact_forces import contact_force
 from mjxgrad.dynamics.onset import Onset
+from mjxgrad.dynamics.rows import contact_force
 from mjxgrad.dynamics.smoothing import Smoothing, smoothing_warnings
 from mjxgrad.dynamics.stepping import Gradient, check_gradient, forward, solve, step
 

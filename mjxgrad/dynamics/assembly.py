@@ -1,33 +1,25 @@
-r"""Constraint rows of a state: Jacobian, reference acceleration and weight.
+r"""All constraint rows of a state: Jacobian, reference acceleration and weight.
 
 The same rows in the same order as `mjx.make_constraint`, so that `mjx.Data` keeps its meaning, formed differently for two
 reasons. Derivatives: MJX's impedance is NaN beyond its width, its stiffness is NaN for a direct solref without damping, and its
 norms have no derivative near zero. Speed: the Jacobian is a map that is applied without being formed (see `jacobian`), and
 the impedance is evaluated once per contact, not once per pyramid edge.
 
-A row has residual r, rate J v, and asks for a_ref = -B J v - K d(r) r, with weight D = d / ((1 - d) Â), Â the inverse inertia
-of the row estimated at the reference pose.
-
 References:
     MuJoCo documentation, "Modeling", "Solver parameters"; "Computation", "Constraint model".
 """
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.contact.law import stiffness_damping
-from mjxgrad.dynamics import contact, equality, limits
-from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics import equality, rows
 from mjxgrad.dynamics.constraint import ConeGroup, Noise, RowLayout, Rows
 from mjxgrad.dynamics.implicit import System
-from mjxgrad.dynamics.inertia import inertia_of
-from mjxgrad.dynamics.jacobian import JoinedRows
+from mjxgrad.dynamics.kinematics import inertia_of
+from mjxgrad.dynamics.rows import Block
 
 _CONDIMS = (1, 3, 4, 6)
 
@@ -46,27 +38,32 @@ def row_layout(model: mjx.Model, data: mjx.Data) -> RowLayout:
 
 def gather(model: mjx.Model, data: mjx.Data) -> list[Block]:
     """Return the rows of a state, kind by kind in MuJoCo's order, also those that are inactive."""
-    return [block for block in _blocks(model, data) if block is not None]
+    disabled, bits = model.opt.disableflags, mujoco.mjtDisableBit
+    if disabled & bits.mjDSBL_CONSTRAINT:
+        return []
+    blocks: list[Block | None] = []
+    if not disabled & bits.mjDSBL_EQUALITY and model.neq:
+        blocks += equality.blocks(model, data)
+    if not disabled & bits.mjDSBL_FRICTIONLOSS:
+        blocks.append(rows.friction_loss(model, data))
+    if not disabled & bits.mjDSBL_LIMIT:
+        blocks += rows.limits(model, data)
+    blocks += [rows.contacts(model, data, dim) for dim in _CONDIMS]
+    return [block for block in blocks if block is not None]
 
 
 def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None = None) -> mjx.Data:
-    """Fill the `efc_` fields; a drop-in for `mjx.make_constraint`.
-
-    Args:
-        model: with the solver's options.
-        data: with contacts, positions and velocities.
-        blocks: its rows, if they are at hand; otherwise they are gathered.
-    """
+    """Fill the `efc_` fields from rows, gathered if they are not at hand; a drop-in for `mjx.make_constraint`."""
     blocks = gather(model, data) if blocks is None else blocks
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
         fields = dict.fromkeys(("D", "aref", "frictionloss", "pos", "margin"), empty)
         fields["J"] = jnp.zeros((0, model.nv), data.qpos.dtype)  # pyright: ignore[reportArgumentType]
     else:
-        block = joined(blocks)
-        reference, weight = law(model, data.qvel, block)
+        block = rows.joined(blocks)
+        reference, weight = rows.law(model, data.qvel, block)
         fields = {
-            "J": jnp.where(block.is_active[:, None], block.jacobian, 0.0),
+            "J": jnp.where(block.is_active[:, None], block.map.matrix(), 0.0),
             "D": weight,
             "aref": reference,
             "frictionloss": block.friction_loss,
@@ -74,28 +71,6 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
             "margin": block.margin,
         }
     return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})  # pyright: ignore[reportReturnType]
-
-
-def joined(blocks: list[Block]) -> Block:
-    """Return all rows as one block; which of them begin and end together it no longer says."""
-    leaves = {
-        field.name: jax.tree.map(lambda *x: jnp.concatenate(x), *(getattr(block, field.name) for block in blocks))
-        for field in dataclasses.fields(Block)
-        if field.name != "map" and not field.metadata.get("static")
-    }
-    return Block(JoinedRows(tuple(block.map for block in blocks)), **leaves)  # pyright: ignore[reportArgumentType]
-
-
-def law(
-    model: mjx.Model, qvel: Float[Array, " nv"], block: Block
-) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
-    """Return a_ref and weight D of rows; those of inactive rows are zero and of no effect."""
-    residual = jnp.where(block.is_active, block.residual, 0.0)
-    rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
-    stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
-    impedance = block.impedance.present
-    weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
-    return -damping * rate - stiffness * impedance * residual, weight
 
 
 def system_of(
@@ -106,43 +81,21 @@ def system_of(
     noise: Noise | None = None,
     velocity: Float[Array, " nv"] | None = None,
 ) -> System:
-    """Return all that determines the acceleration of a state.
+    """Return all that determines the acceleration of a state with all smooth forces, rows, and noise on them.
 
-    Args:
-        model: with the solver's options.
-        data: with all smooth forces.
-        layout: the laws of the rows.
-        block: all rows.
-        noise: of rows that have it.
-        velocity: at which the rows ask for their acceleration, if not that of the state.
+    The rows ask for their acceleration at a velocity, by default that of the state.
     """
-    reference, weight = law(model, data.qvel if velocity is None else velocity, block)
-    rows = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)
-    return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, rows)  # pyright: ignore[reportArgumentType]
+    reference, weight = rows.law(model, data.qvel if velocity is None else velocity, block)
+    laws = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)
+    return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, laws)  # pyright: ignore[reportArgumentType]
 
 
 def cone_scales(model: mjx.Model, data: mjx.Data, layout: RowLayout) -> tuple[Float[Array, "contacts dim"], ...]:
     """Return (μ, f₁, ...) of each elliptic contact, by group."""
     touching, scales = data._impl.contact, []
     for group in layout.cones:
-        friction = contact.least_friction(touching.friction)[np.asarray(touching.dim) == group.dim]
+        friction = rows.least_friction(touching.friction)[np.asarray(touching.dim) == group.dim]
         friction = friction[:, : group.dim - 1]
         mu = friction[:, :1] / jnp.sqrt(model.opt.impratio)
         scales.append(jnp.concatenate([mu, friction], axis=1))
     return tuple(scales)
-
-
-def _blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
-    disabled = model.opt.disableflags
-    bits = mujoco.mjtDisableBit
-    if disabled & bits.mjDSBL_CONSTRAINT:
-        return []
-    blocks: list[Block | None] = []
-    if not disabled & bits.mjDSBL_EQUALITY and model.neq:
-        blocks += equality.blocks(model, data)
-    if not disabled & bits.mjDSBL_FRICTIONLOSS:
-        blocks.append(limits.friction_loss(model, data))
-    if not disabled & bits.mjDSBL_LIMIT:
-        blocks += [limits.ball_limits(model, data), limits.joint_limits(model, data), limits.tendon_limits(model, data)]
-    blocks += [contact.contacts(model, data, dim) for dim in _CONDIMS]
-    return blocks

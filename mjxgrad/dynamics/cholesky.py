@@ -18,13 +18,15 @@ from jaxtyping import Array, Float
 
 from mjxgrad.dynamics.linear import batch_last
 
+_Vector = Float[Array, "n *batch"]
+_Matrix = Float[Array, "n n *batch"]
 # Larger factorisations are left to LAPACK or cuSOLVER: written out they would take longer to compile than they save.
 _LARGEST = 16
 # Threads of one block of the kernel: a warp.
 _BLOCK = 32
 
 
-def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
+def cholesky_solve(matrix: _Matrix, vector: _Vector) -> _Vector:
     """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite."""
     if matrix.ndim == 2:
         return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), vector)
@@ -40,7 +42,7 @@ def cholesky_solve(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *
 
 @functools.cache
 def _has_kernels() -> bool:
-    """Whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
+    """Return whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
     if jax.default_backend() != "gpu":
         return False
     try:
@@ -57,12 +59,8 @@ def solve_positive_definite(
 ) -> Float[Array, " n"]:
     """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
-    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation.
-
-    Args:
-        matrix: symmetric, positive definite.
-        vector: right-hand side.
-        apply: the matrix as a map, through which to differentiate in place of its entries.
+    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through `apply`, the matrix
+    as a map, in place of its entries.
     """
 
     def solve(_, b):
@@ -71,7 +69,7 @@ def solve_positive_definite(
     return jax.lax.custom_linear_solve(apply or (lambda x: matrix @ x), vector, solve, symmetric=True)
 
 
-def written_out(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
+def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
     """Return matrix⁻¹ vector, column by column."""
     columns: list[Array] = []  # of the factor, from the diagonal down
     for k in range(len(vector)):
@@ -89,13 +87,7 @@ def written_out(matrix: Float[Array, "n n *batch"], vector: Float[Array, "n *bat
 def in_one_kernel(
     matrix: Float[Array, "n n batch"], vector: Float[Array, "n batch"], *, interpret: bool = False
 ) -> Float[Array, "n batch"]:
-    """Return matrix⁻¹ vector, entry by entry in the registers of one thread each.
-
-    Args:
-        matrix: of which the lower half is read.
-        vector: right-hand side.
-        interpret: run on any device, slowly.
-    """
+    """Return matrix⁻¹ vector, entry by entry in the registers of one thread each; `interpret` runs on any device, slowly."""
     # Imported here: no other device needs it, and it takes half a second.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton

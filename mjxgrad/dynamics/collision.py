@@ -24,10 +24,15 @@ from mjxgrad._math import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
 from mjxgrad.dynamics.spatial import contract, dot, pick
 
+_PerPair = Float[Array, " pairs"]
+_Frames = Float[Array, "pairs 3 3"]
+_Points = Float[Array, "pairs 3"]
+_Pairs = Int[np.ndarray, "pairs 2"]
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
-_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER")
+_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
 )
+CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
@@ -49,7 +54,9 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     for key, contact in contact_groups(model, data).items():
         geoms = np.array(members[key])[:, :2]
         if len(geoms) > most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types):
-            contact = _greatest(contact, -_gaps(model, data, geoms), most_pairs)
+            first, second = data.geom_xpos[geoms.T]
+            gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
+            contact = _greatest(contact, -gaps, most_pairs)
             geoms = contact.geom
         find = _FUNCTIONS.get(key.types) or COLLISION_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
         dist, pos, frame = find(model, data, key, geoms)
@@ -77,19 +84,29 @@ def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
     return np.concatenate(slots) if slots else np.zeros((0, 2), int)
 
 
+def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
+    """Return of which pairs the distance is known only where they overlap."""
+    is_plane, is_sphere, is_box, is_convex = (
+        are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
+    )
+    is_ball_on_box = is_sphere.any(axis=1) & is_box.any(axis=1)
+    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~is_ball_on_box  # pyright: ignore[reportReturnType]
+
+
+def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
+    """Return which geoms are of some kinds; known while tracing where the geoms are."""
+    table = np.isin(np.asarray(model.geom_type), kinds)
+    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
+
+
 def other_sides(
     model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
 ) -> tuple[Any, Float[Array, " contacts"]]:
     """Return the contact that would take the place of each as bodies move on, and by how much the present one is nearer (m).
 
     Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
-    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps.
-
-    Args:
-        model: with the geoms.
-        data: with their poses.
-        contact: as `collide` found them.
-        geoms: of each; constants where they are known. Faces of boxes change sides only there.
+    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
+    boxes change sides only where the geoms are constants.
     """
     towards = data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
@@ -102,9 +119,7 @@ def other_sides(
     return contact.replace(pos=pos, frame=frame), nearer
 
 
-def _next_face(
-    model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]
-) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"], Float[Array, " pairs"]]:
+def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points, _Frames, _PerPair]:
     """Return position and frame of a ball's contact with the second nearest face of a box, and how much farther that is."""
     distance, outward, beyond, sign = _from_box(model, data, geoms)
     nearest = _largest(beyond)
@@ -129,13 +144,7 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
     return jax.tree.map(lambda x: x[index], contact)
 
 
-def _gaps(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> Float[Array, " pairs"]:
-    """Return the distances of bounding spheres."""
-    first, second = data.geom_xpos[geoms.T]
-    return jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
-
-
-def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
     plane, box = geoms.T
     normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
@@ -151,7 +160,7 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pair
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
-def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> _Found:
     """Return MJX's contacts with the derivative of the distance that it drops."""
     dist, pos, frame = COLLISION_FUNCTIONS[key.types](model, data, key, geoms)
     on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
@@ -160,14 +169,14 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: Int[np.ndarray
     return jax.lax.stop_gradient(dist - height) + height, pos, frame
 
 
-def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: Int[np.ndarray, "pairs 2"]) -> _Found:
+def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
     distance, outward, *_ = _from_box(model, data, geoms)
     pos, frame = _towards_box(model, data, geoms, distance, outward)
     return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
 
 
-def _from_box(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"]) -> tuple[Array, Array, Array, Array]:
+def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
     """Return how far a ball's centre lies outside a box, in which direction, and its distances and sides along the axes."""
     sphere, box = geoms.T
     away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
@@ -183,12 +192,8 @@ def _from_box(model: mjx.Model, data: mjx.Data, geoms: Int[np.ndarray, "pairs 2"
 
 
 def _towards_box(
-    model: mjx.Model,
-    data: mjx.Data,
-    geoms: Int[np.ndarray, "pairs 2"],
-    distance: Float[Array, " pairs"],
-    outward: Float[Array, "pairs 3"],
-) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs 3 3"]]:
+    model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
+) -> tuple[_Points, _Frames]:
     """Return position and frame of contacts, half-way between both surfaces."""
     sphere, box = geoms.T
     normal = contract("pij,pj->pi", pick(box, data.geom_xmat), -outward)
@@ -196,7 +201,7 @@ def _towards_box(
     return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
 
 
-def _largest(x: Float[Array, "pairs 3"]) -> Array:
+def _largest(x: _Points) -> Array:
     """Return which is the largest of three."""
     return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
 

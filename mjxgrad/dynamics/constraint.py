@@ -36,6 +36,11 @@ from jaxtyping import Array, Bool, Float
 from mjxgrad.dynamics.kernels import Kernel
 from mjxgrad.dynamics.linear import add, sum_of_few
 
+_PerRow = Float[Array, "rows *batch"]
+_PerContact = Float[Array, "contacts *batch"]
+_Directions = Float[Array, "contacts dim *batch"]
+_Columns = Float[Array, "contacts dim columns *batch"]
+
 
 @dataclasses.dataclass(frozen=True)
 class ConeGroup:
@@ -89,8 +94,8 @@ class Noise(eqx.Module):
         gate: x at which contact ends by distance alone and not by acceleration; -inf if it never does (m/s² or rad/s²).
     """
 
-    spread: Float[Array, "rows *batch"]
-    gate: Float[Array, "rows *batch"]
+    spread: _PerRow
+    gate: _PerRow
 
 
 class Rows(eqx.Module):
@@ -104,46 +109,14 @@ class Rows(eqx.Module):
         noise: of the rows, where the layout has a kernel.
     """
 
-    reference: Float[Array, "rows *batch"]
-    weight: Float[Array, "rows *batch"]
-    bound: Float[Array, "rows *batch"]
+    reference: _PerRow
+    weight: _PerRow
+    bound: _PerRow
     scales: tuple[Float[Array, "_ _ *batch"], ...]
     noise: Noise | None = None
 
 
-class _Cone(eqx.Module):
-    """An elliptic group seen in the coordinates u, with its zones."""
-
-    tangent: Float[Array, "contacts tangents *batch"]
-    slip: Float[Array, "contacts *batch"]
-    gap: Float[Array, "contacts *batch"]
-    stiffness: Float[Array, "contacts *batch"]
-    is_middle: Bool[Array, "contacts *batch"]
-    is_bottom: Bool[Array, "contacts *batch"]
-
-
-def _cone(
-    group: ConeGroup, rows: Rows, scale: Float[Array, "contacts dim *batch"], x: Float[Array, "rows *batch"]
-) -> _Cone:
-    u = _blocks(group, x) * scale
-    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
-    slides = square > 0
-    slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
-    mu = scale[:, 0]
-    normal = u[:, 0]
-    is_top = normal >= mu * slip
-    is_bottom = ~is_top & (mu * normal + slip <= 0)
-    weight = rows.weight[group.start : group.stop : group.dim]
-    tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
-    stiffness = weight / (mu**2 * (1 + mu**2))
-    return _Cone(tangent, slip, normal - mu * slip, stiffness, ~is_top & ~is_bottom, is_bottom)
-
-
-def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
-    return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
-
-
-def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
+def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
     """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
     hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
     linear = -rows.weight * x
@@ -158,38 +131,29 @@ def force(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Floa
     if layout.kernel is not None:
         noisy = slice(layout.hard_stop, layout.simple_stop)
         parts.append(rows.weight[noisy] * _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
-    for group, scale in zip(layout.cones, rows.scales, strict=True):
-        if layout.kernel is None:
-            block = _cone_force(group, rows, scale, x, linear)
-        else:
-            block = _noisy_cone(layout.kernel, group, rows, scale, x).force()
-        parts.append(block.reshape(-1, *x.shape[1:]))
+    for k in range(len(layout.cones)):
+        parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
 class Bend(eqx.Module):
-    """The second derivative of the cost with respect to x.
-
-    Attributes:
-        simple: of each row that stands for itself.
-        cones: of each elliptic contact, a matrix, by group.
-    """
+    """The second derivative of the cost by x: of rows that stand for themselves, and a matrix for each elliptic contact."""
 
     simple: Float[Array, "_ *batch"]
     cones: tuple[Float[Array, "_ _ _ *batch"], ...]
 
 
-def bend(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Bend:
+def bend(layout: RowLayout, rows: Rows, x: _PerRow) -> Bend:
     """Return the second derivative of the cost with respect to x."""
     cones = []
     for k, group in enumerate(layout.cones):
         unit = jnp.eye(group.dim, dtype=x.dtype).reshape(1, group.dim, group.dim, *(1,) * (x.ndim - 1))
         unit = jnp.broadcast_to(unit, (group.count, group.dim, group.dim, *x.shape[1:]))
-        cones.append(_cone_product(layout, k, rows, x, unit))
+        cones.append(_cone(layout, k, rows, x).curvature_product(unit))
     return Bend(_simple_curvature(layout, rows, x), tuple(cones))
 
 
-def bend_product(layout: RowLayout, bend: Bend, x: Float[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
+def bend_product(layout: RowLayout, bend: Bend, x: _PerRow) -> _PerRow:
     """Return a second derivative of the cost times a vector."""
     parts = [bend.simple * x[: layout.simple_stop]]
     for group, matrix in zip(layout.cones, bend.cones, strict=True):
@@ -200,20 +164,17 @@ def bend_product(layout: RowLayout, bend: Bend, x: Float[Array, "rows *batch"]) 
 
 
 def curvature_product(
-    layout: RowLayout,
-    rows: Rows,
-    x: Float[Array, "rows *batch"],
-    matrix: Float[Array, "rows columns *batch"],
+    layout: RowLayout, rows: Rows, x: _PerRow, matrix: Float[Array, "rows columns *batch"]
 ) -> Float[Array, "rows columns *batch"]:
     """Return the second derivative of the cost with respect to x, times a matrix."""
     parts = [_simple_curvature(layout, rows, x)[:, None] * matrix[: layout.simple_stop]]
     for k, group in enumerate(layout.cones):
-        both = _cone_product(layout, k, rows, x, _blocks(group, matrix))
+        both = _cone(layout, k, rows, x).curvature_product(_blocks(group, matrix))
         parts.append(both.reshape(-1, *matrix.shape[1:]))
     return jnp.concatenate(parts, axis=0)
 
 
-def _simple_curvature(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batch"]) -> Float[Array, "_ *batch"]:
+def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array, "_ *batch"]:
     hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
     stuck = jnp.abs(rows.weight[friction] * x[friction]) < rows.bound[friction]
     equality = jnp.ones_like(x[: friction.start], bool)
@@ -226,50 +187,103 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: Float[Array, "rows *batc
     return jnp.concatenate([curvature, rows.weight[noisy] * share])
 
 
-def _cone_product(
-    layout: RowLayout, which: int, rows: Rows, x: Float[Array, "rows *batch"], block: Float[Array, "_ _ _ *batch"]
-) -> Float[Array, "_ _ _ *batch"]:
-    """Return the second derivative for one group of elliptic contacts, times a matrix each."""
+class _Cone(eqx.Module):
+    """An elliptic group seen in the coordinates u, with its zones."""
+
+    group: ConeGroup = eqx.field(static=True)
+    weight: _PerRow
+    scale: _Directions
+    tangent: Float[Array, "contacts tangents *batch"]
+    slip: _PerContact
+    gap: _PerContact
+    stiffness: _PerContact
+    is_middle: Bool[Array, "contacts *batch"]
+    is_bottom: Bool[Array, "contacts *batch"]
+
+    def force(self, linear: _PerRow) -> _Directions:
+        press = jnp.where(self.is_middle, -self.stiffness * self.gap, 0.0)
+        slide = -(press * self.scale[:, 0])[:, None] * self.tangent
+        middle = self.scale * jnp.concatenate([press[:, None], slide], axis=1)
+        return jnp.where(self.is_bottom[:, None], _blocks(self.group, linear), middle)
+
+    def curvature_product(self, block: _Columns) -> _Columns:
+        scaled = self.scale[:, :, None] * block
+        mu = self.scale[:, 0]
+        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * self.tangent], axis=1)
+        ratio = jnp.where(self.is_middle, -self.gap / jnp.where(self.slip > 0, self.slip, 1.0), 0.0)
+        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
+        slide = sum_of_few(self.tangent[:, :, None] * scaled[:, 1:])
+        across = scaled[:, 1:] - self.tangent[:, :, None] * slide
+        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
+        middle = (self.stiffness[:, None] * self.scale)[:, :, None] * (first + second)
+        bottom = _blocks(self.group, self.weight)[:, :, None] * block
+        zone = jnp.where(self.is_middle[:, None, None], middle, 0.0)
+        return jnp.where(self.is_bottom[:, None, None], bottom, zone)
+
+
+class _NoisyCone(eqx.Module):
+    """An elliptic group under noise: both terms of its cost in the coordinates u."""
+
+    scale: _Directions
+    stiffness: _PerContact
+    tangential: Float[Array, "contacts tangents *batch"]
+    slip: _PerContact
+    pushes: tuple[_PerContact, _PerContact]
+    shares: tuple[_PerContact, _PerContact]
+    hold: _PerContact
+
+    def force(self, _: _PerRow) -> _Directions:
+        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
+        both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
+        return self.stiffness[:, None] * self.scale * both
+
+    def curvature_product(self, block: _Columns) -> _Columns:
+        scaled = self.scale[:, :, None] * block
+        mu = self.scale[:, :1, None]
+        tangent = (self.tangential / jnp.where(self.slip > 0, self.slip, 1.0)[:, None])[:, :, None]
+        slide = sum_of_few(tangent * scaled[:, 1:])
+        first = self.shares[0][:, None, None] * (scaled[:, :1] - mu * slide)
+        second = self.shares[1][:, None, None] * (mu * scaled[:, :1] + slide)
+        across = self.hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
+        along = tangent * (second - mu * first)
+        both = jnp.concatenate([first + mu * second, along + across], axis=1)
+        return (self.stiffness[:, None] * self.scale)[:, :, None] * both
+
+
+def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _NoisyCone:
+    """Return one group of elliptic contacts at x."""
     group, scale = layout.cones[which], rows.scales[which]
+    u = _blocks(group, x) * scale
+    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
+    slides = square > 0
+    slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
+    mu, normal = scale[:, 0], u[:, 0]
+    stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))
     if layout.kernel is None:
-        return _cone_curvature(group, rows, scale, x, block)
-    return _noisy_cone(layout.kernel, group, rows, scale, x).curvature_product(block)
+        is_top = normal >= mu * slip
+        is_bottom = ~is_top & (mu * normal + slip <= 0)
+        tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
+        gap, is_middle = normal - mu * slip, ~is_top & ~is_bottom
+        return _Cone(group, rows.weight, scale, tangent, slip, gap, stiffness, is_middle, is_bottom)
+    noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
+    first = Noise(mu * noise.spread, mu * noise.gate)
+    second = Noise(mu * first.spread, mu * first.gate)
+    push1, share1 = _mean_push(layout.kernel, normal - mu * slip, first)
+    push2, share2 = _mean_push(layout.kernel, mu * normal + slip, second)
+    # The pull along the tangent, per slip. Where slip is small both pushes nearly cancel; there it is the mean over
+    # the slip of its derivative, by the trapezoidal rule, whose error (of second order) meets that of rounding at the
+    # cube root of eps.
+    still = _mean_push(layout.kernel, normal, first)[1]
+    smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
+    is_small = slip < smallest
+    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
+    resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
+    hold = jnp.where(is_small, resting, moving)
+    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)
 
 
-def _cone_force(
-    group: ConeGroup,
-    rows: Rows,
-    scale: Float[Array, "contacts dim *batch"],
-    x: Float[Array, "rows *batch"],
-    linear: Float[Array, "rows *batch"],
-) -> Float[Array, "contacts dim *batch"]:
-    cone = _cone(group, rows, scale, x)
-    press = jnp.where(cone.is_middle, -cone.stiffness * cone.gap, 0.0)
-    slide = -(press * scale[:, 0])[:, None] * cone.tangent
-    middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
-    return jnp.where(cone.is_bottom[:, None], _blocks(group, linear), middle)
-
-
-def _cone_curvature(
-    group: ConeGroup,
-    rows: Rows,
-    scale: Float[Array, "contacts dim *batch"],
-    x: Float[Array, "rows *batch"],
-    block: Float[Array, "contacts dim columns *batch"],
-) -> Float[Array, "contacts dim columns *batch"]:
-    cone = _cone(group, rows, scale, x)
-    scaled = scale[:, :, None] * block
-    mu = scale[:, 0]
-    along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * cone.tangent], axis=1)
-    ratio = jnp.where(cone.is_middle, -cone.gap / jnp.where(cone.slip > 0, cone.slip, 1.0), 0.0)
-    first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
-    slide = sum_of_few(cone.tangent[:, :, None] * scaled[:, 1:])
-    across = scaled[:, 1:] - cone.tangent[:, :, None] * slide
-    second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
-    middle = (cone.stiffness[:, None] * scale)[:, :, None] * (first + second)
-    bottom = _blocks(group, rows.weight)[:, :, None] * block
-    zone = jnp.where(cone.is_middle[:, None, None], middle, 0.0)
-    return jnp.where(cone.is_bottom[:, None, None], bottom, zone)
+def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
+    return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
 
 
 def _noise_at(rows: Rows, which: slice) -> Noise:
@@ -289,65 +303,3 @@ def _mean_push(
     near = held / noise.spread
     share = kernel.share(near)
     return noise.spread * kernel.ramp(near) + share * (held - x), share
-
-
-class _NoisyCone(eqx.Module):
-    """An elliptic group under noise: both terms of its cost in the coordinates u."""
-
-    scale: Float[Array, "contacts dim *batch"]
-    stiffness: Float[Array, "contacts *batch"]
-    tangential: Float[Array, "contacts tangents *batch"]
-    slip: Float[Array, "contacts *batch"]
-    pushes: tuple[Float[Array, "contacts *batch"], Float[Array, "contacts *batch"]]
-    shares: tuple[Float[Array, "contacts *batch"], Float[Array, "contacts *batch"]]
-    hold: Float[Array, "contacts *batch"]
-
-    def force(self) -> Float[Array, "contacts dim *batch"]:
-        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
-        both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
-        return self.stiffness[:, None] * self.scale * both
-
-    def curvature_product(
-        self, block: Float[Array, "contacts dim columns *batch"]
-    ) -> Float[Array, "contacts dim columns *batch"]:
-        scaled = self.scale[:, :, None] * block
-        mu = self.scale[:, :1, None]
-        tangent = (self.tangential / jnp.where(self.slip > 0, self.slip, 1.0)[:, None])[:, :, None]
-        slide = sum_of_few(tangent * scaled[:, 1:])
-        first = self.shares[0][:, None, None] * (scaled[:, :1] - mu * slide)
-        second = self.shares[1][:, None, None] * (mu * scaled[:, :1] + slide)
-        across = self.hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
-        along = tangent * (second - mu * first)
-        both = jnp.concatenate([first + mu * second, along + across], axis=1)
-        return (self.stiffness[:, None] * self.scale)[:, :, None] * both
-
-
-def _noisy_cone(
-    kernel: Kernel,
-    group: ConeGroup,
-    rows: Rows,
-    scale: Float[Array, "contacts dim *batch"],
-    x: Float[Array, "rows *batch"],
-) -> _NoisyCone:
-    u = _blocks(group, x) * scale
-    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
-    slides = square > 0
-    slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
-    mu, normal = scale[:, 0], u[:, 0]
-    noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
-    first = Noise(mu * noise.spread, mu * noise.gate)
-    second = Noise(mu * first.spread, mu * first.gate)
-    push1, share1 = _mean_push(kernel, normal - mu * slip, first)
-    push2, share2 = _mean_push(kernel, mu * normal + slip, second)
-    # The pull along the tangent, per slip. Where slip is small both pushes nearly cancel; there it is the mean over
-    # the slip of its derivative, by the trapezoidal rule, whose error (of second order) meets that of rounding at the
-    # cube root of eps.
-    still = _mean_push(kernel, normal, first)[1]
-    smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
-    is_small = slip < smallest
-    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
-    resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
-    weight = rows.weight[group.start : group.stop : group.dim]
-    stiffness = weight / (mu**2 * (1 + mu**2))
-    hold = jnp.where(is_small, resting, moving)
-    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)

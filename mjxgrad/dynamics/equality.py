@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 from mjxgrad._math import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import impedance
-from mjxgrad.dynamics import rotation, spatial, tree
-from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.contact import contact_jacobian
+from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.jacobian import DenseRows
+from mjxgrad.dynamics.rows import Block, contact_jacobian, per_row
+
+_Ends = Float[Array, "constraints 2 3"]
 
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
@@ -37,23 +38,19 @@ def _block(
     inverse_weight: Float[Array, "constraints k"],
 ) -> Block:
     """Return the rows of constraints with k rows each, whose impedance follows the norm of their residual."""
-    count, each = residual.shape
-
-    def spread(x: Array) -> Array:
-        return jnp.repeat(x, each, axis=0, total_repeat_length=each * count)
-
+    each = residual.shape[1]
     flat = residual.reshape(-1)
     zero = jnp.zeros_like(flat)
     return Block(
-        map=DenseRows(jacobian.reshape(count * each, -1)),
+        map=DenseRows(jacobian.reshape(flat.size, -1)),
         residual=flat,
-        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], safe_norm(residual))),
-        solimp=spread(model.eq_solimp[ids]),
+        impedance=jax.tree.map(lambda x: per_row(x, each), impedance(model.eq_solimp[ids], safe_norm(residual))),
+        solimp=per_row(model.eq_solimp[ids], each),
         inverse_weight=inverse_weight.reshape(-1),
-        solref=spread(model.eq_solref[ids]),
+        solref=per_row(model.eq_solref[ids], each),
         margin=zero,
         friction_loss=zero,
-        is_active=spread(jnp.asarray(data.eq_active)[ids] != 0),
+        is_active=per_row(jnp.asarray(data.eq_active)[ids] != 0, each),
     )
 
 
@@ -67,9 +64,7 @@ def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return is_site, objects, bodies
 
 
-def _points(
-    model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: Float[Array, "constraints 2 3"]
-) -> Float[Array, "constraints 2 3"]:
+def _points(model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: _Ends) -> _Ends:
     """Return the world positions of both ends: sites, or anchors in the frames of their bodies."""
     is_site, objects, bodies = _ends(model, ids)
     points = data.xpos[bodies] + jnp.sum(data.xmat[bodies] * anchors[:, :, None, :], axis=-1)
@@ -80,32 +75,22 @@ def _points(
 
 
 def _translation(
-    model: mjx.Model,
-    data: mjx.Data,
-    points: Float[Array, "constraints 2 3"],
-    bodies: np.ndarray,
+    model: mjx.Model, data: mjx.Data, points: _Ends, bodies: np.ndarray
 ) -> Float[Array, "constraints 3 nv"]:
     """Return the Jacobian of the first end's position less the second's."""
     frame = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), (len(points), 3, 3))
     world = np.zeros_like(bodies[:, 0])
-    return contact_jacobian(model, data, points[:, 0], frame, np.stack([world, bodies[:, 0]], 1), 3) - contact_jacobian(
-        model, data, points[:, 1], frame, np.stack([world, bodies[:, 1]], 1), 3
+    first, second = (
+        contact_jacobian(model, data, points[:, end], frame, np.stack([world, bodies[:, end]], 1), 3) for end in (0, 1)
     )
+    return first - second
 
 
 def _connect(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    anchors = model.eq_data[ids][:, :6].reshape(-1, 2, 3)
-    points = _points(model, data, ids, anchors)
+    points = _points(model, data, ids, model.eq_data[ids][:, :6].reshape(-1, 2, 3))
     bodies = _ends(model, ids)[2]
-    weight = jnp.sum(model.body_invweight0[bodies, 0], axis=1)
-    return _block(
-        model,
-        data,
-        ids,
-        _translation(model, data, points, bodies),
-        points[:, 0] - points[:, 1],
-        jnp.repeat(weight[:, None], 3, axis=1),
-    )
+    weight = jnp.repeat(jnp.sum(model.body_invweight0[bodies, 0], axis=1)[:, None], 3, axis=1)
+    return _block(model, data, ids, _translation(model, data, points, bodies), points[:, 0] - points[:, 1], weight)
 
 
 def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
@@ -122,28 +107,18 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
         of_sites = spatial.multiply(data.xquat[bodies], quaternions)
         first = jnp.where(is_site[:, None], of_sites[:, 0], first)
         second = jnp.where(is_site[:, None], of_sites[:, 1], second)
-    back = rotation.conjugate(second)
+    back = spatial.conjugate(second)
     error = spatial.multiply(back, first)[:, 1:] * scale
-    turning = _turning(model, data, bodies)  # constraints, nv, 3
+    moves = tree.moving_dofs(model)
+    sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
+    turning = sign[:, :, None] * data.cdof[:, :3]  # constraints, nv, 3
     axis = jnp.concatenate([jnp.zeros_like(turning[..., :1]), turning], axis=-1)
     rate = spatial.multiply(spatial.multiply(back[:, None], axis), first[:, None])[..., 1:]
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
     weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
-    return _block(
-        model,
-        data,
-        ids,
-        jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1),
-        jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1),
-        jnp.repeat(weight, 3, axis=1),
-    )
-
-
-def _turning(model: mjx.Model, data: mjx.Data, bodies: np.ndarray) -> Float[Array, "constraints nv 3"]:
-    """Return each joint velocity's part in the first body's angular velocity less the second's."""
-    moves = tree.moving_dofs(model)
-    sign = jnp.asarray(moves[bodies[:, 0]] - moves[bodies[:, 1]], data.cdof.dtype)
-    return sign[:, :, None] * data.cdof[:, :3]
+    jacobian = jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1)
+    residual = jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1)
+    return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1))
 
 
 def _polynomial(
@@ -161,22 +136,16 @@ def _coupling(
     model: mjx.Model,
     data: mjx.Data,
     ids: np.ndarray,
-    position: tuple[Array, Array],
-    jacobian: tuple[Array, Array],
-    weight: tuple[Array, Array],
+    positions: list[Array],
+    jacobians: list[Array],
+    weights: list[Array],
 ) -> Block:
     """Return rows x₁ - p(x₂) for pairs of scalar coordinates; without a second one x₂ = 0."""
     has_second = jnp.asarray(model.eq_obj2id[ids] >= 0, data.qpos.dtype)
-    value, slope = _polynomial(model.eq_data[ids][:, :5], position[1] * has_second)
-    row = jacobian[0] - (slope * has_second)[:, None] * jacobian[1]
-    return _block(
-        model,
-        data,
-        ids,
-        row[:, None],
-        (position[0] - value)[:, None],
-        (weight[0] + weight[1] * has_second)[:, None],
-    )
+    value, slope = _polynomial(model.eq_data[ids][:, :5], positions[1] * has_second)
+    row = jacobians[0] - (slope * has_second)[:, None] * jacobians[1]
+    weight = (weights[0] + weights[1] * has_second)[:, None]
+    return _block(model, data, ids, row[:, None], (positions[0] - value)[:, None], weight)
 
 
 def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
@@ -184,14 +153,13 @@ def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     addresses = [model.jnt_qposadr[joint] for joint in objects]
     dofs = [model.jnt_dofadr[joint] for joint in objects]
     unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
-    first, second = (data.qpos[a] - model.qpos0[a] for a in addresses)
-    weights = tuple(model.dof_invweight0[dof] for dof in dofs)
-    return _coupling(model, data, ids, (first, second), (unit[dofs[0]], unit[dofs[1]]), weights)  # pyright: ignore[reportArgumentType]
+    positions = [data.qpos[a] - model.qpos0[a] for a in addresses]
+    weights = [model.dof_invweight0[dof] for dof in dofs]
+    return _coupling(model, data, ids, positions, [unit[dof] for dof in dofs], weights)
 
 
 def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    first, second = (data.ten_length[t] - model.tendon_length0[t] for t in objects)
-    jacobians = tuple(data._impl.ten_J[t] for t in objects)
-    weights = tuple(model.tendon_invweight0[t] for t in objects)
-    return _coupling(model, data, ids, (first, second), jacobians, weights)  # pyright: ignore[reportArgumentType]
+    positions = [data.ten_length[t] - model.tendon_length0[t] for t in objects]
+    weights = [model.tendon_invweight0[t] for t in objects]
+    return _coupling(model, data, ids, positions, [data._impl.ten_J[t] for t in objects], weights)

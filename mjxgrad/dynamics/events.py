@@ -65,10 +65,14 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly, constraint, implicit, linear
-from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
-from mjxgrad.dynamics.implicit import System
+from mjxgrad.dynamics.newton import System
+from mjxgrad.dynamics.rows import Block, joined
 
+_PerRow = Float[Array, " rows"]
+_Truths = Bool[Array, " contacts"]
+_PerContact = Float[Array, " contacts"]
+_Vector = Float[Array, " nv"]
 # Nodes and weights of Gauss and Legendre on (0, 1).
 _NODES = 0.5 + 0.5 * np.polynomial.legendre.leggauss(3)[0]
 _SHARES = 0.5 * np.polynomial.legendre.leggauss(3)[1]
@@ -79,8 +83,6 @@ class _Plan:
     """What is static about the events of a step.
 
     Attributes:
-        layout: the laws of the rows.
-        max_iterations: of a solve.
         owner: the contact or limit that each row belongs to, -1 if it never begins or ends.
         is_spread: whether an event lies within the step, so that the contact damps its impulse for the rest of it.
     """
@@ -97,128 +99,105 @@ class _Events(eqx.Module):
     Attributes:
         system: whose balance is the acceleration.
         damping: h B of each row that acts after the events; zero of others.
-        begins: whether a contact or limit begins.
-        ends: whether it ends.
         normal: from joint velocities to the rate of distance.
         speed: of approach or retreat (m/s or rad/s).
         creep: speed below which gravity presses a contact together faster than it approaches (m/s).
-        start: acceleration to start from.
-        timestep: h (s).
-        tolerance: of a solve.
     """
 
     system: System
-    damping: Float[Array, " rows"]
-    begins: Bool[Array, " contacts"]
-    ends: Bool[Array, " contacts"]
+    damping: _PerRow
+    begins: _Truths
+    ends: _Truths
     normal: Float[Array, "contacts nv"]
-    speed: Float[Array, " contacts"]
-    creep: Float[Array, " contacts"]
-    start: Float[Array, " nv"]
+    speed: _PerContact
+    creep: _PerContact
+    start: _Vector
     timestep: Float[Array, ""]
     tolerance: Float[Array, ""]
 
 
 def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
-    """Return data with acceleration and constraint force to which the tangents of a semi-implicit step's events are added.
-
-    Args:
-        model: gives the time step.
-        data: of the present state, solved.
-        blocks: its constraint rows.
-
-    Returns:
-        Data of the same values.
-    """
+    """Return solved data with the tangents of a semi-implicit step's events added to acceleration and constraint force."""
     if not any(block.rows_each for block in blocks):
         return data
     distance, normal = contacts_of(blocks)
-    speed = normal @ data.qvel
-    before = distance - model.opt.timestep * speed
-    begins = (distance < 0) & (before >= 0) & (speed < 0)
-    ends = (distance >= 0) & (before < 0) & (speed > 0)
-    plan = _plan(model, data, blocks, is_spread=False)
-    events = _events(model, data, data.qvel, plan, blocks, normal, begins, ends)
-    change = _impulse(plan, events, distance) / model.opt.timestep
-    pushed = data.qfrc_constraint + events.system.inertia.apply(change)
+    before = distance - model.opt.timestep * (normal @ data.qvel)
+    change, system = _change(model, data, blocks, normal, data.qvel, before, distance, is_spread=False)
+    change = change / model.opt.timestep
+    pushed = data.qfrc_constraint + system.inertia.apply(change)
     return data.replace(qacc=data.qacc + change, qfrc_constraint=pushed)
 
 
-def impulse(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
-    """Return a change of velocity of value zero with the tangents of the events between two states.
+def impulse(model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity: _Vector) -> _Vector:
+    """Return a change of velocity after a step, of value zero, with the tangents of the events within it.
 
-    Args:
-        model: gives the time step.
-        data: of the state before, solved.
-        blocks: its constraint rows.
-        mean_velocity: displacement until the state after, divided by the time step.
-
-    Returns:
-        To be added to the velocity after the step.
+    `data` is solved for the state before; the mean velocity leads from there to the state after.
     """
     if not any(block.rows_each for block in blocks):
         return jnp.zeros_like(data.qvel)
     distance, normal = contacts_of(blocks)
     after = distance + model.opt.timestep * (normal @ mean_velocity)
     velocity = data.qvel + 0.5 * model.opt.timestep * data.qacc
-    speed = normal @ velocity
-    begins = (distance >= 0) & (after < 0) & (speed < 0)
-    ends = (distance < 0) & (after >= 0) & (speed > 0)
-    plan = _plan(model, data, blocks, is_spread=True)
-    return _impulse(plan, _events(model, data, velocity, plan, blocks, normal, begins, ends), distance)
+    return _change(model, data, blocks, normal, velocity, distance, after, is_spread=True)[0]
 
 
-def _plan(model: mjx.Model, data: mjx.Data, blocks: list[Block], *, is_spread: bool) -> _Plan:
-    owner, count = [], 0
-    for block in blocks:
-        num_rows, each = len(block.residual), block.rows_each
-        owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
-        count += num_rows // each if each else 0
-    return _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
-
-
-def contacts_of(blocks: list[Block]) -> tuple[Float[Array, " contacts"], Float[Array, "contacts nv"]]:
+def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contacts nv"]]:
     """Return distance less margin, and normal row, of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
         if not block.rows_each:
             continue
-        jacobian = block.jacobian.reshape(-1, block.rows_each, block.jacobian.shape[1])
+        matrix = block.map.matrix()
+        jacobian = matrix.reshape(-1, block.rows_each, matrix.shape[1])
         distance.append(block.residual[:: block.rows_each])
         normal.append(jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0])
     return jnp.concatenate(distance), jnp.concatenate(normal)
 
 
-def _events(
+def _change(
     model: mjx.Model,
     data: mjx.Data,
-    velocity: Float[Array, " nv"],
-    plan: _Plan,
     blocks: list[Block],
     normal: Float[Array, "contacts nv"],
-    begins: Bool[Array, " contacts"],
-    ends: Bool[Array, " contacts"],
-) -> _Events:
-    is_event = _per_row(plan, begins | ends)
-    touching = _in_contact(assembly.joined(blocks), is_event)
+    velocity: _Vector,
+    before: _PerContact,
+    after: _PerContact,
+    *,
+    is_spread: bool,
+) -> tuple[_Vector, System]:
+    """Return the change by events between two distances, and the state in which all of them are just in contact."""
+    speed = normal @ velocity
+    begins = (before >= 0) & (after < 0) & (speed < 0)
+    ends = (before < 0) & (after >= 0) & (speed > 0)
+    owner, count = [], 0
+    for block in blocks:
+        num_rows, each = len(block.residual), block.rows_each
+        owner += [count + i // each for i in range(num_rows)] if each else [-1] * num_rows
+        count += num_rows // each if each else 0
+    plan = _Plan(assembly.row_layout(model, data), int(model.opt.iterations), tuple(owner), is_spread)
+    rows, which = joined(blocks), _per_row(plan, begins | ends)
+    # All events at zero distance, in contact.
+    present = jnp.where(which, rows.impedance.onset, rows.impedance.present)
+    impedance = Impedance(present, rows.impedance.full, rows.impedance.onset)
+    residual = jnp.where(which, 0.0, rows.residual)
+    touching = dataclasses.replace(rows, residual=residual, impedance=impedance, is_active=rows.is_active | which)
     damping = model.opt.timestep * stiffness_damping(model, touching.solref, touching.impedance.full)[1]
-    return _Events(
+    events = _Events(
         system=assembly.system_of(model, data, plan.layout, touching, velocity=velocity),
         damping=jnp.where(_per_row(plan, ends), 0.0, damping),
         begins=begins,
         ends=ends,
         normal=normal,
-        speed=jnp.abs(normal @ velocity),
+        speed=jnp.abs(speed),
         creep=_creep(model, blocks),
         start=data.qacc,
         timestep=jnp.asarray(model.opt.timestep, velocity.dtype),
         tolerance=jnp.asarray(model.opt.tolerance, velocity.dtype),
     )
+    return _impulse(plan, events, before if is_spread else after), events.system
 
 
-def _creep(model: mjx.Model, blocks: list[Block]) -> Float[Array, " contacts"]:
+def _creep(model: mjx.Model, blocks: list[Block]) -> _PerContact:
     """Return g / 2(B + √K) of each contact, and zero for limits, whose coordinate gravity may not be an acceleration of."""
     gravity, speeds = safe_sqrt(jnp.sum(model.opt.gravity**2)), []
     for block in blocks:
@@ -237,22 +216,8 @@ def _per_row(plan: _Plan, values: Array) -> Array:
     return jnp.where(owner >= 0, values[np.maximum(owner, 0)], jnp.zeros((), values.dtype))
 
 
-def _in_contact(block: Block, which: Bool[Array, " rows"]) -> Block:
-    """Return rows with some of them at zero distance, in contact."""
-    impedance = jnp.where(which, block.impedance.onset, block.impedance.present)
-    return eqx.tree_at(
-        lambda b: (b.residual, b.impedance, b.is_active),
-        block,
-        (
-            jnp.where(which, 0.0, block.residual),
-            Impedance(impedance, block.impedance.full, block.impedance.onset),
-            block.is_active | which,
-        ),
-    )
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _impulse(plan: _Plan, events: _Events, distance: Float[Array, " contacts"]) -> Float[Array, " nv"]:
+def _impulse(plan: _Plan, events: _Events, distance: _PerContact) -> _Vector:
     """Return zero, whose tangent is the change of velocity by what later events leave out."""
     # Not a constant: under nested batches JAX (0.10.2) fails on a rule whose value has no batch and whose tangent has one.
     return 0 * events.start
@@ -265,7 +230,11 @@ def _impulse_jvp(plan, primals, tangents):
     without = _without(system, is_event)
     held, _ = implicit.solve(plan.layout, plan.max_iterations, system, events.start, events.tolerance)
     free, _ = implicit.solve(plan.layout, plan.max_iterations, without, held, events.tolerance)
-    late = jnp.where(events.begins | events.ends, tangents[1] * _delay(events, free), 0.0)
+    # By how much an event comes later per distance (s/m), less where the speed is not resolved.
+    drift = events.timestep * (events.normal @ free)
+    square = events.speed**2 + jnp.maximum(drift**2, events.creep**2)
+    delay = events.speed / jnp.where(square > 0, square, 1.0)
+    late = jnp.where(events.begins | events.ends, tangents[1] * delay, 0.0)
     lost = system.pull(system.row_force(plan.layout, held) * _per_row(plan, late))
     start, stop = (without.rates(a) - without.rows.reference for a in (free, held))
     change = -implicit.respond(plan.layout, without, _secant_bend(plan.layout, without.rows, start, stop), lost)
@@ -274,18 +243,11 @@ def _impulse_jvp(plan, primals, tangents):
     return 0 * events.start, change
 
 
-def _delay(events: _Events, free: Float[Array, " nv"]) -> Float[Array, " contacts"]:
-    """Return by how much an event comes later per distance (s/m), less where the speed is not resolved."""
-    drift = events.timestep * (events.normal @ free)
-    square = events.speed**2 + jnp.maximum(drift**2, events.creep**2)
-    return events.speed / jnp.where(square > 0, square, 1.0)
-
-
 def _without(system: System, which: Bool[Array, " rows"]) -> System:
     return eqx.tree_at(lambda s: s.rows.weight, system, jnp.where(which, 0.0, system.rows.weight))
 
 
-def _secant_bend(layout: RowLayout, rows: Rows, start: Float[Array, " rows"], stop: Float[Array, " rows"]) -> Bend:
+def _secant_bend(layout: RowLayout, rows: Rows, start: _PerRow, stop: _PerRow) -> Bend:
     """Return the curvature averaged between two points, by which the forces at both differ."""
     moved = stop - start
     is_far = jnp.abs(moved) > jnp.sqrt(jnp.finfo(moved.dtype).eps) * (jnp.abs(start) + jnp.abs(stop))
@@ -300,22 +262,16 @@ def _secant_bend(layout: RowLayout, rows: Rows, start: Float[Array, " rows"], st
     return Bend(jnp.where(is_far[simple], secant[simple], curved.simple), tuple(means))
 
 
-def _damped(
-    plan: _Plan, events: _Events, acceleration: Float[Array, " nv"], change: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
+def _damped(plan: _Plan, events: _Events, acceleration: _Vector, change: _Vector) -> _Vector:
     """Return what contacts leave of a change of velocity in half a time step, by the implicit midpoint rule."""
     after = _without(events.system, _per_row(plan, events.ends))
     bend = constraint.bend(plan.layout, after.rows, after.rates(acceleration) - after.rows.reference)
-    resisting = _damped_bend(plan.layout, bend, 0.5 * events.damping)
+    # The curvature times the damping of the rows, symmetric.
+    damping, cones = 0.5 * events.damping, []
+    for group, matrix in zip(plan.layout.cones, bend.cones, strict=True):
+        own = damping[group.start : group.stop].reshape(group.count, group.dim)
+        cones.append(0.5 * matrix * (own[:, :, None] + own[:, None]))
+    resisting = Bend(bend.simple * damping[: plan.layout.simple_stop], tuple(cones))
     whole = jax.tree.map(operator.add, bend, resisting)
     resistance = after.pull(constraint.bend_product(plan.layout, resisting, after.rates(change)))
     return change - implicit.respond(plan.layout, after, whole, resistance)
-
-
-def _damped_bend(layout: RowLayout, bend: Bend, damping: Float[Array, " rows"]) -> Bend:
-    """Return the curvature times the damping of the rows, symmetric."""
-    cones = []
-    for group, matrix in zip(layout.cones, bend.cones, strict=True):
-        own = damping[group.start : group.stop].reshape(group.count, group.dim)
-        cones.append(0.5 * matrix * (own[:, :, None] + own[:, None]))
-    return Bend(bend.simple * damping[: layout.simple_stop], tuple(cones))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import cholesky, kinematics, rotation, spatial, tree
+from mjxgrad.dynamics import cholesky, kinematics, spatial, tree
 from mjxgrad.dynamics.spatial import contract, pick
 
 _Disable = mujoco.mjtDisableBit
@@ -31,15 +31,7 @@ def _drives_axes(model: mjx.Model) -> bool:
 
 
 def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find lengths and moments of actuators; a drop-in for `mjx.transmission`.
-
-    Args:
-        model: `actuator_gear`. Anything but hinges and slides is left to MJX.
-        data: `qpos`; poses of sites and tendons if actuators act on them.
-
-    Returns:
-        Data with `actuator_length` and `actuator_moment`.
-    """
+    """Find lengths and moments of actuators; as `mjx.transmission`, to which all but hinges and slides are left."""
     if not model.nu or not _drives_axes(model):
         return mjx.transmission(model, data)
     gear, joint = model.actuator_gear[:, 0], model.actuator_trnid[:, 0]
@@ -50,15 +42,7 @@ def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Run the velocity-dependent stages; a drop-in for `mjx.fwd_velocity`.
-
-    Args:
-        model: any.
-        data: with all that depends on position.
-
-    Returns:
-        Data with velocities, passive forces and bias forces.
-    """
+    """Find velocities, passive forces and bias forces; a drop-in for `mjx.fwd_velocity`."""
     if model.nu:
         rate = contract("uv,v->u", data._impl.actuator_moment, data.qvel)
         data = data.tree_replace({"_impl.actuator_velocity": rate})  # pyright: ignore[reportAssignmentType]
@@ -72,12 +56,7 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find spring and damper forces; a drop-in for `mjx.passive` whose springs have their derivative at rest.
 
-    Args:
-        model: stiffness and damping of joints. Tendons, gravity compensation and media are left to MJX.
-        data: `qpos`, normalised, and `qvel`.
-
-    Returns:
-        Data with `qfrc_passive` and `qfrc_gravcomp`.
+    Tendons, gravity compensation and media are left to MJX.
     """
     flags = model.opt.disableflags
     compensates = model.flg_gravcomp and not flags & _Disable.mjDSBL_GRAVITY
@@ -100,8 +79,8 @@ def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]
             forces.append(stiffness * (rest - q))
             continue
         q, rest = q.reshape(-1, run.width), rest.reshape(-1, run.width)
-        inverse = rotation.conjugate(rest[:, -4:])
-        stretch = rotation.logarithm(spatial.multiply(inverse, q[:, -4:]))
+        inverse = spatial.conjugate(rest[:, -4:])
+        stretch = spatial.logarithm(spatial.multiply(inverse, q[:, -4:]))
         if run.kind == _Joint.mjJNT_FREE:
             stretch = jnp.concatenate([q[:, :3] - rest[:, :3], stretch], axis=1)
         forces.append(-(stiffness[:, None] * stretch).reshape(-1))
@@ -115,15 +94,14 @@ def _restore_derivative(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     zero there, as if the spring had gone. The torque itself is zero at the reference, so adding the difference of the analytic
     torque and its own frozen value restores the derivative and leaves the force.
     """
-    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    joints = np.nonzero(free | (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL))[0]
-    off = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
-    if not joints.size or model.opt.disableflags & off:
+    free = model.jnt_type == _Joint.mjJNT_FREE
+    joints = np.nonzero(free | (model.jnt_type == _Joint.mjJNT_BALL))[0]
+    if not joints.size or model.opt.disableflags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
         return data
     addresses = (model.jnt_qposadr + 3 * free)[joints][:, None] + np.arange(4)
     dofs = (model.jnt_dofadr + 3 * free)[joints][:, None] + np.arange(3)
-    turn = spatial.multiply(rotation.conjugate(model.qpos_spring[addresses]), data.qpos[addresses])
-    torque = -model.jnt_stiffness[joints][:, None] * rotation.logarithm(turn)
+    turn = spatial.multiply(spatial.conjugate(model.qpos_spring[addresses]), data.qpos[addresses])
+    torque = -model.jnt_stiffness[joints][:, None] * spatial.logarithm(turn)
     is_cut = jnp.all(jnp.abs(turn[:, 1:]) <= _CUT_OFF, axis=1, keepdims=True)
     missing = jnp.where(is_cut, torque - jax.lax.stop_gradient(torque), 0.0)
     return data.replace(qfrc_passive=data.qfrc_passive.at[dofs].add(missing))
@@ -132,12 +110,7 @@ def _restore_derivative(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find actuator forces; a drop-in for `mjx.fwd_actuation`.
 
-    Args:
-        model: motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
-        data: with `ctrl`, and actuator lengths, velocities and moments.
-
-    Returns:
-        Data with `act_dot`, `actuator_force` and `qfrc_actuator`.
+    For motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
     """
     if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION or not _is_plain(model):
         return mjx.fwd_actuation(model, data)
@@ -180,13 +153,7 @@ def _clamp(x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "
 def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Add up all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
 
-    Args:
-        model: any.
-        data: with passive, bias and actuator forces, and the mass matrix; `xfrc_applied` acts at the bodies' centres of
-            mass (N, N m).
-
-    Returns:
-        Data with `qfrc_smooth` and `qacc_smooth`.
+    `xfrc_applied` acts at the bodies' centres of mass (N, N m).
     """
     push, torque = data.xfrc_applied[:, :3], data.xfrc_applied[:, 3:]
     lever = data.xipos - pick(model.body_rootid, data.subtree_com)

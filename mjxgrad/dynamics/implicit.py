@@ -17,10 +17,8 @@ The acceleration is named "acceleration" for `jax.checkpoint`: a rollout that re
 spares itself the iterations.
 """
 
-import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,98 +26,21 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import cholesky, constraint, linear, newton
-from mjxgrad.dynamics.constraint import Bend, RowLayout, Rows
-from mjxgrad.dynamics.inertia import Inertia
-from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
-from mjxgrad.dynamics.newton import Problem
-from mjxgrad.dynamics.sparse import SparseRows
+from mjxgrad.dynamics.constraint import Bend, RowLayout
+from mjxgrad.dynamics.newton import System, Variant
 
+_Truth = Bool[Array, ""]
+_Scalar = Float[Array, ""]
+_Vector = Float[Array, " nv"]
 CHECKPOINT_NAME = "acceleration"
-
-
-class Variant(eqx.Module):
-    """In what a second solve of the same state may differ. For two solves arrays have a leading axis of two.
-
-    Attributes:
-        weight: of the rows.
-        reference: a_ref of the rows; None for that of the system.
-        parts: of J, where contacts may push from another side; None where they never do.
-    """
-
-    weight: Float[Array, "*two rows"]
-    reference: Float[Array, "*two rows"] | None = None
-    parts: tuple[RowMap | None, ...] | None = None
-
-    def __getitem__(self, number: int) -> "Variant":
-        """Return that of one solve."""
-        return jax.tree.map(lambda x: x[number], self)
-
-
-class System(eqx.Module):
-    """What determines the acceleration of one state, as its derivative wants it.
-
-    Attributes:
-        inertia: M.
-        force: f_smooth, all forces but those of constraints (N or N m).
-        map: J, also of rows that are inactive.
-        is_active: which rows are not.
-        rows: parameters of the rows' laws.
-    """
-
-    inertia: Inertia
-    force: Float[Array, "nv *batch"]
-    map: JoinedRows
-    is_active: Bool[Array, "rows *batch"]
-    rows: Rows
-
-    def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
-        """Return J v, zero for inactive rows."""
-        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
-
-    def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
-        """Return Jᵀ f."""
-        return self.map.pull(jnp.where(self.is_active, force, 0.0))
-
-    def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
-        """Return the constraint forces at an acceleration."""
-        return constraint.force(layout, self.rows, self.rates(acceleration) - self.rows.reference)
-
-    def gradient(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """Return M a - f_smooth - Jᵀ f, zero at the solution."""
-        pull = self.pull(self.row_force(layout, acceleration))
-        return self.inertia.apply(acceleration) - self.force - pull
-
-    def varied(self, variant: Variant) -> "System":
-        """Return the same with what is different in one solve."""
-        reference = self.rows.reference if variant.reference is None else variant.reference
-        rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
-        return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
-
-    def problem(self) -> Problem:
-        """Return the same with entries; arrays may carry the batch as trailing axes here."""
-        jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def solve(
-    layout: RowLayout,
-    max_iterations: int,
-    system: System,
-    start: Float[Array, " nv"],
-    tolerance: Float[Array, ""],
-) -> tuple[Float[Array, " nv"], Int[Array, ""]]:
-    """Return the acceleration at which the forces of a system are in balance, differentiable with respect to it.
-
-    Returns:
-        The acceleration, and the number of iterations that it took: one more than `max_iterations` where these, or
-        the digits of this precision, were too few.
-    """
-
-    def run(system, start, tolerance):
-        return newton.minimise(layout, system.problem(), start, tolerance, max_iterations)
-
-    return linear.batch_last(run)(system, start, tolerance)
+    layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar
+) -> tuple[_Vector, Int[Array, ""]]:
+    """Return what `newton.minimise` does, differentiable with respect to the system."""
+    return linear.batch_last(functools.partial(newton.minimise, layout, max_iterations))(system, start, tolerance)
 
 
 @solve.defjvp
@@ -140,30 +61,26 @@ def solve_both(
     max_iterations: int,
     system: System,
     variants: Variant,
-    differ: Bool[Array, ""],
-    start: Float[Array, " nv"],
-    tolerance: Float[Array, ""],
+    differ: _Truth,
+    start: _Vector,
+    tolerance: _Scalar,
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
     """Solve in two variants, on CPUs the second time only where they differ.
 
-    Where they do not, the second solution is the first one, and its derivative must not count, for it is zero.
-
-    Returns:
-        Both accelerations, and the larger number of iterations, as `solve` has it.
+    Where they do not, the second solution is the first one, and its derivative must not count, for it is zero. The number of
+    iterations is the larger one.
     """
+    minimise = functools.partial(newton.minimise, layout, max_iterations)
 
-    def first(system, variant, start, tolerance):
-        return newton.minimise(layout, system.varied(variant).problem(), start, tolerance, max_iterations)
-
-    def second(system, variant, differ, start, tolerance):
+    def second(system, differ, start, tolerance):
         none = jnp.zeros(differ.shape, jnp.int32)
-        return linear.on_few(first, differ, (start, none), system, variant, start, tolerance)
+        return linear.on_few(minimise, differ, (start, none), system, start, tolerance)
 
     if not _takes_few():
-        both, counts = jax.vmap(lambda variant: linear.batch_last(first)(system, variant, start, tolerance))(variants)
+        both, counts = jax.vmap(lambda v: linear.batch_last(minimise)(system.varied(v), start, tolerance))(variants)
         return both, jnp.max(counts)
-    found, count = linear.batch_last(first)(system, variants[0], start, tolerance)
-    other, more = linear.batch_last(second)(system, variants[1], differ, found, tolerance)
+    found, count = linear.batch_last(minimise)(system.varied(variants[0]), start, tolerance)
+    other, more = linear.batch_last(second)(system.varied(variants[1]), differ, found, tolerance)
     return jnp.stack([found, other]), jnp.maximum(count, more)
 
 
@@ -196,19 +113,13 @@ def _takes_few() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def respond(
-    layout: RowLayout,
-    system: System,
-    bend: Bend,
-    force: Float[Array, " nv"],
-    is_needed: Bool[Array, ""] | None = None,
-) -> Float[Array, " nv"]:
+def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_needed: _Truth | None = None) -> _Vector:
     """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force.
 
     Where it is not needed it is zero.
     """
 
-    def apply(x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def apply(x: _Vector) -> _Vector:
         return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
 
     def run(system, bend, force):

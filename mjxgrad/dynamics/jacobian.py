@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 from mjxgrad.dynamics import linear, spatial
 from mjxgrad.dynamics.spatial import combine, contract
 
+_PerRow = Float[Array, " rows"]
+_Vector = Float[Array, " nv"]
 # By how much the entries of a Hessian may grow where contacts are kept together.
 _WASTE = 2.0
 
@@ -60,20 +62,20 @@ class RowMap(eqx.Module):
         """The rows in order, by the joint velocities that they see."""
 
     @abc.abstractmethod
-    def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
+    def rates(self, velocity: _Vector) -> _PerRow:
         """Return J v."""
 
     @abc.abstractmethod
-    def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
+    def pull(self, force: _PerRow) -> _Vector:
         """Return Jᵀ f."""
 
     @abc.abstractmethod
     def directions(self) -> Sequence[Float[Array, "num dim dofs *batch"]]:
         """Return the entries, one array per group; pyramids by their directions."""
 
-    @abc.abstractmethod
     def tilts(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
         """Return μ of each tangent of a pyramid, one array per group; None where there is none."""
+        return [None] * len(self.groups)
 
     @abc.abstractmethod
     def matrix(self) -> Float[Array, "rows nv"]:
@@ -81,12 +83,7 @@ class RowMap(eqx.Module):
 
 
 class DenseRows(RowMap):
-    """Rows that are few, or that may move every joint.
-
-    Attributes:
-        entries: J.
-        cones: number and dimension of elliptic contacts among them, in order of rows; rows before stand for themselves.
-    """
+    """Rows that are few, or that may move every joint: J, and number and dimension of its elliptic contacts, which are last."""
 
     entries: Float[Array, "rows nv *batch"]
     cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
@@ -121,21 +118,12 @@ class DenseRows(RowMap):
             start += group.num_rows
         return pieces
 
-    def tilts(self):
-        return [None] * len(self.groups)
-
     def matrix(self):
         return self.entries
 
 
 class AxisRows(RowMap):
-    """Rows of one joint velocity each.
-
-    Attributes:
-        sign: the entries.
-        dofs: which joint velocity.
-        num_dofs: nv.
-    """
+    """Rows of one joint velocity each, `dofs` of all `num_dofs`, with entries `sign`."""
 
     sign: Float[Array, "rows *batch"]
     dofs: tuple[int, ...] = eqx.field(static=True)
@@ -154,9 +142,6 @@ class AxisRows(RowMap):
     def directions(self):
         return [self.sign[:, None, None]]
 
-    def tilts(self):
-        return [None]
-
     def matrix(self):
         selection = _selection(self.dofs, self.num_dofs)
         return self.sign[:, None] * selection.reshape(*selection.shape, *(1,) * (self.sign.ndim - 1))
@@ -164,11 +149,9 @@ class AxisRows(RowMap):
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """One of the two bodies of a contact.
+    """One of the two bodies of a contact: its sign, 1 for the second body, and the joint velocities that move it alone.
 
-    Attributes:
-        sign: 1 for the second body, -1 for the first.
-        dofs: joint velocities that move it and not the other one too; what moves both does nothing to a contact.
+    What moves both bodies does nothing to a contact.
     """
 
     sign: float
@@ -179,15 +162,14 @@ class ContactRows(RowMap):
     """Rows of contacts of one dimension.
 
     A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
-    on a joint velocity at the rate (axis · wrench).
+    on a joint velocity at the rate (axis · wrench). All contacts have as many sides, those that do not move without joint
+    velocities.
 
     Attributes:
         lever: from that centre of each side to the point of contact (m).
         frame: normal and tangents.
         axes: motion of unit joint velocities.
         friction: μ of each tangent of a pyramid, n ± μ t its edges; None for frictionless and elliptic contacts.
-        sides: of each contact; as many for all, those that do not move without joint velocities.
-        dim: directions of each contact.
     """
 
     lever: Float[Array, "contacts sides 3 *batch"]
@@ -199,9 +181,8 @@ class ContactRows(RowMap):
 
     @property
     def groups(self) -> tuple[Group, ...]:
-        return tuple(
-            Group(dofs, stop - start, self.dim, self.friction is not None) for start, stop, dofs in self._runs()
-        )
+        has_edges = self.friction is not None
+        return tuple(Group(dofs, stop - start, self.dim, has_edges) for start, stop, dofs in self._runs())
 
     def _runs(self) -> list[tuple[int, int, tuple[int, ...]]]:
         """Return neighbouring contacts that are kept together: first, one after the last, dofs.
@@ -367,10 +348,10 @@ def _spread(
     if len(dofs) == num_dofs:
         return entries
     columns, at = [], 0
-    for run in linear.runs(dofs):
-        columns.append(jnp.zeros((*entries.shape[:2], run.target.start - at, *entries.shape[3:]), entries.dtype))
-        columns.append(entries[:, :, run.source])
-        at = run.target.stop
+    for target, source in linear.runs(dofs):
+        columns.append(jnp.zeros((*entries.shape[:2], target.start - at, *entries.shape[3:]), entries.dtype))
+        columns.append(entries[:, :, source])
+        at = target.stop
     columns.append(jnp.zeros((*entries.shape[:2], num_dofs - at, *entries.shape[3:]), entries.dtype))
     return jnp.concatenate(columns, axis=2)
 

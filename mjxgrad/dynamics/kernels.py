@@ -27,10 +27,10 @@ References:
     analytic one).
 """
 
-import abc
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import special
 
+_Shape = Float[Array, "*shape"]
 # The mean of |w| that all kernels share.
 _MEAN_SIZE = math.sqrt(2 / math.pi)
 _LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
@@ -49,86 +50,29 @@ _TAIL_DEGREE = {4: 10, 8: 24}
 
 
 @dataclasses.dataclass(frozen=True)
-class Kernel(abc.ABC):
-    """A density of noise with the averages of a contact under it. Distances are in units of the length.
+class Kernel:
+    r"""A density of noise with the averages of a contact under it. Distances are in units of the length.
 
     Static and hashable: which kernel it is shapes the compiled program.
 
     Attributes:
         reach: distance beyond which `share` is below 1e-8, and `depth` is held.
         stddev: standard deviation.
+        ramp: from distances r to the mean push, $\mathbb{E} \max(-r - w, 0)$.
+        share: from distances to the probability of contact, that r + w is negative.
+        density: of the noise, the derivative of `share` but for its sign.
     """
 
     reach: float
     stddev: float
+    ramp: Callable[[_Shape], _Shape]
+    share: Callable[[_Shape], _Shape]
+    density: Callable[[_Shape], _Shape]
 
-    @abc.abstractmethod
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        r"""Return the mean push, $\mathbb{E} \max(-r - w, 0)$."""
-
-    @abc.abstractmethod
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return the probability of contact, that r + w is negative."""
-
-    @abc.abstractmethod
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return the density of the noise, the derivative of `share` but for its sign."""
-
-    def depth(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def depth(self, distance: _Shape) -> _Shape:
         """Return the mean penetration, given that there is contact; held beyond `reach`, where there is next to none."""
         near = jnp.minimum(distance, self.reach)
         return self.ramp(near) / self.share(near)
-
-
-class Gaussian(Kernel):
-    """Normal noise."""
-
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return φ(r) - r Φ(-r)."""
-        return _normal_ramp(distance)
-
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return Φ(-r)."""
-        return _normal_share(distance)
-
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return φ(w)."""
-        return jnp.exp(-0.5 * noise**2) * (1 / math.sqrt(2 * math.pi))
-
-
-class Logistic(Kernel):
-    """Noise with the logistic distribution."""
-
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return b softplus(-r/b)."""
-        return _LOGISTIC_SCALE * jax.nn.softplus(-distance / _LOGISTIC_SCALE)
-
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return 1 / (1 + exp(r/b))."""
-        return jax.nn.sigmoid(-distance / _LOGISTIC_SCALE)
-
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return share (1 - share) / b."""
-        return self.share(noise) * self.share(-noise) / _LOGISTIC_SCALE
-
-
-class LogBarrier(Kernel):
-    """Noise with Student's t distribution of two degrees of freedom, which is what a log barrier averages over."""
-
-    def ramp(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return (-r + √(r² + 4/κ)) / 2, written so that nothing cancels."""
-        root = jnp.sqrt(distance**2 + _BARRIER_SQUARE)
-        is_far = distance > 0
-        return jnp.where(is_far, 0.5 * _BARRIER_SQUARE / (root + jnp.abs(distance)), 0.5 * (root - distance))
-
-    def share(self, distance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return S(r) / √(r² + 4/κ)."""
-        return self.ramp(distance) / jnp.sqrt(distance**2 + _BARRIER_SQUARE)
-
-    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return 2√κ / (4 + κ w²)^(3/2)."""
-        root = jnp.sqrt(noise**2 + _BARRIER_SQUARE)
-        return 0.5 * _BARRIER_SQUARE / root / root / root
 
 
 @functools.cache
@@ -143,7 +87,7 @@ def _tail_coefficients(degree: int) -> tuple[float, ...]:
 
 
 @jax.custom_jvp
-def _normal_share(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _normal_share(r: _Shape) -> _Shape:
     """Return Φ(-r), to rounding relative to itself on both sides.
 
     Not by `jax.lax.erfc`: that ends in polynomials, which XLA takes for so cheap that it evaluates them again for every
@@ -159,13 +103,13 @@ def _normal_share(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 @_normal_share.defjvp
 def _normal_share_jvp(primals, tangents):
-    return _normal_share(*primals), -KERNELS["gaussian"].density(*primals) * tangents[0]
+    return _normal_share(*primals), -_normal_density(*primals) * tangents[0]
 
 
 @jax.custom_jvp
-def _normal_ramp(r: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _normal_ramp(r: _Shape) -> _Shape:
     """Return φ(r) - r Φ(-r), which holds its digits to a few units of rounding times r²."""
-    return KERNELS["gaussian"].density(r) - r * _normal_share(r)
+    return _normal_density(r) - r * _normal_share(r)
 
 
 @_normal_ramp.defjvp
@@ -173,8 +117,42 @@ def _normal_ramp_jvp(primals, tangents):
     return _normal_ramp(*primals), -_normal_share(*primals) * tangents[0]
 
 
+def _normal_density(w: _Shape) -> _Shape:
+    return jnp.exp(-0.5 * w**2) * (1 / math.sqrt(2 * math.pi))
+
+
+def _logistic_ramp(r: _Shape) -> _Shape:
+    return _LOGISTIC_SCALE * jax.nn.softplus(-r / _LOGISTIC_SCALE)
+
+
+def _logistic_share(r: _Shape) -> _Shape:
+    return jax.nn.sigmoid(-r / _LOGISTIC_SCALE)
+
+
+def _logistic_density(w: _Shape) -> _Shape:
+    return _logistic_share(w) * _logistic_share(-w) / _LOGISTIC_SCALE
+
+
+def _barrier_ramp(r: _Shape) -> _Shape:
+    # Written so that nothing cancels.
+    root = jnp.sqrt(r**2 + _BARRIER_SQUARE)
+    return jnp.where(r > 0, 0.5 * _BARRIER_SQUARE / (root + jnp.abs(r)), 0.5 * (root - r))
+
+
+def _barrier_share(r: _Shape) -> _Shape:
+    return _barrier_ramp(r) / jnp.sqrt(r**2 + _BARRIER_SQUARE)
+
+
+def _barrier_density(w: _Shape) -> _Shape:
+    root = jnp.sqrt(w**2 + _BARRIER_SQUARE)
+    return 0.5 * _BARRIER_SQUARE / root / root / root
+
+
 KERNELS: dict[str, Kernel] = {
-    "gaussian": Gaussian(reach=6.0, stddev=1.0),
-    "logistic": Logistic(reach=11.0, stddev=math.pi * _LOGISTIC_SCALE / math.sqrt(3)),
-    "log_barrier": LogBarrier(reach=1e4, stddev=math.inf),
+    "gaussian": Kernel(6.0, 1.0, _normal_ramp, _normal_share, _normal_density),
+    "logistic": Kernel(
+        11.0, math.pi * _LOGISTIC_SCALE / math.sqrt(3), _logistic_ramp, _logistic_share, _logistic_density
+    ),
+    # What a log barrier averages over: Student's t distribution of two degrees of freedom.
+    "log_barrier": Kernel(1e4, math.inf, _barrier_ramp, _barrier_share, _barrier_density),
 }

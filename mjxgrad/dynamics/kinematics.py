@@ -14,8 +14,7 @@ References:
     MuJoCo documentation, "Computation", "General framework".
 """
 
-import functools
-
+import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -23,24 +22,18 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import spatial, tree
-from mjxgrad.dynamics.orientation import Orientation, orientation
+from mjxgrad.dynamics.orientation import orientation
 from mjxgrad.dynamics.spatial import combine, contract, pick
 
+_Position = Float[Array, " nq"]
+_Vector = Float[Array, " nv"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Place bodies, joints, geoms and sites; a drop-in for `mjx.kinematics`.
-
-    Args:
-        model: joints of any type and number.
-        data: `qpos` and the poses of mocap bodies. Quaternions need not be normalised.
-
-    Returns:
-        Data with positions (m) and orientations in the world, and normalised quaternions in `qpos`.
-    """
+    """Place bodies, joints, geoms and sites, and normalise the quaternions of `qpos`; a drop-in for `mjx.kinematics`."""
     frames = tree.frames(model)
     qpos, turn, way, origin = _joint_motion(model, data.qpos)
     turned = orientation(model, data, frames, turn)
@@ -59,7 +52,12 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     steps = jnp.concatenate([from_parent, to_anchor, moved])
     positions = combine(np.concatenate([of_bodies, of_anchors]), steps)
     xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
-    place = functools.partial(_place, turned, frames, xpos)
+
+    def place(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
+        """Return world position and orientation of what is fixed to bodies."""
+        last = frames.of_body[body]
+        return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
+
     xmat = turned.compose(frames.of_body, jnp.broadcast_to(jnp.eye(3, dtype=xpos.dtype), (model.nbody, 3, 3)))
     xquat = turned.quaternions(frames.of_body)
     xipos, ximat = place(np.arange(model.nbody), model.body_ipos, model.body_iquat)
@@ -75,8 +73,8 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _joint_motion(
-    model: mjx.Model, qpos: Float[Array, " nq"]
-) -> tuple[Float[Array, " nq"], Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
+    model: mjx.Model, qpos: _Position
+) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
     """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
     dtype = qpos.dtype
     kept, turns, ways, origins = [], [], [], []
@@ -105,29 +103,8 @@ def _joint_motion(
     return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
 
 
-def _place(
-    turned: Orientation,
-    frames: tree.Frames,
-    xpos: Float[Array, "nbody 3"],
-    body: np.ndarray,
-    pos: Float[Array, "n 3"],
-    quat: Float[Array, "n 4"],
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
-    """Return world position and orientation of what is fixed to bodies."""
-    last = frames.of_body[body]
-    return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
-
-
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find centres of mass, inertias about them, and joint axes as motions; a drop-in for `mjx.com_pos`.
-
-    Args:
-        model: masses (kg) and principal inertias (kg m²). Bodies may have no mass.
-        data: with poses, as `kinematics` leaves them.
-
-    Returns:
-        Data with `subtree_com` (m), `cinert` and `cdof`.
-    """
+    """Find `subtree_com`, `cinert` and `cdof` of posed bodies, with mass or without; a drop-in for `mjx.com_pos`."""
     mass = model.body_mass
     moments = jnp.concatenate([spatial.scale(mass, data.xipos), mass[:, None]], axis=1)
     sums = combine(tree.descendants(model), moments)
@@ -168,15 +145,7 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
 
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find velocities of bodies and rates of joint axes; a drop-in for `mjx.com_vel`.
-
-    Args:
-        model: gives the tree.
-        data: `qvel`, and `cdof` as `com_pos` leaves it.
-
-    Returns:
-        Data with `cvel` and `cdof_dot`.
-    """
+    """Find velocities of bodies `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
     motion = spatial.scale(data.qvel, data.cdof)
     sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
     velocity, before = sums[: model.nbody], sums[model.nbody :]
@@ -186,14 +155,8 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find the mass matrix from composite inertias; a drop-in for `mjx.crb`.
 
-    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself.
-
-    Args:
-        model: `dof_armature` is added to the diagonal (kg or kg m²).
-        data: with `cinert` and `cdof`, as `com_pos` leaves them.
-
-    Returns:
-        Data with `crb` and `M`, in whichever of MJX's two formats the data has.
+    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself. `M` is in
+    whichever of MJX's two formats the data has.
     """
     if data._impl.M.ndim == 1:
         return mjx.crb(model, data)
@@ -211,15 +174,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find gravity, Coriolis and centrifugal forces; a drop-in for `mjx.rne`.
-
-    Args:
-        model: `opt.gravity` (m/s²).
-        data: with `cinert`, `cdof`, `cvel` and `cdof_dot`.
-
-    Returns:
-        Data with `qfrc_bias` (N or N m), the joint forces that keep the acceleration at zero.
-    """
+    """Find gravity, Coriolis and centrifugal forces, `qfrc_bias`, which keep the acceleration at zero; as `mjx.rne`."""
     acceleration = combine(tree.moving_dofs(model), spatial.scale(data.qvel, data.cdof_dot))
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
@@ -230,7 +185,98 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(qfrc_bias=generalised_force(model, data, force))
 
 
-def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> Float[Array, " nv"]:
+def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> _Vector:
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
     return spatial.dot(data.cdof, carried)
+
+
+class Bodies(eqx.Module):
+    """Bodies in motion, by which the mass matrix is applied without being formed.
+
+    M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
+    ancestors, a product with each body's inertia, sums over descendants, as in `rne`. Its derivative is of the same kind,
+    where that of the matrix is a matrix. `moves` has the joint velocities that move each body.
+    """
+
+    inertia: Float[Array, "nbody 10 *batch"]
+    axes: Float[Array, "nv 6 *batch"]
+    armature: Float[Array, "nv *batch"]
+    moves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def apply(self, acceleration: _Vector) -> _Vector:
+        """Return M a."""
+        moves = np.zeros((len(self.moves), len(self.axes)))
+        for row, dofs in zip(moves, self.moves, strict=True):
+            row[list(dofs)] = 1
+        motion = combine(moves, spatial.scale(acceleration, self.axes))
+        force = spatial.momentum(self.inertia, motion)
+        return spatial.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
+
+
+class Inertia(eqx.Module):
+    """M: its entries, and the bodies it is made of, if nothing else adds to it. Derivatives go through these."""
+
+    matrix: Float[Array, "nv nv *batch"]
+    bodies: Bodies | None = None
+
+    def apply(self, acceleration: _Vector) -> _Vector:
+        """Return M a."""
+        if self.bodies is None:
+            return contract("ij,j->i", self.matrix, acceleration)
+        return self.bodies.apply(acceleration)
+
+
+def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
+    """Return M of data with its mass matrix filled in."""
+    matrix = mjx.full_m(model, data)
+    if model.ntendon or data._impl.M.ndim == 1:
+        # Tendons have armature of their own; the sparse format is MJX's.
+        return Inertia(matrix)
+    moves = tuple(tuple(int(dof) for dof in np.nonzero(row)[0]) for row in tree.moving_dofs(model))
+    armature = jnp.asarray(model.dof_armature, matrix.dtype)
+    return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
+
+
+def integrate_position(
+    model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
+) -> _Position:
+    """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
+    turning, first, dofs = _addresses(model)
+    if not turning.size:
+        return qpos + duration * qvel
+    moved = qpos.at[first].add(duration * qvel[dofs])
+    quaternions = qpos[turning[:, :1] + np.arange(4)]
+    turned = spatial.multiply(quaternions, spatial.exponential(duration * qvel[turning[:, 1:] + np.arange(3)]))
+    turned = turned / jnp.sqrt(jnp.sum(turned * turned, axis=-1, keepdims=True))
+    return moved.at[turning[:, :1] + np.arange(4)].set(turned)
+
+
+def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
+    """Return the velocity that moves one position to another in unit time, by the shorter turns of quaternions.
+
+    The inverse of `integrate_position`.
+    """
+    turning, first, dofs = _addresses(model)
+    if not turning.size:
+        return end - start
+    quaternions = turning[:, :1] + np.arange(4)
+    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(start[quaternions]), end[quaternions]))
+    change = jnp.zeros(model.nv, start.dtype).at[dofs].set((end - start)[first])
+    return change.at[turning[:, 1:] + np.arange(3)].set(turned)
+
+
+def _addresses(model: mjx.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (qpos, dof) addresses of quaternions, and those of the coordinates that simply add."""
+    turning, first, dofs = [], [], []
+    for kind, address, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        if kind == _Joint.mjJNT_FREE:
+            first += range(address, address + 3)
+            dofs += range(dof, dof + 3)
+            turning.append((address + 3, dof + 3))
+        elif kind == _Joint.mjJNT_BALL:
+            turning.append((address, dof))
+        else:
+            first.append(address)
+            dofs.append(dof)
+    return np.array(turning, int).reshape(-1, 2), np.array(first, int), np.array(dofs, int)

@@ -6,7 +6,6 @@ third and a fifth of the time of their batched counterparts, which work on one s
 axes are written out, since XLA does not vectorise a reduction over the batch that is left.
 """
 
-import dataclasses
 import functools
 import math
 import operator
@@ -16,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+_Items = Float[Array, "n *rest"]
+_Matrix = Float[Array, "n n *batch"]
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
 # What only some of a batch need is computed for this part of it at a time.
@@ -47,7 +48,7 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     return add(a * b for a, b in zip(x, y, strict=True))
 
 
-def diagonal(matrix: Float[Array, "n n *batch"]) -> Float[Array, "n *batch"]:
+def diagonal(matrix: _Matrix) -> Float[Array, "n *batch"]:
     """Return the diagonal."""
     return jnp.stack([matrix[i, i] for i in range(len(matrix))])
 
@@ -55,64 +56,51 @@ def diagonal(matrix: Float[Array, "n n *batch"]) -> Float[Array, "n *batch"]:
 def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "contacts 1 *rest"]:
     """Return the sum over the second axis, written out.
 
-    XLA's CPU backend hands such a reduction to a library (YNNPACK)
-    that neither vectorises it over the batch nor, under two `jax.vmap` (jax 0.10.2), always survives it.
+    XLA's CPU backend hands such a reduction to a library (YNNPACK) that neither vectorises it over the batch nor, under two
+    `jax.vmap` (jax 0.10.2), always survives it.
     """
     return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
-def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> Float[Array, "n n *batch"]:
+def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> _Matrix:
     """Return leftᵀ right."""
     if left.ndim > 2 and len(left) <= LONGEST_SUM:
         return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
 
-def batch_last(function, batch: int | None = None):
+def batch_last(function: Callable, batch: int | None = None) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank.
-
-    Args:
-        function: of arrays whose trailing axis may be a batch.
-        batch: size of the trailing axis that the arguments have already; for the recursion.
+    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank. `batch` is for the recursion,
+    the size of the trailing axis that the arguments have already.
     """
+    # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
+    # `jax.lax.cond` asks for where its condition differs between members of the batch.
+    batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
-    @functools.wraps(function)
-    def wrapped(*args):
-        # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
-        # `jax.lax.cond` asks for where its condition differs between members of the batch.
-        batched = jax.custom_batching.custom_vmap(jax.jit(function))
+    @batched.def_vmap
+    def rule(size, is_batched, *args):
+        def back(x: Array) -> Array:
+            split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
+            return jnp.moveaxis(split, -1, 0)
 
-        @batched.def_vmap
-        def rule(size, is_batched, *args):
-            def back(x: Array) -> Array:
-                split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
-                return jnp.moveaxis(split, -1, 0)
+        leaves, structure = jax.tree.flatten(args)
+        moved = _moved_last(leaves, jax.tree.leaves(tuple(is_batched)), size)
+        if batch is not None:
+            moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
+        merged = jax.tree.unflatten(structure, moved)
+        result = batch_last(function, size if batch is None else batch * size)(*merged)
+        return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
-            leaves, structure = jax.tree.flatten(args)
-            moved = _moved_last(leaves, jax.tree.leaves(tuple(is_batched)), size)
-            if batch is not None:
-                moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
-            merged = jax.tree.unflatten(structure, moved)
-            result = batch_last(function, size if batch is None else batch * size)(*merged)
-            return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
-
-        return batched(*args)
-
-    return wrapped
+    return batched
 
 
 def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
     """Return what a function gives where it is needed, and the default elsewhere.
 
-    Of a batch an eighth is taken at a time, until none is left: for what few of its members need.
-
-    Args:
-        function: of arrays whose trailing axis is the batch, as are those of its result.
-        is_needed: by whom; without axes for a single problem.
-        default: shaped as the result.
-        args: to the function.
+    Of a batch, the trailing axis of all arrays, an eighth is taken at a time, until none is left: for what few of its
+    members need.
     """
     if not is_needed.ndim:
         return jax.lax.cond(is_needed, lambda: function(*args), lambda: default)
@@ -127,14 +115,9 @@ def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree
 
 
 class Few:
-    """Some of a batch, taken out and put back: of those chosen the first, in their order, then others as there is room.
+    """Some of a batch, the trailing axis of arrays, taken out and put back.
 
-    Args:
-        is_chosen: of the batch, which is the trailing axis of arrays.
-        count: for how many there is room.
-
-    Attributes:
-        is_taken: who is among them of those chosen.
+    Of those chosen the first, in their order, then others as there is room; `is_taken` says who is among them of those chosen.
     """
 
     def __init__(self, is_chosen: Bool[Array, " batch"], count: int):
@@ -179,54 +162,35 @@ def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[
     return moved  # pyright: ignore[reportReturnType]
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """Neighbours among chosen entries.
-
-    Attributes:
-        target: their place among all entries.
-        source: their place among the chosen ones.
-    """
-
-    target: slice
-    source: slice
-
-
-def runs(chosen: tuple[int, ...]) -> list[Run]:
-    """Return ascending indices as few slices."""
+def runs(chosen: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Return ascending indices as few slices: their places among all entries, and among the chosen ones."""
     cuts = [k for k in range(1, len(chosen)) if chosen[k] != chosen[k - 1] + 1]
     ends = zip([0, *cuts], [*cuts, len(chosen)], strict=True)
-    return [Run(slice(chosen[a], chosen[a] + b - a), slice(a, b)) for a, b in ends if b > a]
+    return [(slice(chosen[a], chosen[a] + b - a), slice(a, b)) for a, b in ends if b > a]
 
 
-def take(x: Float[Array, "n *rest"], chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
+def take(x: _Items, chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
     """Return entries at ascending constant indices."""
-    parts = [x[run.target] for run in runs(chosen)]
+    parts = [x[target] for target, _ in runs(chosen)]
     return parts[0] if len(parts) == 1 else jnp.concatenate([x[:0], *parts])
 
 
-def add_at(
-    x: Float[Array, "n *rest"], chosen: tuple[int, ...], part: Float[Array, "m *rest"]
-) -> Float[Array, "n *rest"]:
+def add_at(x: _Items, chosen: tuple[int, ...], part: Float[Array, "m *rest"]) -> _Items:
     """Return x with something added to entries at ascending constant indices."""
-    for run in runs(chosen):
-        x = _add_block(x, (run.target,), part[run.source])
+    for target, source in runs(chosen):
+        x = _add_block(x, (target,), part[source])
     return x
 
 
-def add_to_block(
-    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m m *batch"]
-) -> Float[Array, "n n *batch"]:
+def add_to_block(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m m *batch"]) -> _Matrix:
     """Return a matrix with something added to some rows and the same columns."""
-    for down in runs(chosen):
-        for across in runs(chosen):
-            matrix = _add_block(matrix, (down.target, across.target), part[down.source, across.source])
+    for down, left in runs(chosen):
+        for across, right in runs(chosen):
+            matrix = _add_block(matrix, (down, across), part[left, right])
     return matrix
 
 
-def add_to_diagonal(
-    matrix: Float[Array, "n n *batch"], chosen: tuple[int, ...], part: Float[Array, "m *batch"]
-) -> Float[Array, "n n *batch"]:
+def add_to_diagonal(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m *batch"]) -> _Matrix:
     """Return a matrix with something added to some entries of the diagonal."""
     for place, k in enumerate(chosen):
         matrix = _add_block(matrix, (slice(k, k + 1), slice(k, k + 1)), part[place][None, None])

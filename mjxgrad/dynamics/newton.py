@@ -19,6 +19,7 @@ The gradient is formed afresh in each iteration rather than updated along the li
 the rounding errors of a poor start.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -29,7 +30,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import cholesky, constraint, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
+from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
+from mjxgrad.dynamics.kinematics import Inertia
 from mjxgrad.dynamics.sparse import SparseRows
+
+_Vector = Float[Array, "nv *batch"]
+_Scalar = Float[Array, "*batch"]
+_Truth = Bool[Array, "*batch"]
+_Result = tuple[_Vector, Int[Array, "*batch"]]
 
 # Newton steps along the search line. Near the solution the first, of length one, is already exact; far from it an inexact
 # search costs an outer iteration and not the answer. On a box and a ball that slide on a plane, 2 to 12 steps needed the
@@ -51,22 +59,79 @@ _ROUNDING = 4
 _RESOLVED = 1e-3
 
 
-class Problem(eqx.Module):
-    """Everything that determines the acceleration of one state.
+class Variant(eqx.Module):
+    """In what a second solve of the same state may differ. For two solves arrays have a leading axis of two.
 
     Attributes:
-        mass: M, joint-space inertia.
-        force: f_smooth = M a_s, all forces but those of constraints (N or N m).
-        jacobian: J, from joint velocities to constraint rows.
+        weight: of the rows.
+        reference: a_ref of the rows; None for that of the system.
+        parts: of J, where contacts may push from another side.
+    """
+
+    weight: Float[Array, "*two rows"]
+    reference: Float[Array, "*two rows"] | None = None
+    parts: tuple[RowMap | None, ...] | None = None
+
+    def __getitem__(self, number: int) -> "Variant":
+        """Return that of one solve."""
+        return jax.tree.map(lambda x: x[number], self)
+
+
+class System(eqx.Module):
+    """What determines the acceleration of one state, as its derivative wants it.
+
+    Attributes:
+        inertia: M.
+        force: f_smooth, all forces but those of constraints (N or N m).
+        map: J, also of rows that are inactive.
+        is_active: which rows are not.
         rows: parameters of the rows' laws.
     """
 
+    inertia: Inertia
+    force: _Vector
+    map: JoinedRows
+    is_active: Bool[Array, "rows *batch"]
+    rows: Rows
+
+    def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
+        """Return J v, zero for inactive rows."""
+        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
+
+    def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
+        """Return Jᵀ f."""
+        return self.map.pull(jnp.where(self.is_active, force, 0.0))
+
+    def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
+        """Return the constraint forces at an acceleration."""
+        return constraint.force(layout, self.rows, self.rates(acceleration) - self.rows.reference)
+
+    def gradient(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """Return M a - f_smooth - Jᵀ f, zero at the solution."""
+        pull = self.pull(self.row_force(layout, acceleration))
+        return self.inertia.apply(acceleration) - self.force - pull
+
+    def varied(self, variant: Variant) -> "System":
+        """Return the same with what is different in one solve."""
+        reference = self.rows.reference if variant.reference is None else variant.reference
+        rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
+        return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
+
+    def problem(self) -> "Problem":
+        """Return the same with entries; arrays may carry the batch as trailing axes here."""
+        jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
+        return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
+
+
+class Problem(eqx.Module):
+    """A system whose M and J are entries. Arrays may carry the batch as trailing axes."""
+
     mass: Float[Array, "nv nv *batch"]
-    force: Float[Array, "nv *batch"]
+    force: _Vector
     jacobian: SparseRows
     rows: Rows
 
-    def at(self, layout: RowLayout, acceleration: Float[Array, "nv *batch"]) -> "Point":
+    def at(self, layout: RowLayout, acceleration: _Vector) -> "Point":
         """Evaluate the problem at an acceleration."""
         x = self.jacobian.matvec(acceleration) - self.rows.reference
         row_force = constraint.force(layout, self.rows, x)
@@ -74,7 +139,7 @@ class Problem(eqx.Module):
         pull = self.jacobian.rmatvec(row_force)
         return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
 
-    def rounding(self, point: "Point") -> Float[Array, "*batch"]:
+    def rounding(self, point: "Point") -> _Scalar:
         """Return the size that the decrement at a point has by rounding alone.
 
         In its norm rows may be as stiff as they like: an error of their x by e adds Jᵀ D e to the gradient, which is large,
@@ -85,7 +150,7 @@ class Problem(eqx.Module):
         terms = linear.dot(point.acceleration, point.inertia) + linear.dot(weight * size, size)
         return (_ROUNDING * jnp.finfo(size.dtype).eps) ** 2 * terms
 
-    def is_resolved(self, point: "Point") -> Bool[Array, "*batch"]:
+    def is_resolved(self, point: "Point") -> _Truth:
         """Return whether rounding leaves less than a thousandth of the acceleration unknown.
 
         In single precision it leaves more where rows weigh 10⁷ times the bodies: the edges of a pyramid do, as 1/μ², at little
@@ -95,35 +160,22 @@ class Problem(eqx.Module):
         return self.rounding(point) <= _RESOLVED**2 * (own + free)
 
     @property
-    def diagonal(self) -> Float[Array, "nv *batch"]:
+    def diagonal(self) -> _Vector:
         """The diagonal of M, positive."""
         return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
-    def hessian(self, layout: RowLayout, x: Float[Array, "rows *batch"]) -> Float[Array, "nv nv *batch"]:
-        """Return the second derivative of the cost, M + Jᵀ s'' J."""
-        return self.jacobian.gram(self.mass, layout, constraint.bend(layout, self.rows, x))
-
 
 class Point(eqx.Module):
-    """A problem evaluated at one acceleration.
+    """A problem evaluated at one acceleration a: x = J a - a_ref, f(x), M a, Jᵀ f, and M a - f_smooth - Jᵀ f."""
 
-    Attributes:
-        acceleration: a.
-        x: J a - a_ref.
-        row_force: f(x), the constraint forces.
-        inertia: M a.
-        pull: Jᵀ f, the constraint forces in joint space.
-        gradient: M a - f_smooth - Jᵀ f.
-    """
-
-    acceleration: Float[Array, "nv *batch"]
+    acceleration: _Vector
     x: Float[Array, "rows *batch"]
     row_force: Float[Array, "rows *batch"]
-    inertia: Float[Array, "nv *batch"]
-    pull: Float[Array, "nv *batch"]
-    gradient: Float[Array, "nv *batch"]
+    inertia: _Vector
+    pull: _Vector
+    gradient: _Vector
 
-    def rounding(self) -> Float[Array, "nv *batch"]:
+    def rounding(self) -> _Vector:
         """Return the size that the gradient has by rounding alone."""
         terms = jnp.abs(self.inertia) + jnp.abs(self.pull)
         return _ROUNDING * jnp.finfo(terms.dtype).eps * terms
@@ -138,40 +190,25 @@ class _Iterate(eqx.Module):
     """
 
     point: Point
-    is_near: Bool[Array, "*batch"]
+    is_near: _Truth
     num_iterations: Int[Array, "*batch"]
 
 
-_Result = tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]
-
-
-def minimise(
-    layout: RowLayout,
-    problem: Problem,
-    start: Float[Array, "nv *batch"],
-    tolerance: Float[Array, "*batch"],
-    max_iterations: int,
-) -> tuple[Float[Array, "nv *batch"], Int[Array, "*batch"]]:
+def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
     """Return the acceleration of least cost and the number of iterations that it took.
 
     It goes on until every member of the batch is done; those that are do not move any more. Once an eighth of them are left,
-    they are taken out and finished among themselves.
+    they are taken out and finished among themselves. A start that is not finite is replaced by zero.
 
-    Args:
-        layout: the laws of the rows.
-        problem: the cost.
-        start: where to begin, usually the last acceleration. A non-finite start is replaced by zero.
-        tolerance: on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
-            single body the root mean square error of its acceleration (m/s²). The search also ends where the step is
-            rounding.
-        max_iterations: upper bound.
+    The tolerance is on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
+    single body the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding.
 
     Returns:
         The acceleration, NaN where the problem is not finite, and the number of iterations: one more than
         `max_iterations` where these, or the digits of this precision, were too few.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
-    batch = start.shape[1:]
+    batch, problem = start.shape[1:], system.problem()
     solver = _Solver(layout, problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
     # On a CPU, where it was measured.
@@ -188,12 +225,7 @@ def minimise(
 def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], result: _Result, count: int) -> _Result:
     """Finish the few that are left among themselves: else all wait for the slowest, and compute what nobody needs.
 
-    Args:
-        solver: of the whole batch.
-        state: of the whole batch.
-        is_left: who is not done.
-        result: of those who are.
-        count: of places for them, no fewer than there are.
+    There are places for `count`, no fewer than are left.
     """
     few = linear.Few(is_left, count)
     part = few.take(solver)
@@ -203,37 +235,24 @@ def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], 
 
 
 class _Solver(eqx.Module):
-    """The iteration for a batch of problems.
-
-    Attributes:
-        layout: the laws of the rows.
-        problem: the cost.
-        smallest: decrement at which a solve has converged.
-        max_iterations: upper bound.
-    """
+    """The iteration for a batch of problems; `smallest` is the decrement at which a solve has converged."""
 
     layout: RowLayout = eqx.field(static=True)
     problem: Problem
-    smallest: Float[Array, "*batch"]
+    smallest: _Scalar
     max_iterations: int = eqx.field(static=True)
 
-    def measure(
-        self,
-        acceleration: Float[Array, "nv *batch"],
-        is_near: Bool[Array, "*batch"],
-        num_iterations: Int[Array, "*batch"],
-    ) -> _Iterate:
-        """Evaluate the problem at an acceleration."""
+    def measure(self, acceleration: _Vector, is_near: _Truth, num_iterations: Int[Array, "*batch"]) -> _Iterate:
         return _Iterate(self.problem.at(self.layout, acceleration), is_near, num_iterations)
 
-    def is_solved(self, state: _Iterate) -> Bool[Array, "*batch"]:
+    def is_solved(self, state: _Iterate) -> _Truth:
         """Return who has converged."""
         # Known without the factor of H: as H exceeds M, no less than the decrement but for what M couples.
         diagonal = self.problem.diagonal
         energy, floor = (linear.dot(v / diagonal, v) for v in (state.point.gradient, state.point.rounding()))
         return state.is_near | (energy < self.smallest) | (energy <= floor)
 
-    def is_done(self, state: _Iterate) -> Bool[Array, "*batch"]:
+    def is_done(self, state: _Iterate) -> _Truth:
         """Return who does not move any more."""
         is_broken = ~jnp.all(jnp.isfinite(state.point.gradient), axis=0)
         return self.is_solved(state) | is_broken | (state.num_iterations >= self.max_iterations)
@@ -251,7 +270,11 @@ class _Solver(eqx.Module):
         """Take one step of Newton's method, those that are done excepted."""
         layout, problem = self.layout, self.problem
         point, stays = state.point, self.is_done(state)
-        direction = _descent(problem.hessian(layout, point.x), point.gradient)
+        hessian = problem.jacobian.gram(problem.mass, layout, constraint.bend(layout, problem.rows, point.x))
+        newton = -cholesky.cholesky_solve(hessian, point.gradient)
+        # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
+        scaled = -point.gradient / linear.diagonal(hessian)
+        direction = jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, scaled)
         decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
         noise = jnp.sqrt(jnp.maximum(decrement, 0.0) * floor)
         length = _line_search(layout, problem, point, direction, noise, stays)
@@ -268,45 +291,24 @@ class _Solver(eqx.Module):
         return jnp.where(is_sound, state.point.acceleration, jnp.nan), num_iterations
 
 
-def _descent(hessian: Float[Array, "nv nv *batch"], gradient: Float[Array, "nv *batch"]) -> Float[Array, "nv *batch"]:
-    """Return Newton's direction; where the factorisation fails in this precision, the gradient scaled by the diagonal."""
-    newton = -cholesky.cholesky_solve(hessian, gradient)
-    return jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, -gradient / linear.diagonal(hessian))
-
-
 class _Search(eqx.Module):
-    """Where the minimiser along a line is known to be.
+    """Where the minimiser along a line is known to be: between `low`, up to which the cost has only fallen, and `high`.
 
-    Attributes:
-        low: up to here the cost has only fallen.
-        high: the minimiser is not beyond.
-        length: where to look next; once the slope is flat, where it is.
-        is_flat: whether the slope was, at the last look.
+    `length` is where to look next; once the slope is flat, as it was at the last look, it is the minimiser.
     """
 
-    low: Float[Array, "*batch"]
-    high: Float[Array, "*batch"]
-    length: Float[Array, "*batch"]
-    is_flat: Bool[Array, "*batch"]
+    low: _Scalar
+    high: _Scalar
+    length: _Scalar
+    is_flat: _Truth
 
 
 def _line_search(
-    layout: RowLayout,
-    problem: Problem,
-    point: Point,
-    direction: Float[Array, "nv *batch"],
-    noise: Float[Array, "*batch"],
-    is_done: Bool[Array, "*batch"],
-) -> Float[Array, "*batch"]:
-    """Return the minimiser of the cost along a descent direction, or a shorter step that lowers it.
+    layout: RowLayout, problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth
+) -> _Scalar:
+    """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers it.
 
-    Args:
-        layout: the laws of the rows.
-        problem: the cost.
-        point: where the line begins.
-        direction: of the line.
-        noise: size of the slope by rounding alone.
-        is_done: for whom the answer does not matter.
+    `noise` is the size of the slope by rounding alone; for those who are done the answer does not matter.
     """
     along = problem.jacobian.matvec(direction)
     smooth_slope = linear.dot(direction, point.inertia - problem.force)

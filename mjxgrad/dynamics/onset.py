@@ -59,12 +59,12 @@ References:
     and control? arXiv:2207.05060 (time of impact). Kong, Payne, Zhu, Johnson. Saltation matrices. arXiv:2306.06862.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -72,16 +72,13 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import Impedance, stiffness_damping
-from mjxgrad.dynamics import assembly
-from mjxgrad.dynamics.block import Block
-from mjxgrad.dynamics.collision import other_sides, slot_geoms
-from mjxgrad.dynamics.contact import row_map
-from mjxgrad.dynamics.implicit import Variant
+from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
 from mjxgrad.dynamics.jacobian import RowMap
+from mjxgrad.dynamics.newton import Variant
+from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
-_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _MESH = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "MESH")
-)
+_PerRow = Float[Array, " rows"]
+_PerContact = Float[Array, " contacts"]
 # Impedance of a partial contact is no smaller than this part of its own: a weight of zero has no logarithm's derivative.
 _LEAST_SHARE = 1e-9
 # What a pyramid's slip adds to the width. Derivatives of a box pushed along the floor at 4 ms are 10⁷ with 1, 1 to 4 with 2 or 3.
@@ -112,12 +109,9 @@ class Onset(eqx.Module):
         Raises:
             ValueError: if the width is negative or not finite.
         """
-        if is_known(self.width):
-            known = np.asarray(self.width)
-            if not np.all((known >= 0) & np.isfinite(known)):
-                raise ValueError(
-                    f"width must be finite and not negative, got {known!s}: 0.1 is the default, 0 no floor"
-                )
+        if is_known(self.width) and not np.all((np.asarray(self.width) >= 0) & np.isfinite(self.width)):
+            given = np.asarray(self.width)
+            raise ValueError(f"width must be finite and not negative, got {given!s}: 0.1 is the default, 0 no floor")
 
     def check(self, gradient: str) -> None:
         """Refuse what a single step cannot take.
@@ -135,31 +129,20 @@ class Onset(eqx.Module):
 
 
 class Shares(eqx.Module):
-    """For which part of the step each row acts; see the module.
+    """For which part of the step each row acts: p₋ and p₊, 1 for rows that never begin or end, Φ, and whether these differ.
 
-    Attributes:
-        before: p₋ of each row; 1 for rows that never begin or end.
-        after: p₊ of each row, likewise.
-        weight: Φ, the weight of the solve with p₊.
-        is_split: whether the two solves differ.
-        parts: of J, block by block, in the solve with p₋, where some push from another side; None where none ever does.
+    `parts` of J, block by block, are those of the solve with p₋ where some push from another side; None where none ever does.
     """
 
-    before: Float[Array, " rows"]
-    after: Float[Array, " rows"]
+    before: _PerRow
+    after: _PerRow
     weight: Float[Array, ""]
     is_split: Bool[Array, ""]
     parts: tuple[RowMap | None, ...] | None
 
 
 class Partial(eqx.Module):
-    """Contacts that act for a part of the step, as two solves take them.
-
-    Attributes:
-        variants: of the rows, with p₊ and with p₋.
-        share: Φ, the weight of the former.
-        is_split: whether they differ.
-    """
+    """Contacts that act for a part of the step, as two solves take them: with p₊, whose weight is Φ, and with p₋."""
 
     variants: Variant
     share: Float[Array, ""]
@@ -167,24 +150,11 @@ class Partial(eqx.Module):
 
 
 def begin(
-    model: mjx.Model,
-    data: mjx.Data,
-    blocks: list[Block],
-    onset: Onset,
-    *,
-    without: tuple[bool, bool] = (False, False),
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], onset: Onset, *, without: tuple[bool, bool] = (False, False)
 ) -> tuple[list[Block], Shares | None]:
-    """Return constraint rows present wherever they act for a part of the step, and for which part.
+    """Return constraint rows present wherever they act for a part of the step, and for which; None if none begins or ends.
 
-    Args:
-        model: gives the time step and gravity.
-        data: with contacts, positions and velocities.
-        blocks: the rows of this state.
-        onset: the width.
-        without: whether contacts, and limits, are left as they are, averaged over noise on their distance.
-
-    Returns:
-        The rows and their shares; no shares if nothing begins or ends.
+    `without` says whether contacts, and limits, are left as they are, averaged over noise on their distance.
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
@@ -199,32 +169,30 @@ def begin(
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
         share, side = _share(model, data, block, onset, geoms)
-        share = jnp.repeat(share, each, total_repeat_length=each * count)
+        share = per_row(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
-        rows.append(eqx.tree_at(lambda b: (b.is_active, b.impedance), block, (share > 0, impedance)))
+        rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
         found.append(share)
         sides.append(side)
     return rows, _split(blocks, found, sides)
 
 
 def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> Partial | None:
-    """Return in what the solves of a step differ.
-
-    Args:
-        model: gives the laws of the rows.
-        data: with velocities.
-        blocks: rows from `begin`, or these under noise.
-        shares: from `begin`; None for rows of which none begins or ends.
-    """
+    """Return in what the solves of a step differ, from what `begin` gives, or these rows under noise."""
     if shares is None:
         return None
-    rows = assembly.joined(blocks)
-    weight = jax.vmap(lambda share: _weights(rows, share))(jnp.stack([shares.after, shares.before]))
+    rows = joined(blocks)
+
+    def weigh(share: _PerRow) -> _PerRow:
+        least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
+        return jnp.where(share > 0, weight_of(rows, least * rows.impedance.present), 0.0)
+
+    weight = jax.vmap(weigh)(jnp.stack([shares.after, shares.before]))
     if shares.parts is None:
         return Partial(Variant(weight), shares.weight, shares.is_split)
-    turned = eqx.tree_at(lambda block: block.map, rows, rows.map.with_parts(shares.parts))
-    references = [assembly.law(model, data.qvel, block)[0] for block in (rows, turned)]
+    turned = dataclasses.replace(rows, map=rows.map.with_parts(shares.parts))  # pyright: ignore[reportAttributeAccessIssue]
+    references = [law(model, data.qvel, block)[0] for block in (rows, turned)]
     parts = tuple(
         None if other is None else jax.tree.map(lambda *x: jnp.stack(x), block.map, other)
         for block, other in zip(blocks, shares.parts, strict=True)
@@ -232,30 +200,16 @@ def partial(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Share
     return Partial(Variant(weight, jnp.stack(references), parts), shares.weight, shares.is_split)
 
 
-def _firsts(block: Block) -> np.ndarray:
-    """Return which rows stand for a contact or limit: the first of each."""
-    return (
-        np.arange(len(block.residual)) % block.rows_each == 0
-        if block.rows_each
-        else np.zeros(len(block.residual), bool)
-    )
-
-
 class _Side(eqx.Module):
-    """What may push instead of the contacts of a block.
+    """What may push instead of the contacts of a block: ψ, for which part the present side pushes, and the other's rows."""
 
-    Attributes:
-        share: ψ, for which part of the step the present side pushes.
-        map: of the rows from the other side.
-    """
-
-    share: Float[Array, " contacts"]
+    share: _PerContact
     map: RowMap
 
 
 def _share(
     model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None
-) -> tuple[Float[Array, " contacts"], _Side | None]:
+) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and what may push instead of it; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
     rates = block.map.rates(data.qvel).reshape(-1, each)
@@ -278,43 +232,27 @@ def _share(
         return _ramp(distance, width, 0.5), None
     slots = slot_geoms(model)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
-    share = _ramp(distance, width, jnp.where(_is_blind(model, geoms), 0.0, 0.5))
+    share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
     return share, _side(model, data, block, contacts, geoms, rate, least)
 
 
-def _normal(block: Block, rates: Float[Array, "contacts each"]) -> Float[Array, " contacts"]:
+def _normal(block: Block, rates: Float[Array, "contacts each"]) -> _PerContact:
     """Return the rates along the normal."""
     return jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
 
 
-def _is_slow(rate: Float[Array, " contacts"], speed: Float[Array, "..."]) -> Float[Array, " contacts"]:
+def _is_slow(rate: _PerContact, speed: Float[Array, "..."]) -> _PerContact:
     """Return 1 for what is much slower than a speed, and 0 for impacts."""
     own, other = speed**4, rate**4
     return own / jnp.where(own + other > 0, own + other, 1.0)
 
 
-def _ramp(
-    distance: Float[Array, " contacts"], width: Float[Array, " contacts"], centre: Float[Array, "..."] | float
-) -> Float[Array, " contacts"]:
+def _ramp(distance: _PerContact, width: _PerContact, centre: Float[Array, "..."] | float) -> _PerContact:
     # `where`, not `clip`: at a tie its derivative is one half. Without a width there is MuJoCo's step.
     has_width = width > 0
     share = centre - distance / jnp.where(has_width, width, 1.0)
     share = jnp.where(share > 0, jnp.where(share < 1, share, 1.0), 0.0)
     return jnp.where(has_width, share, (distance < 0).astype(distance.dtype))
-
-
-def _is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
-    """Return of which pairs the distance is known only where they overlap."""
-    is_plane, is_sphere, is_box, is_convex = (
-        _are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), (_BOX, _MESH, _HEIGHT_FIELD))
-    )
-    return jnp.asarray(is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~(is_sphere.any(axis=1) & is_box.any(axis=1)))
-
-
-def _are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
-    """Return which geoms are of some kinds; known while tracing where the geoms are."""
-    table = np.isin(np.asarray(model.geom_type), kinds)
-    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
 
 
 def _side(
@@ -323,11 +261,11 @@ def _side(
     block: Block,
     contacts: slice,
     geoms: Array | np.ndarray,
-    rate: Float[Array, " contacts"],
-    least: Float[Array, " contacts"],
+    rate: _PerContact,
+    least: _PerContact,
 ) -> _Side | None:
     """Return for how long each contact pushes from its present side, and how it does from another; None if none can."""
-    can_turn = ~_are(model, geoms, (_PLANE, _HEIGHT_FIELD, _MESH)).any(axis=1)
+    can_turn = ~are(model, geoms, WITHOUT_CENTRE).any(axis=1)
     if isinstance(can_turn, np.ndarray) and not can_turn.any():
         return None
     contact = jax.tree.map(lambda x: x[contacts], data._impl.contact)
@@ -342,14 +280,14 @@ def _side(
 
 def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_Side | None]) -> Shares:
     """Return the shares in two solves, from φ of the rows and what may push instead of them."""
-    is_first = np.concatenate([_firsts(block) for block in blocks])
+    # The first row of each stands for a contact or limit.
+    each = [(np.arange(len(block.residual)), block.rows_each) for block in blocks]
+    is_first = np.concatenate([row % num == 0 if num else np.zeros(len(row), bool) for row, num in each])
     whole, present = jnp.concatenate(shares), 1.0
     if any(side is not None for side in sides):
         present = jnp.concatenate(
             [
-                jnp.ones_like(share)
-                if side is None
-                else jnp.repeat(side.share, block.rows_each, total_repeat_length=len(share))
+                jnp.ones_like(share) if side is None else per_row(side.share, block.rows_each)
                 for block, share, side in zip(blocks, shares, sides, strict=True)
             ]
         )
@@ -387,11 +325,3 @@ def _chosen(is_other: Bool[Array, " rows"], other: RowMap, own: RowMap) -> RowMa
         return jnp.where(is_other[:: len(is_other) // len(a)].reshape(-1, *(1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(choose, other, own)
-
-
-def _weights(block: Block, share: Float[Array, " rows"]) -> Float[Array, " rows"]:
-    """Return D of rows that act with a part of their impedance; zero for those without."""
-    least = jnp.where(share > _LEAST_SHARE, share, _LEAST_SHARE)
-    impedance = least * block.impedance.present
-    weight = 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
-    return jnp.where(share > 0, weight, 0.0)

@@ -12,7 +12,6 @@ C the constant product of the fixed rotations and φ the sum of the angles, whic
 products. To know that, axes and fixed rotations must be known when the program is traced.
 """
 
-import abc
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -27,64 +26,44 @@ from mjxgrad._static import known
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.spatial import contract, pick
 
+_Vectors = Float[Array, "n 3"]
+_Matrices = Float[Array, "n 3 3"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Axes count as parallel up to this many units of rounding of the numbers that they are made of.
 _PARALLEL = 16
 
 
-class Orientation(eqx.Module):
-    """Where frames point, one after each turn. An index of -1 is the world."""
-
-    @abc.abstractmethod
-    def quaternions(self, index: np.ndarray) -> Float[Array, "n 4"]:
-        """Return the orientations of chosen frames as quaternions."""
-
-    @abc.abstractmethod
-    def compose(self, index: np.ndarray, matrices: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
-        """Return the orientation of what is turned by matrices in chosen frames."""
-
-    @abc.abstractmethod
-    def rotate(self, index: np.ndarray, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Return vectors of chosen frames in the world."""
-
-
-class Products(Orientation):
-    """Products of the turns from the root.
+class Products(eqx.Module):
+    """Products of the turns from the root: where frames point, one after each turn. An index of -1 is the world.
 
     Both quaternions and matrices are carried through the products, so that XLA can remove the quaternions where nobody
     reads them.
-
-    Attributes:
-        quat: after each turn.
-        mat: likewise.
     """
 
     quat: Float[Array, "turns 4"]
     mat: Float[Array, "turns 3 3"]
 
     def quaternions(self, index: np.ndarray) -> Float[Array, "n 4"]:
+        """Return the orientations of chosen frames as quaternions."""
         return pick(index, self.quat, _IDENTITY)
 
-    def compose(self, index: np.ndarray, matrices: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+    def compose(self, index: np.ndarray, matrices: _Matrices) -> _Matrices:
+        """Return the orientation of what is turned by matrices in chosen frames."""
         return spatial.compose(pick(index, self.mat, np.eye(3)), matrices)
 
-    def rotate(self, index: np.ndarray, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def rotate(self, index: np.ndarray, vectors: _Vectors) -> _Vectors:
+        """Return vectors of chosen frames in the world."""
         return spatial.rotate(pick(index, self.mat, np.eye(3)), vectors)
 
 
-class Angles(Orientation):
-    """Sums of angles about the axes of chains.
-
-    Attributes:
-        angle: φ, after each turn (rad).
-        chain: the constants of the formula.
-    """
+class Angles(eqx.Module):
+    """Sums of angles about the axes of chains: φ after each turn (rad), and the constants of the formula."""
 
     angle: Float[Array, " turns"]
     chain: "Chains" = eqx.field(static=True)
 
-    def quaternions(self, index: np.ndarray) -> Float[Array, "n 4"]:
+    def quaternions(self, index):
         half = pick(index, 0.5 * self.angle)
         fixed = np.where((index >= 0)[:, None], self.chain.quaternion[index], _IDENTITY)
         turned = np.where((index >= 0)[:, None], self.chain.turned_quaternion[index], 0.0)
@@ -92,11 +71,11 @@ class Angles(Orientation):
             jnp.sin(half), jnp.asarray(turned, half.dtype)
         )
 
-    def compose(self, index: np.ndarray, matrices: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+    def compose(self, index, matrices):
         parts = (contract("nij,njk->nik", part, matrices).reshape(-1, 9) for part in self._parts(index))
         return self._sum(index, *parts).reshape(-1, 3, 3)
 
-    def rotate(self, index: np.ndarray, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def rotate(self, index, vectors):
         return self._sum(index, *(contract("nij,nj->ni", part, vectors) for part in self._parts(index)))
 
     def _parts(self, index: np.ndarray) -> list[Array]:
@@ -135,15 +114,10 @@ class Chains:
     turned_quaternion: np.ndarray
 
 
-def orientation(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]) -> Orientation:
-    """Return the orientations after all turns of a state.
-
-    Args:
-        model: of any kind.
-        data: poses of mocap bodies, and positions.
-        frames: the turns.
-        turn: quaternion of each joint.
-    """
+def orientation(
+    model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
+) -> Products | Angles:
+    """Return the orientations after all turns of a state, from the quaternion of each joint."""
     found = chains(model, frames)
     if found is None:
         return _products(model, data, frames, turn)
@@ -170,12 +144,7 @@ def _products(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float
 
 
 def chains(model: mjx.Model, frames: tree.Frames) -> Chains | None:
-    """Return the constants of chains that turn about one axis each; None where one does not, or is not known to.
-
-    Args:
-        model: of any kind.
-        frames: its turns.
-    """
+    """Return the constants of chains that turn about one axis each; None where one does not, or is not known to."""
     axes, quats = known(model.jnt_axis), known(model.body_quat)
     turns_freely = np.isin(model.jnt_type, (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL)).any()
     if axes is None or quats is None or turns_freely or model.nmocap or not (frames.joint >= 0).any():

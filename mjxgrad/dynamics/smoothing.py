@@ -32,6 +32,7 @@ slots have no rows.
 """
 
 import dataclasses
+import functools
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -45,9 +46,10 @@ from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.dynamics.block import Block
+from mjxgrad.dynamics.collision import CONVEX, are, is_blind
 from mjxgrad.dynamics.constraint import Noise, RowLayout
 from mjxgrad.dynamics.kernels import KERNELS, Kernel
+from mjxgrad.dynamics.rows import Block, per_row
 
 KernelName = Literal["gaussian", "logistic", "log_barrier"]
 Mode = Literal["forward", "backward"]
@@ -57,16 +59,10 @@ _SOFTEST = 1e-3
 # Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
 # derivative.
 _WEIGHTLESS = 1e30
-_BALL_ON_BOX = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)}
-_CONVEX = {int(kind) for kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)}
 
 
-def _as_length(value: Any) -> Array:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
-def _as_optional_length(value: Any) -> Array | None:
-    return None if value is None else _as_length(value)
+def _as_length(value: Any) -> Any:
+    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 class Smoothing(eqx.Module):
@@ -90,7 +86,7 @@ class Smoothing(eqx.Module):
     # Plain strings, so that a name that there is not meets the check below, which knows the choices.
     kernel: str = eqx.field(static=True, default="gaussian")
     mode: str = eqx.field(static=True, default="forward")
-    limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_optional_length, default=None, kw_only=True)
+    limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_length, default=None, kw_only=True)
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
@@ -108,11 +104,8 @@ class Smoothing(eqx.Module):
         }
         for name, remedy in remedies.items():
             value = getattr(self, name)
-            if not is_known(value):
-                continue
-            known = np.asarray(value)
-            if not np.all((known > 0) & np.isfinite(known)):
-                raise ValueError(f"{name} must be positive and finite, got {known!s}: {remedy}")
+            if is_known(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
+                raise ValueError(f"{name} must be positive and finite, got {np.asarray(value)!s}: {remedy}")
 
     @property
     def noise(self) -> Kernel:
@@ -150,7 +143,8 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
     pairs = contact_pairs(model)
     if not pairs:
         messages.append(f"smoothing of {smoothing.kernel} contact has no effect: no two geoms of the scene can touch")
-    blind = [str(pair) for pair in pairs if _is_blind(model, pair.geom1, pair.geom2)]
+    geoms = np.array([(pair.geom1, pair.geom2) for pair in pairs], int).reshape(-1, 2)
+    blind = [str(pairs[i]) for i in np.flatnonzero(is_blind(model, geoms))]
     if blind:
         shown = ", ".join(blind[:4]) + (f" and {len(blind) - 4} more" if len(blind) > 4 else "")
         messages.append(
@@ -163,32 +157,18 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
 
 
 def has_limits(model: mjx.Model) -> bool:
-    """Whether some joint or tendon has a limit that acts."""
+    """Return whether some joint or tendon has a limit that acts."""
     if int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
         return False
     return bool(np.any(model.jnt_limited) or np.any(model.tendon_limited))
 
 
-def _is_blind(model: mjx.Model, geom1: int, geom2: int) -> bool:
-    kinds = {int(model.geom_type[geom1]), int(model.geom_type[geom2])}
-    return bool(kinds & _CONVEX) and int(mujoco.mjtGeom.mjGEOM_PLANE) not in kinds and kinds != _BALL_ON_BOX
-
-
 def smoothed(
     model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing, layout: RowLayout
 ) -> tuple[list[Block], Noise | None, RowLayout]:
-    """Return rows, their noise and their laws under noise.
+    """Return rows, present at any distance where they have noise, the noise of all rows, and their laws under noise.
 
-    Args:
-        model: with the solver's options.
-        data: with contacts.
-        blocks: the rows of this state.
-        smoothing: which noise, and on what.
-        layout: the laws of the rows without noise.
-
-    Returns:
-        The rows, present at any distance where they have noise; the noise of all rows, with numbers without meaning
-        where there is none; the laws. Noise is None, and nothing else changes, if there is nothing to be smoothed.
+    Noise has numbers without meaning for rows without, and is None, and nothing else changes, if there is nothing to be smoothed.
     """
     has_distance, num_contacts = _has_distance(model, data), 0
     rows, noises, first = [], [], None
@@ -203,7 +183,7 @@ def smoothed(
             if block.is_contact:
                 known = has_distance[num_contacts : num_contacts + count // each]
                 num_contacts += count // each
-            block, noise = _noisy(model, block, known, length.astype(block.residual.dtype), smoothing)
+            block, noise = noisy(model, block, known, smoothing)
             first = start if first is None else first
         rows.append(block)
         noises.append(noise)
@@ -214,48 +194,28 @@ def smoothed(
     return rows, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=first)
 
 
-def noisy_rows(
-    model: mjx.Model, block: Block, smoothing: Smoothing, layout: RowLayout
-) -> tuple[Block, Noise, RowLayout]:
-    """Return contact rows under noise that are a whole problem's, as `smoothed` does; all at a known distance."""
-    known = jnp.ones(len(block.residual) // block.rows_each, bool)
-    block, noise = _noisy(model, block, known, smoothing.length.astype(block.residual.dtype), smoothing)
-    return block, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=0)
-
-
-def _noisy(
-    model: mjx.Model, block: Block, known: Bool[Array, " groups"], length: Float[Array, ""], smoothing: Smoothing
-) -> tuple[Block, Noise]:
+def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
     """Return a block that is present at any known distance, and its noise."""
     each, kernel = block.rows_each, smoothing.noise
+    length = smoothing.length if block.is_contact else smoothing.limit_length
+    assert length is not None
+    length = length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
-    depth = _depth(kernel, distance, length)
-    resistance = impedance(block.solimp[::each], depth)
-
-    def spread(x: Array) -> Array:
-        return jnp.repeat(x, each, axis=0, total_repeat_length=len(block.residual))
-
+    # The mean of -(r + w) where it is positive (m or rad).
+    resistance = impedance(block.solimp[::each], length * kernel.depth(distance / length))
+    spread = functools.partial(per_row, each=each)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
     gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
-    is_present = spread(known)
-    present = eqx.tree_at(
-        lambda b: (b.impedance, b.inverse_weight, b.is_active),
-        block,
-        (jax.tree.map(spread, resistance), jnp.where(is_present, block.inverse_weight, _WEIGHTLESS), is_present),
-    )
+    is_present, impedances = spread(known), jax.tree.map(spread, resistance)
+    weight = jnp.where(is_present, block.inverse_weight, _WEIGHTLESS)
+    present = dataclasses.replace(block, impedance=impedances, inverse_weight=weight, is_active=is_present)
     return present, Noise(spread(rate * length), spread(gate))
-
-
-def _depth(kernel: Kernel, distance: Float[Array, " groups"], length: Float[Array, ""]) -> Float[Array, " groups"]:
-    """Return the mean of -(r + w) where it is positive (m or rad)."""
-    return length * kernel.depth(distance / length)
 
 
 def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
     contact = data._impl.contact
-    is_convex = np.isin(model.geom_type, list(_CONVEX))
-    if not is_convex.any() or not len(contact.dist):
+    if not np.isin(model.geom_type, CONVEX).any() or not len(contact.dist):
         return jnp.ones(len(contact.dist), bool)
     # Of a ball on a box it is known, and of no interest beyond a metre.
-    return ~(jnp.any(jnp.asarray(is_convex)[contact.geom], axis=1) & (contact.dist >= 1))
+    return ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))

@@ -12,6 +12,9 @@ from mjxgrad.dynamics import linear
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.jacobian import DenseRows, Group, RowMap, edges, flat, fold
 
+_Entries = Float[Array, "num dim dofs *batch"]
+_Square = Float[Array, "dofs dofs *batch"]
+
 # Beyond so many groups the entries are kept in one matrix with its zeros: every group is some operations more to compile.
 _MOST_GROUPS = 24
 
@@ -19,11 +22,7 @@ _MOST_GROUPS = 24
 class SparseRows(eqx.Module):
     """The entries of a Jacobian, group by group, without those that are always zero.
 
-    Attributes:
-        pieces: entries of each group, by item, direction and joint velocity.
-        tilts: μ of each tangent of a pyramid; None for other groups.
-        groups: which joint velocities, and what the directions mean.
-        num_dofs: nv.
+    `pieces` are by item, direction and joint velocity, `tilts` μ of each tangent of a pyramid.
     """
 
     pieces: tuple[Float[Array, "_ _ _ *batch"], ...]
@@ -67,13 +66,7 @@ class SparseRows(eqx.Module):
         return total
 
     def gram(self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, bend: Bend) -> Float[Array, "nv nv *batch"]:
-        """Return mass + Jᵀ s'' J, of which each group adds to what it moves and to nothing else.
-
-        Args:
-            mass: to be added to.
-            layout: the laws of the rows.
-            bend: s'', see `constraint.bend`.
-        """
+        """Return mass + Jᵀ s'' J, of which each group adds to what it moves and to nothing else; s'' by `constraint.bend`."""
         total, start = mass, 0
         for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
             rows = slice(start, start + group.num_rows)
@@ -92,27 +85,21 @@ class SparseRows(eqx.Module):
         return total
 
 
-def _gram(
-    left: Float[Array, "num dim dofs *batch"], right: Float[Array, "num dim dofs *batch"]
-) -> Float[Array, "dofs dofs *batch"]:
+def _gram(left: _Entries, right: _Entries) -> _Square:
     """Return leftᵀ right."""
     if left.ndim == 3 or left.shape[0] * left.shape[1] > linear.LONGEST_SUM:
         return linear.gram(flat(left), flat(right))
     return linear.add(a[:, None] * b[None] for a, b in zip(_rows(left), _rows(right), strict=True))
 
 
-def _over_dofs(
-    entries: Float[Array, "num dim dofs *batch"], x: Float[Array, "dofs *batch"]
-) -> Float[Array, "num dim *batch"]:
+def _over_dofs(entries: _Entries, x: Float[Array, "dofs *batch"]) -> Float[Array, "num dim *batch"]:
     """Return entries x."""
     if entries.ndim == 3 or len(x) > linear.LONGEST_SUM:
         return linear.matvec(flat(entries), x).reshape(*entries.shape[:2], *x.shape[1:])
     return linear.add(entries[:, :, k] * one for k, one in enumerate(x))
 
 
-def _over_rows(
-    entries: Float[Array, "num dim dofs *batch"], force: Float[Array, "num dim *batch"]
-) -> Float[Array, "dofs *batch"]:
+def _over_rows(entries: _Entries, force: Float[Array, "num dim *batch"]) -> Float[Array, "dofs *batch"]:
     """Return entriesᵀ force."""
     if entries.ndim == 3 or entries.shape[0] * entries.shape[1] > linear.LONGEST_SUM:
         return linear.rmatvec(flat(entries), flat(force))
@@ -125,10 +112,8 @@ def _rows(entries: Array) -> list[Array]:
 
 
 def _pyramid_square(
-    bend: Float[Array, "num tangents 2 *batch"],
-    tilt: Float[Array, "num tangents *batch"],
-    entries: Float[Array, "num dim dofs *batch"],
-) -> Float[Array, "dofs dofs *batch"]:
+    bend: Float[Array, "num tangents 2 *batch"], tilt: Float[Array, "num tangents *batch"], entries: _Entries
+) -> _Square:
     """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
     both, difference = bend[:, :, 0] + bend[:, :, 1], (tilt * (bend[:, :, 0] - bend[:, :, 1]))[:, :, None]
     normal, tangents = entries[:, 0], entries[:, 1:]
@@ -137,9 +122,7 @@ def _pyramid_square(
     return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
 
 
-def _cone_product(
-    layout: RowLayout, bend: Bend, rows: slice, entries: Float[Array, "num dim dofs *batch"]
-) -> Float[Array, "num dim dofs *batch"]:
+def _cone_product(layout: RowLayout, bend: Bend, rows: slice, entries: _Entries) -> _Entries:
     """Return s'' of neighbouring elliptic contacts times their rows."""
     which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
     cone = layout.cones[which]

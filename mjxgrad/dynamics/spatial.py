@@ -1,19 +1,100 @@
 """Rotations, cross products and inertias of many bodies at once.
 
 Motions are (angular, linear), forces (torque, force), about one point for a whole kinematic tree and in world axes. All
-functions but `multiply` take one leading axis of items.
+functions but those of quaternions take one leading axis of items.
+
+**Bilinear maps.** A cross product is written in components: slices, products, one concatenation. XLA fuses that into one
+loop. JAX's derivative of a slice, though, is a padded array, and the sum of many of those is what makes reverse mode slow. A
+batched matrix product instead keeps one factor, arranged as a matrix, for the backward pass, and runs as one small
+product after another. So the map is a primitive of its own. Its transposes with respect to either factor are again bilinear
+maps of short vectors, with the same terms in another order; hence derivatives of every order and mode are such maps.
+
+**At rest.** The exponential map is analytic in the squared angle. Written so, with a series where the closed form divides by
+zero, it has its true derivative at zero angular velocity (half the time step), where dividing by a guarded norm gives none.
 """
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics.bilinear import Bilinear
+_Quaternions = Float[Array, "*batch 4"]
+_Matrices = Float[Array, "n 3 3"]
+_Vectors = Float[Array, "n 3"]
+# (entry of the result, entry of the first factor, entry of the second, coefficient)
+_Term = tuple[int, int, int, float]
 
+# Below this squared angle the truncated series are exact to double precision: the first term left out of either is
+# smaller than (1e-4)**3 / 46080 = 2e-17.
+_SERIES = 1e-4
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 # Entries of a symmetric matrix in the order in which MuJoCo keeps those of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+class Bilinear:
+    """The map c_k = Σ_ij T_kij a_i b_j along the last axis, for a constant T."""
+
+    def __init__(self, table: np.ndarray):
+        """Keep the terms of T that are not zero."""
+        self._size = len(table)
+        self._terms = _ordered([(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)])  # pyright: ignore[reportArgumentType]
+
+    def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
+        """Return c; both factors have the same leading axes."""
+        return _bilinear.bind(a, b, terms=self._terms, size=self._size)
+
+
+def _ordered(terms: Sequence[_Term]) -> tuple[_Term, ...]:
+    """Return the terms by entry of the result, those that are added before those that are subtracted."""
+    return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
+
+
+def _evaluate(a: Array, b: Array, *, terms: tuple[_Term, ...], size: int) -> Array:
+    last = a.ndim - 1
+    a_entries, b_entries = (jax.lax.split(x, (1,) * x.shape[last], last) for x in (a, b))
+    entries: list[Array | None] = [None] * size
+    for k, i, j, coefficient in terms:
+        product, so_far = a_entries[i] * b_entries[j], entries[k]
+        if abs(coefficient) != 1:
+            product = abs(coefficient) * product
+        if coefficient < 0:
+            entries[k] = -product if so_far is None else so_far - product
+        else:
+            entries[k] = product if so_far is None else so_far + product
+    none = jnp.zeros((*a.shape[:last], 1), a.dtype)
+    return jnp.concatenate([none if x is None else x for x in entries], axis=last)
+
+
+def _transpose_first(cotangent, a, b, *, terms, size):
+    swapped = _ordered([(i, k, j, c) for k, i, j, c in terms])
+    return _bilinear.bind(cotangent, b, terms=swapped, size=a.aval.shape[-1])
+
+
+def _transpose_second(cotangent, a, b, *, terms, size):
+    swapped = _ordered([(j, i, k, c) for k, i, j, c in terms])
+    return _bilinear.bind(a, cotangent, terms=swapped, size=b.aval.shape[-1])
+
+
+def _batch(factors, axes, **parameters):
+    size = next(x.shape[axis] for x, axis in zip(factors, axes, strict=True) if axis is not None)
+    spread = [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(factors, axes, strict=True)
+    ]
+    return _bilinear.bind(*spread, **parameters), 0
+
+
+_bilinear = Primitive("bilinear")
+_bilinear.def_impl(jax.jit(_evaluate, static_argnames=("terms", "size")))
+_bilinear.def_abstract_eval(lambda a, b, *, terms, size: jax.core.ShapedArray((*a.shape[:-1], size), a.dtype))
+mlir.register_lowering(_bilinear, mlir.lower_fun(_evaluate, multiple_results=False))
+ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
+batching.primitive_batchers[_bilinear] = _batch
 
 
 def _cross_table() -> np.ndarray:
@@ -71,12 +152,16 @@ def _steiner_table() -> np.ndarray:
 
 _CROSS = _cross_table()
 QUATERNION = _quaternion_table()
-_cross = Bilinear(_CROSS)
+cross = Bilinear(_CROSS)
+"""a × b."""
 _multiply = Bilinear(QUATERNION)
 _rotation = Bilinear(_rotation_table())
-_cross_motion = Bilinear(_motion_table())
-_cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
-_momentum = Bilinear(_momentum_table())
+cross_motion = Bilinear(_motion_table())
+"""v × motion, the rate of a motion fixed to a body of velocity v."""
+cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
+"""v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
+momentum = Bilinear(_momentum_table())
+"""Inertia times motion."""
 _steiner = Bilinear(_steiner_table())
 
 
@@ -126,12 +211,12 @@ def _scale_jvp(primals, tangents):
     return _scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
 
 
-def rotate(matrix: Float[Array, "n 3 3"], x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
     """Return matrix times vector of each item."""
     return contract("nij,nj->ni", matrix, x)
 
 
-def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+def compose(p: _Matrices, q: _Matrices) -> _Matrices:
     """Return the matrix product of each item.
 
     Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices
@@ -141,7 +226,7 @@ def compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, 
 
 
 @jax.custom_jvp
-def _compose(p: Float[Array, "n 3 3"], q: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+def _compose(p: _Matrices, q: _Matrices) -> _Matrices:
     return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
 
@@ -151,18 +236,13 @@ def _compose_jvp(primals, tangents):
     return _compose(p, q), contract("nij,njk->nik", dp, q) + contract("nij,njk->nik", p, dq)
 
 
-def cross(a: Float[Array, "n 3"], b: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return a × b."""
-    return _cross(a, b)
-
-
 def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
     """Return the Hamilton product p q of quaternions (w, x, y, z); leading axes of any number are broadcast."""
     dtype = jnp.result_type(p, q)
     return _multiply(*jnp.broadcast_arrays(jnp.asarray(p, dtype), jnp.asarray(q, dtype)))
 
 
-def rotation_matrix(q: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
+def rotation_matrix(q: Float[Array, "n 4"]) -> _Matrices:
     """Return the matrix of v ↦ q v q*, a rotation if q has norm one; quadratic in q whatever its norm."""
     return _rotation(q, q).reshape(-1, 3, 3)
 
@@ -173,35 +253,39 @@ def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
     return scale(jax.lax.rsqrt(jnp.where(square == 0, 1.0, square)), q)
 
 
-def cross_motion(v: Float[Array, "n 6"], motion: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
-    """Return v × motion, the rate of a motion fixed to a body of velocity v."""
-    return _cross_motion(v, motion)
+def inertia_about(offset: _Vectors, mass: Float[Array, " n"], central: _Matrices) -> Float[Array, "n 10"]:
+    """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset (from the point), and mass.
 
-
-def cross_force(v: Float[Array, "n 6"], force: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
-    """Return v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
-    return _cross_force(v, force)
-
-
-def momentum(inertia: Float[Array, "n 10"], motion: Float[Array, "n 6"]) -> Float[Array, "n 6"]:
-    """Return inertia times motion."""
-    return _momentum(inertia, motion)
-
-
-def inertia_about(
-    offset: Float[Array, "n 3"], mass: Float[Array, " n"], central: Float[Array, "n 3 3"]
-) -> Float[Array, "n 10"]:
-    """Return the inertia about a point.
-
-    Args:
-        offset: from the point to the centre of mass (m).
-        mass: of each body (kg).
-        central: rotational inertia about the centre of mass, in world axes (kg m²).
-
-    Returns:
-        Rotational inertia about the point (xx, yy, zz, xy, xz, yz), mass times offset, and mass.
+    `central` is the rotational inertia about the centre of mass, in world axes (kg m²).
     """
     moment = scale(mass, offset)
     flat = central.reshape(-1, 9)
     entries = jnp.concatenate([flat[:, ::4], flat[:, 1:3], flat[:, 5:6]], axis=1)
     return jnp.concatenate([entries + _steiner(offset, moment), moment, mass[:, None]], axis=1)
+
+
+def conjugate(q: _Quaternions) -> _Quaternions:
+    """Return the conjugate quaternion, the inverse rotation of a unit quaternion."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+
+
+def exponential(rotation: Float[Array, "*batch 3"]) -> _Quaternions:
+    """Return the unit quaternion of a rotation vector (axis times angle, rad)."""
+    square = jnp.sum(rotation * rotation, axis=-1, keepdims=True)
+    small = square < _SERIES
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    half_sinc = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(0.5 * angle) / angle)
+    cosine = jnp.where(small, 1 - square / 8 + square**2 / 384, jnp.cos(0.5 * angle))
+    return jnp.concatenate([cosine, half_sinc * rotation], axis=-1)
+
+
+def logarithm(q: _Quaternions) -> Float[Array, "*batch 3"]:
+    """Return the rotation vector (rad) of a unit quaternion, of the shorter of the two turns."""
+    q = jnp.where(q[..., :1] < 0, -q, q)
+    sine = jnp.sum(q[..., 1:] ** 2, axis=-1, keepdims=True)
+    small = sine < _SERIES
+    norm = jnp.sqrt(jnp.where(small, 1.0, sine))
+    # angle / sin(angle / 2) as a series in sin² of the half angle, else in closed form.
+    series = 2 + sine / 3 + 3 * sine**2 / 20 + 5 * sine**3 / 56
+    scale = jnp.where(small, series, 2 * jnp.arctan2(norm, q[..., :1]) / norm)
+    return scale * q[..., 1:]

@@ -9,9 +9,9 @@ choose the better start.
 Matrix products ask for full precision, since NVIDIA GPUs otherwise round their factors to ten bits, contact Jacobians included.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, Literal, get_args
+import contextlib
+from collections.abc import Iterator
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,34 +22,31 @@ from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known_to_be
 from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
-from mjxgrad.dynamics.block import Block
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.implicit import System, Variant
-from mjxgrad.dynamics.inertia import Inertia, inertia_of
-from mjxgrad.dynamics.integrate import integrate_position
 from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
+from mjxgrad.dynamics.kinematics import Inertia, inertia_of, integrate_position
+from mjxgrad.dynamics.newton import System, Variant
 from mjxgrad.dynamics.onset import Onset, Partial, Shares
+from mjxgrad.dynamics.rows import Block, joined
 from mjxgrad.dynamics.smoothing import Smoothing, smoothed
 
+_Vector = Float[Array, " nv"]
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
 Gradient = Literal["discrete", "event"]
 
 
-def _at_full_precision(function: Callable[..., mjx.Data]) -> Callable[..., mjx.Data]:
-    @functools.wraps(function)
-    def wrapped(model: mjx.Model, data: mjx.Data, **settings: Any) -> mjx.Data:
-        if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
-            raise ValueError(
-                "model and data must be of MJX's JAX implementation, got "
-                f"{model.impl} and {data.impl}: create them with impl='jax'"
-            )
-        with jax.default_matmul_precision("highest"):
-            return function(model, data, **settings)
-
-    return wrapped
+@contextlib.contextmanager
+def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
+    if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
+        raise ValueError(
+            "model and data must be of MJX's JAX implementation, got "
+            f"{model.impl} and {data.impl}: create them with impl='jax'"
+        )
+    with jax.default_matmul_precision("highest"):
+        yield
 
 
 def check_gradient(gradient: str) -> None:
@@ -62,7 +59,6 @@ def check_gradient(gradient: str) -> None:
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
 
 
-@_at_full_precision
 def step(
     model: mjx.Model,
     data: mjx.Data,
@@ -100,18 +96,18 @@ def step(
     if onset is not None:
         onset.check(gradient)
     integrator = model.opt.integrator
-    if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, gradient, onset, smoothing)
-    data, blocks = _forward(model, data, onset, smoothing)
-    moving = events.correct(model, data, blocks) if gradient == "event" else data
-    if integrator == _Integrator.mjINT_EULER:
-        return _advance(model, data, _euler_acceleration(model, moving), None)
-    if integrator == _Integrator.mjINT_IMPLICITFAST:
-        return _advance(model, data, _implicit_acceleration(model, moving), None)
+    with _at_full_precision(model, data):
+        if integrator == _Integrator.mjINT_RK4:
+            return _runge_kutta(model, data, gradient, onset, smoothing)
+        data, blocks = _forward(model, data, onset, smoothing)
+        moving = events.correct(model, data, blocks) if gradient == "event" else data
+        if integrator == _Integrator.mjINT_EULER:
+            return _advance(model, data, _euler_acceleration(model, moving), None)
+        if integrator == _Integrator.mjINT_IMPLICITFAST:
+            return _advance(model, data, _implicit_acceleration(model, moving), None)
     raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>")
 
 
-@_at_full_precision
 def forward(
     model: mjx.Model, data: mjx.Data, *, onset: Onset | None = None, smoothing: Smoothing | None = None
 ) -> mjx.Data:
@@ -135,7 +131,8 @@ def forward(
         smoothing.check("discrete")
     if onset is not None:
         onset.check("discrete")
-    return _forward(model, data, onset, smoothing)[0]
+    with _at_full_precision(model, data):
+        return _forward(model, data, onset, smoothing)[0]
 
 
 def _forward(
@@ -161,7 +158,6 @@ def _forward(
     return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
 
 
-@_at_full_precision
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find the acceleration and the constraint forces; a drop-in for `mjx.solve`.
 
@@ -177,23 +173,23 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX.
     """
-    layout, impl = assembly.row_layout(model, data), data._impl
-    rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
-    entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
-    active = jnp.ones(layout.num_rows, bool)
-    system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
-    return _minimum(model, data, layout, system, _start(model, data))
+    with _at_full_precision(model, data):
+        layout, impl = assembly.row_layout(model, data), data._impl
+        rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
+        entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
+        active = jnp.ones(layout.num_rows, bool)
+        system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
+        return _minimum(model, data, layout, system, _start(model, data))
 
 
 def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowLayout, System | None]:
     """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
     layout = assembly.row_layout(model, data)
-    return layout, assembly.system_of(model, data, layout, assembly.joined(blocks)) if blocks else None
+    return layout, assembly.system_of(model, data, layout, joined(blocks)) if blocks else None
 
 
-def _start(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
-    return data.qacc_smooth if cold else data.qacc_warmstart
+def _start(model: mjx.Model, data: mjx.Data) -> _Vector:
+    return data.qacc_smooth if model.opt.disableflags & _Disable.mjDSBL_WARMSTART else data.qacc_warmstart
 
 
 def _smoothed_solve(
@@ -206,13 +202,7 @@ def _smoothed_solve(
 ) -> mjx.Data:
     """Solve with rows under noise; in backward mode without it, but for the derivative.
 
-    Args:
-        model: with the solver's options.
-        data: with all smooth forces.
-        blocks: the rows as MuJoCo has them.
-        begun: as they act for a part of the step, and
-        shares: for which.
-        smoothing: the noise.
+    `blocks` are the rows as MuJoCo has them, `begun` as they act for a part of the step, and `shares` for which.
     """
     is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
@@ -221,18 +211,16 @@ def _smoothed_solve(
     if uncertain is None or not model.nv:
         return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)
     soft = assembly.make_constraint(model, data, blocks)
-    system = assembly.system_of(model, data, layout, assembly.joined(blocks), uncertain)
+    system = assembly.system_of(model, data, layout, joined(blocks), uncertain)
     if is_forward:
         return _minimum(model, soft, layout, system, _start(model, data), partial)
     fixed_model, fixed_data, given, partial = jax.lax.stop_gradient((model, data, begun, partial))
     hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), partial)
     soft = _minimum(model, soft, layout, system, hard.qacc)
 
-    def forces_of(data: mjx.Data) -> dict[str, Array]:
-        return {"qacc": data.qacc, "qfrc_constraint": data.qfrc_constraint, "_impl.efc_force": data._impl.efc_force}
-
-    changed = _with_derivative_of(forces_of(hard), forces_of(soft))
-    return data.tree_replace({**changed, "_impl.solver_niter": hard._impl.solver_niter})  # pyright: ignore[reportReturnType]
+    found = [(one.qacc, one.qfrc_constraint, one._impl.efc_force) for one in (hard, soft)]
+    acceleration, total, force = _with_derivative_of(*found)
+    return _solved(data, acceleration, total, force, hard._impl.solver_niter)
 
 
 @jax.custom_jvp
@@ -251,7 +239,7 @@ def _minimum(
     data: mjx.Data,
     layout: RowLayout,
     system: System | None,
-    start: Float[Array, " nv"],
+    start: _Vector,
     partial: Partial | None = None,
 ) -> mjx.Data:
     """Return data with the acceleration, and the forces of the rows, at which all are in balance."""
@@ -280,14 +268,12 @@ def _minimum(
         acceleration, force, total = (
             x[1] + partial.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(partial.variants, both))
         )
-    return data.tree_replace(  # pyright: ignore[reportReturnType]
-        {
-            "qacc": acceleration,
-            "qfrc_constraint": total,
-            "_impl.efc_force": force,
-            "_impl.solver_niter": num_iterations.astype(data._impl.solver_niter.dtype),
-        }
-    )
+    return _solved(data, acceleration, total, force, num_iterations.astype(data._impl.solver_niter.dtype))
+
+
+def _solved(data: mjx.Data, acceleration: Array, total: Array, force: Array, num_iterations: Array) -> mjx.Data:
+    found = {"_impl.efc_force": force, "_impl.solver_niter": num_iterations}
+    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **found})  # pyright: ignore[reportReturnType]
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
@@ -308,7 +294,7 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
-def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
 
     (M + h D) a' = M a, and M a the sum of all forces, is a' = a - (M + h D)⁻¹ h D a: so the forces need not be added up, nor
@@ -325,7 +311,7 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     return data.qacc - slowed
 
 
-def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with the velocity derivative of the smooth forces taken implicitly."""
     derivative = mjx.deriv_smooth_vel(model, data)
     if derivative is None:
@@ -334,12 +320,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> Float[Array, " n
     return cholesky.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
 
 
-def _advance(
-    model: mjx.Model,
-    data: mjx.Data,
-    acceleration: Float[Array, " nv"],
-    velocity: Float[Array, " nv"] | None,
-) -> mjx.Data:
+def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: _Vector | None) -> mjx.Data:
     """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
     # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.
     bare = model.tree_replace({"opt.disableflags": model.opt.disableflags | _Disable.mjDSBL_EULERDAMP})

@@ -19,11 +19,7 @@ _SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 class Run:
     """Neighbouring joints of one type. Their coordinates are neighbours too, so a slice and a reshape gather them.
 
-    Attributes:
-        kind: the type.
-        joints: their place among the joints.
-        qpos: their place among the positions.
-        width: positions per joint.
+    `width` is the number of positions per joint.
     """
 
     kind: mujoco.mjtJoint
@@ -105,25 +101,12 @@ def frames(model: mjx.Model) -> Frames:
             previous.append(last)
             last = len(body) - 1
         of_body[b] = last
-    return Frames(
-        body=np.array(body, int),
-        joint=np.array(joint, int),
-        mocap=np.array(mocap, int),
-        jumps=_jumps(np.array(previous, int)),
-        of_body=of_body,
-        before_body=before_body,
-        before_joint=before_joint,
-        is_first=is_first,
-        after_joint=after_joint,
-    )
-
-
-def _jumps(previous: np.ndarray) -> tuple[np.ndarray, ...]:
-    jumps = []
-    while (previous >= 0).any():
-        jumps.append(previous)
-        previous = np.where(previous >= 0, previous[previous], -1)
-    return tuple(jumps)
+    jumps, before = [], np.array(previous, int)
+    while (before >= 0).any():
+        jumps.append(before)
+        before = np.where(before >= 0, before[before], -1)
+    body, joint, mocap = (np.array(x, int) for x in (body, joint, mocap))
+    return Frames(body, joint, mocap, tuple(jumps), of_body, before_body, before_joint, is_first, after_joint)
 
 
 def joints_of(model: mjx.Model, body: int) -> range:

@@ -1,10 +1,9 @@
 """Plans through contact: trajectory optimisation and search trees, both on smoothed linear models."""
 
 from mjxgrad.planning.cost import Cost, GoalCost
-from mjxgrad.planning.linear_model import LinearModel
-from mjxgrad.planning.models import Analytic, Exact, Sampled, Smoother
+from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import FunctionSystem, SceneSystem, System
-from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
+from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
 from mjxgrad.planning.tree import Path, Sampling, Search, path, search
 
 __all__ = [
@@ -26,4 +25,5 @@ __all__ = [
     "optimise_trajectory",
     "path",
     "search",
+    "shifted",
 ]

@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad.planning.system import System
+from mjxgrad.planning.system import ControlVector, StateVector, System
 
 
 class Cost(eqx.Module):
     """A cost of states and controls; a subclass gives `stage` and `terminal`, twice differentiable."""
 
     @abstractmethod
-    def stage(self, system: System, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, ""]:
+    def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
         """Return the cost of one step."""
 
     @abstractmethod
-    def terminal(self, system: System, state: Float[Array, " state"]) -> Float[Array, ""]:
+    def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
         """Return the cost of the last state."""
 
     def total(
@@ -40,35 +40,28 @@ class GoalCost(Cost):
         resting: the control that costs nothing.
     """
 
-    goal: Float[Array, " state"]
+    goal: StateVector
     stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     resting: Float[ArrayLike, "..."] = 0.0
 
-    def stage(self, system: System, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, ""]:
-        """Return half the weighted square of the distance and of the control."""
+    def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
         distance, effort = system.difference(state, self.goal), control - self.resting
         return 0.5 * (jnp.sum(self.stage_weight * distance**2) + jnp.sum(self.control_weight * effort**2))
 
-    def terminal(self, system: System, state: Float[Array, " state"]) -> Float[Array, ""]:
-        """Return half the weighted square of the distance."""
+    def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
         return 0.5 * jnp.sum(self.terminal_weight * system.difference(state, self.goal) ** 2)
 
 
 class Quadratic(eqx.Module):
-    """A convex quadratic model in changes of state and control; the terminal one has no control.
-
-    Attributes:
-        gradient: of all coordinates, those of the state first.
-        hessian: likewise, positive semidefinite.
-    """
+    """A convex quadratic model in changes of state and then control; the terminal one has no control."""
 
     gradient: Float[Array, " both"]
     hessian: Float[Array, "both both"]
 
 
-def stage_model(cost: Cost, system: System, state: Float[Array, " state"], control: Float[Array, " m"]) -> Quadratic:
+def stage_model(cost: Cost, system: System, state: StateVector, control: ControlVector) -> Quadratic:
     """Expand the cost of a step around a state and a control."""
     n = system.num_changes
 
@@ -78,11 +71,10 @@ def stage_model(cost: Cost, system: System, state: Float[Array, " state"], contr
     return _model(moved, jnp.zeros(n + control.size, state.dtype))
 
 
-def terminal_model(cost: Cost, system: System, state: Float[Array, " state"]) -> Quadratic:
+def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
     """Expand the cost of the last state around it."""
-    return _model(
-        lambda change: cost.terminal(system, system.retract(state, change)), jnp.zeros(system.num_changes, state.dtype)
-    )
+    at = jnp.zeros(system.num_changes, state.dtype)
+    return _model(lambda change: cost.terminal(system, system.retract(state, change)), at)
 
 
 def _model(function, at: Float[Array, " both"]) -> Quadratic:

@@ -11,7 +11,10 @@ Three ways to the same model: `first_order` averages Jacobians and misses what t
 `gradient="discrete"` the moving time of an impact); `zeroth_order` fits a plane to samples of f and misses nothing, at the
 price of noise; `analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
 distance of contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it
-agrees with the others as far as a contact's impedance is small against one.
+agrees with the others as far as a contact's impedance is small against one. A `Smoother` is one of them, with its noise.
+
+Standard deviations are a number or one per coordinate of a change or per control, at least 0; one that does not fit, or too few
+samples, are refused (ValueError). A key is consumed. With `wrt_state=False` A has no columns, and the state's noise still acts.
 
 References:
     Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
@@ -19,13 +22,24 @@ References:
     Models. T-RO 2023, arXiv:2206.10787 (the analytic way).
 """
 
+from abc import abstractmethod
+from typing import Any, Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad.planning.system import System
+from mjxgrad._static import is_known
+from mjxgrad.contact.parameters import ContactPair
+from mjxgrad.dynamics import Smoothing
+from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
+from mjxgrad.scene.contact_check import name_pairs
+
+_Samples = Float[Array, "N both"]
+_Errors = Float[Array, "n columns"]
 
 
 class LinearModel(eqx.Module):
@@ -42,29 +56,129 @@ class LinearModel(eqx.Module):
             all numbers are NaN.
     """
 
-    A: Float[Array, "n columns"]
+    A: _Errors
     B: Float[Array, "n m"]
-    c: Float[Array, " state"]
-    A_error: Float[Array, "n columns"]
+    c: StateVector
+    A_error: _Errors
     B_error: Float[Array, "n m"]
-    c_error: Float[Array, " n"]
+    c_error: ChangeVector
     finite_fraction: Float[Array, ""]
 
 
-def analytic(
-    system: System, state: Float[Array, " state"], control: Float[Array, " m"], *, wrt_state: bool = True
-) -> LinearModel:
-    """Linearise the step itself; with `SceneSystem.smoothing` that is the smoothed solver's, without it the plain one's.
+class Smoother(eqx.Module):
+    """A smoothed step and its derivative. The same key gives the same step, so that costs can be compared."""
 
-    Args:
-        system: what to linearise.
-        state: where.
-        control: under which control.
-        wrt_state: whether A is wanted.
+    @abstractmethod
+    def step(self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray) -> StateVector:
+        """Return the next state of the smoothed system."""
 
-    Returns:
-        The model, without sampling error.
+    @abstractmethod
+    def linear_model(
+        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray, *, wrt_state: bool = True
+    ) -> LinearModel:
+        """Return the linear model of the smoothed system."""
+
+    @abstractmethod
+    def scaled(self, factor: ArrayLike) -> "Smoother":
+        """Give the smoother with its lengths and standard deviations multiplied."""
+
+    def warnings(self, system: System, start: StateVector) -> list[str]:
+        """Say what this smoothing does to a start besides; nothing for numbers that are traced."""
+        return []
+
+
+class Analytic(Smoother):
+    """Contacts averaged in the solver; without sampling, so each key gives the same.
+
+    Attributes:
+        smoothing: of contacts and limits; None is the system as it is.
     """
+
+    smoothing: Smoothing | None
+
+    def step(self, system, state, control, key):
+        return system.with_smoothing(self.smoothing).step(state, control)
+
+    def linear_model(self, system, state, control, key, *, wrt_state=True):
+        return analytic(system.with_smoothing(self.smoothing), state, control, wrt_state=wrt_state)
+
+    def scaled(self, factor: ArrayLike) -> "Analytic":
+        # The lengths are its only leaves.
+        return jax.tree.map(lambda length: factor * length, self)
+
+    def warnings(self, system: System, start: StateVector) -> list[str]:
+        if self.smoothing is None or not isinstance(system, SceneSystem) or not is_known(start):
+            return []
+        resting = _resting(system, np.asarray(start, float))
+        if not resting:
+            return []
+        return [
+            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then holds at a distance, "
+            "and bodies that should slide or roll hardly move; for planning give them condim=1, or take Sampled"
+        ]
+
+
+class Exact(Analytic):
+    """No smoothing: the system as it is."""
+
+    smoothing: Smoothing | None = None
+
+
+class Sampled(Smoother):
+    """The mean over samples of noise on state and control.
+
+    Attributes:
+        stddev_state: of the noise on the state, a number or one per coordinate of a change.
+        stddev_control: of the noise on the control, a number or one per control.
+        num_samples: per step and linear model; in all `1 + 2 num_samples` steps for a step, `1 + num_samples` for a model.
+        order: "first" averages Jacobians, "zeroth" fits a plane.
+    """
+
+    stddev_state: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
+    stddev_control: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
+    num_samples: int = eqx.field(static=True)
+    order: Literal["first", "zeroth"] = eqx.field(static=True, default="zeroth")
+
+    def __check_init__(self):
+        if self.order not in ("first", "zeroth"):
+            raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
+
+    def _noise(self) -> dict[str, Any]:
+        names = ("stddev_state", "stddev_control", "num_samples")
+        return {name: getattr(self, name) for name in names}
+
+    def step(self, system, state, control, key):
+        return mean_step(system, state, control, key, **self._noise())
+
+    def linear_model(self, system, state, control, key, *, wrt_state=True):
+        if self.order == "zeroth":
+            return zeroth_order(system, state, control, key, **self._noise())
+        return first_order(system, state, control, key, wrt_state=wrt_state, **self._noise())
+
+    def scaled(self, factor: ArrayLike) -> "Sampled":
+        return Sampled(factor * self.stddev_state, factor * self.stddev_control, self.num_samples, self.order)
+
+
+def _resting(system: SceneSystem, start: np.ndarray) -> list[ContactPair]:
+    """Return the pairs with friction of something fixed that touch at a start, by C MuJoCo; none of a traced scene."""
+    scene = system.scene
+    if not all(is_known(leaf) for leaf in (scene.model.geom_size, scene.model.body_pos, scene.model.geom_pos)):
+        return []
+    model = scene.to_mujoco()
+    data = mujoco.MjData(model)
+    data.qpos[:] = start[: model.nq]
+    mujoco.mj_fwdPosition(model, data)
+    touching = {frozenset(geoms) for geoms in data.contact.geom.tolist()}
+    is_fixed = model.body_weldid[model.geom_bodyid] == 0
+    return [
+        pair
+        for pair in scene.pairs
+        if pair.condim > 1 and {pair.geom1, pair.geom2} in touching and is_fixed[[pair.geom1, pair.geom2]].any()
+    ]
+
+
+def analytic(system: System, state: StateVector, control: ControlVector, *, wrt_state: bool = True) -> LinearModel:
+    """Linearise the step itself; with `SceneSystem.smoothing` that is the smoothed solver's, without it the plain one's."""
     noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
     jacobian, ends = _linearised(system, state, control, noise, wrt_state)
     change, jacobian = _changes(system, ends, ends[0], jacobian)
@@ -75,8 +189,8 @@ def analytic(
 
 def first_order(
     system: System,
-    state: Float[Array, " state"],
-    control: Float[Array, " m"],
+    state: StateVector,
+    control: ControlVector,
     key: PRNGKeyArray,
     *,
     stddev_state: ArrayLike = 0.0,
@@ -84,26 +198,10 @@ def first_order(
     num_samples: int,
     wrt_state: bool = True,
 ) -> LinearModel:
-    """Average Jacobians over samples of the noise.
+    """Average Jacobians over at least 2 samples of the noise.
 
     The mean next state is that of the samples less what their mean Jacobian explains of it (each sample's own left out), so
     that noise adds nothing to a linear step: A, B and c are then exact.
-
-    Args:
-        system: what to linearise.
-        state: where.
-        control: around which control.
-        key: consumed here.
-        stddev_state: of the noise on the state, a number or one per coordinate of a change; at least 0.
-        stddev_control: of the noise on the control, a number or one per control; at least 0.
-        num_samples: at least 2.
-        wrt_state: whether A is wanted; the state's noise acts in any case.
-
-    Returns:
-        The model.
-
-    Raises:
-        ValueError: if a standard deviation is negative or does not fit, or there are too few samples.
     """
     stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
     _check_count(num_samples, 2)
@@ -124,8 +222,8 @@ def first_order(
 
 def zeroth_order(
     system: System,
-    state: Float[Array, " state"],
-    control: Float[Array, " m"],
+    state: StateVector,
+    control: ControlVector,
     key: PRNGKeyArray,
     *,
     stddev_state: ArrayLike,
@@ -136,23 +234,8 @@ def zeroth_order(
 
     Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
     Its errors do not assume that the samples scatter alike everywhere (White's, with leverage taken out, HC3), for across a
-    contact they do not.
-
-    Args:
-        system: what to linearise; it need not have derivatives.
-        state: where.
-        control: around which control.
-        key: consumed here.
-        stddev_state: of the noise on the state, a number or one per coordinate of a change; where it is 0 the step is not
-            seen to vary, and that column of A is zero, with an infinite error.
-        stddev_control: of the noise on the control, likewise for B.
-        num_samples: at least two more than there are coordinates of state and control.
-
-    Returns:
-        The model.
-
-    Raises:
-        ValueError: if a standard deviation is negative or does not fit, or there are too few samples.
+    contact they do not. It takes at least two samples more than there are coordinates of state and control; where the noise
+    is 0 the step is not seen to vary, and that column is zero, with an infinite error.
     """
     stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
     least = stddev.size + 2
@@ -182,30 +265,17 @@ def zeroth_order(
 
 def mean_step(
     system: System,
-    state: Float[Array, " state"],
-    control: Float[Array, " m"],
+    state: StateVector,
+    control: ControlVector,
     key: PRNGKeyArray,
     *,
     stddev_state: ArrayLike = 0.0,
     stddev_control: ArrayLike = 0.0,
     num_samples: int,
-) -> Float[Array, " state"]:
-    """Return the mean next state under noise. The same key gives the same noise: as a function of the state it is one map.
+) -> StateVector:
+    """Return the mean next state over the finite ones under noise. As a function of the state it is one map for each key.
 
-    Args:
-        system: what to step.
-        state: where.
-        control: around which control.
-        key: consumed here.
-        stddev_state: of the noise on the state, as for `first_order`.
-        stddev_control: of the noise on the control.
-        num_samples: at least 1. Each is taken with its mirror image, so that a linear step is averaged without error.
-
-    Returns:
-        The mean of the samples that are finite.
-
-    Raises:
-        ValueError: if a standard deviation is negative or does not fit, or there is no sample.
+    Each of at least 1 sample is taken with its mirror image, so that a linear step is averaged without error.
     """
     stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
     _check_count(num_samples, 1)
@@ -216,34 +286,28 @@ def mean_step(
     return system.retract(nominal, mean)
 
 
-def _perturbed(
-    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, " both"]
-) -> Float[Array, " state"]:
+def _perturbed(system: System, state: StateVector, control: ControlVector, noise: Float[Array, " both"]) -> StateVector:
     """Return the next state under noise on state and control."""
     n = system.num_changes
     return system.step(system.retract(state, noise[:n]), control + noise[n:])
 
 
 def _sampled(
-    system: System, state: Float[Array, " state"], control: Float[Array, " m"], noise: Float[Array, "N both"]
-) -> tuple[Float[Array, " state"], Float[Array, "N n"]]:
+    system: System, state: StateVector, control: ControlVector, noise: _Samples
+) -> tuple[StateVector, Float[Array, "N n"]]:
     """Return the next state without noise, and how far from it those with noise are."""
     ends = jax.vmap(lambda w: _perturbed(system, state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
     return ends[0], jax.vmap(lambda end: system.difference(end, ends[0]))(ends[1:])
 
 
 def _linearised(
-    system: System,
-    state: Float[Array, " state"],
-    control: Float[Array, " m"],
-    noise: Float[Array, "N both"],
-    wrt_state: bool,
+    system: System, state: StateVector, control: ControlVector, noise: _Samples, wrt_state: bool
 ) -> tuple[Float[Array, "N state columns"], Float[Array, "N state"]]:
     """Return, for each sample of noise, the derivative of the next state, and that state."""
     columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
 
-    def sample(noise: Float[Array, " both"]) -> tuple[Float[Array, "state columns"], Float[Array, " state"]]:
-        def moved(change: Float[Array, " columns"]) -> tuple[Float[Array, " state"], Float[Array, " state"]]:
+    def sample(noise):
+        def moved(change):
             end = _perturbed(system, state, control, noise.at[columns].add(change))
             return end, end
 
@@ -253,18 +317,12 @@ def _linearised(
 
 
 def _changes(
-    system: System,
-    ends: Float[Array, "N state"],
-    nominal: Float[Array, " state"],
-    jacobian: Float[Array, "N state columns"],
+    system: System, ends: Float[Array, "N state"], nominal: StateVector, jacobian: Float[Array, "N state columns"]
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n columns"]]:
     """Return states and their derivatives as changes of the nominal one."""
 
-    def one(end: Float[Array, " state"], jacobian: Float[Array, "state columns"]):
-        def change(end: Float[Array, " state"]) -> Float[Array, " n"]:
-            return system.difference(end, nominal)
-
-        return change(end), jax.jacfwd(change)(end) @ jacobian
+    def one(end, jacobian):
+        return system.difference(end, nominal), jax.jacfwd(system.difference)(end, nominal) @ jacobian
 
     return jax.vmap(one)(ends, jacobian)
 
@@ -282,11 +340,11 @@ def _mean(
 
 def _model(
     system: System,
-    nominal: Float[Array, " state"],
-    jacobian: Float[Array, "n columns"],
-    jacobian_error: Float[Array, "n columns"],
-    change: Float[Array, " n"],
-    change_error: Float[Array, " n"],
+    nominal: StateVector,
+    jacobian: _Errors,
+    jacobian_error: _Errors,
+    change: ChangeVector,
+    change_error: ChangeVector,
     is_finite: Bool[Array, " N"],
     *,
     least: int,
@@ -298,15 +356,9 @@ def _model(
         jnp.where(exists, x, jnp.nan) for x in (jacobian, jacobian_error, change, change_error)
     )
     columns = jacobian.shape[1] - num_controls
-    return LinearModel(
-        A=jacobian[:, :columns],
-        B=jacobian[:, columns:],
-        c=system.retract(nominal, change),
-        A_error=jacobian_error[:, :columns],
-        B_error=jacobian_error[:, columns:],
-        c_error=change_error,
-        finite_fraction=is_finite.mean(dtype=jacobian.dtype),
-    )
+    (A, B), (A_error, B_error) = (jnp.split(x, [columns], axis=1) for x in (jacobian, jacobian_error))
+    fraction = is_finite.mean(dtype=jacobian.dtype)
+    return LinearModel(A, B, system.retract(nominal, change), A_error, B_error, change_error, fraction)
 
 
 def _stddev(system: System, state: ArrayLike, control: ArrayLike, dtype: jnp.dtype) -> Float[Array, " both"]:

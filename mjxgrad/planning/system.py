@@ -11,14 +11,19 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State
 from mjxgrad.dynamics import Smoothing, step
-from mjxgrad.dynamics.integrate import integrate_position, position_change
+from mjxgrad.dynamics.kinematics import integrate_position, position_change
 from mjxgrad.scene import Scene
 from mjxgrad.task import as_pytree
+
+StateVector = Float[Array, " state"]
+ControlVector = Float[Array, " m"]
+ChangeVector = Float[Array, " n"]
 
 
 class System(eqx.Module):
@@ -35,16 +40,36 @@ class System(eqx.Module):
     num_controls: eqx.AbstractVar[int]
 
     @abstractmethod
-    def step(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, " state"]:
+    def step(self, state: StateVector, control: ControlVector) -> StateVector:
         """Return the next state."""
 
-    def retract(self, state: Float[Array, " state"], change: Float[Array, " n"]) -> Float[Array, " state"]:
+    def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         """Return the state moved by a change."""
         return state + change
 
-    def difference(self, end: Float[Array, " state"], start: Float[Array, " state"]) -> Float[Array, " n"]:
+    def difference(self, end: StateVector, start: StateVector) -> ChangeVector:
         """Return the change that moves `start` to `end`; the inverse of `retract`."""
         return end - start
+
+    def __hash__(self) -> int:
+        # `jax.jit(system.step)` asks for one, and arrays have none.
+        return id(self)
+
+    @property
+    def control_limits(self) -> tuple[ControlVector, ControlVector]:
+        """The least and the largest control; infinite where there is no limit."""
+        unlimited = jnp.full(self.num_controls, jnp.inf)
+        return -unlimited, unlimited
+
+    def limits(
+        self, lower: ArrayLike | None, upper: ArrayLike | None, dtype: jnp.dtype
+    ) -> tuple[ControlVector, ControlVector]:
+        """Return limits, a number or one per control, for each control; `control_limits` where there is None."""
+        low, high = (
+            jnp.broadcast_to(jnp.asarray(own if given is None else given, dtype), (self.num_controls,))
+            for given, own in zip((lower, upper), self.control_limits, strict=True)
+        )
+        return low, high
 
     def with_smoothing(self, smoothing: Smoothing | None) -> "System":
         """Give the system with another analytic smoothing of its contacts.
@@ -52,6 +77,8 @@ class System(eqx.Module):
         Raises:
             ValueError: if the system has no contacts to smooth.
         """
+        if smoothing is None:
+            return self
         raise ValueError(
             f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: "
             "take samples, by first_order or zeroth_order"
@@ -65,17 +92,16 @@ class FunctionSystem(System):
         function: from state and control to the next state.
     """
 
-    function: Callable[[Float[Array, " n"], Float[Array, " m"]], Float[Array, " n"]] = eqx.field(converter=as_pytree)
+    function: Callable[[ChangeVector, ControlVector], ChangeVector] = eqx.field(converter=as_pytree)
     num_changes: int = eqx.field(static=True)
     num_controls: int = eqx.field(static=True)
 
     @property
     def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give the number of all states."""
+        """The number of all states."""
         return self.num_changes
 
-    def step(self, state: Float[Array, " n"], control: Float[Array, " m"]) -> Float[Array, " n"]:
-        """Return the function's value."""
+    def step(self, state: ChangeVector, control: ControlVector) -> ChangeVector:
         return self.function(state, control)
 
 
@@ -103,25 +129,26 @@ class SceneSystem(System):
 
     @property
     def num_changes(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give twice the degrees of freedom, and the number of activations."""
         return 2 * self.scene.model.nv + self.scene.model.na
 
     @property
     def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give the degrees of freedom."""
         return self.scene.model.nv
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give the number of actuators."""
         return self.scene.model.nu
 
     @property
-    def duration(self) -> Float[Array, ""]:
-        """How long a step of the system takes (s)."""
-        return self.num_substeps * self.scene.model.opt.timestep
+    def control_limits(self) -> tuple[ControlVector, ControlVector]:
+        """The actuators' `ctrlrange`, infinite where they have none."""
+        is_limited, ranges = (
+            np.asarray(self.scene.model.actuator_ctrllimited, bool),
+            self.scene.model.actuator_ctrlrange,
+        )
+        return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
 
-    def flatten(self, state: State) -> Float[Array, " state"]:
+    def flatten(self, state: State) -> StateVector:
         """Return a rollout's state as a vector; time and warm start are left out."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
@@ -129,27 +156,31 @@ class SceneSystem(System):
         """Return the qpos of states."""
         return state[..., : self.scene.model.nq]
 
-    def step(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> Float[Array, " state"]:
-        """Return the state after `num_substeps` time steps under the same control."""
-        data = self._data(state, control)
+    def step(self, state: StateVector, control: ControlVector) -> StateVector:
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        data = self.scene.data.replace(
+            qpos=state[:nq],
+            qvel=state[nq : nq + nv],
+            act=state[nq + nv :],
+            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
+            ctrl=control,
+        )
 
         def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
             # Only what the next step needs is carried: the rest of Data would be copied in every turn.
-            moved = self._advance(data)
+            moved = step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
             names = ("qpos", "qvel", "act", "qacc_warmstart")
             return data.replace(**{name: getattr(moved, name) for name in names}), None
 
         data, _ = jax.lax.scan(advance, data, None, length=self.num_substeps)
         return jnp.concatenate([data.qpos, data.qvel, data.act])
 
-    def retract(self, state: Float[Array, " state"], change: Float[Array, " n"]) -> Float[Array, " state"]:
-        """Return the state moved by a change; quaternions turn in their own frame."""
+    def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv
         qpos = integrate_position(self.scene.model, state[:nq], change[:nv], 1.0)
         return jnp.concatenate([qpos, state[nq:] + change[nv:]])
 
-    def difference(self, end: Float[Array, " state"], start: Float[Array, " state"]) -> Float[Array, " n"]:
-        """Return the change that moves `start` to `end`."""
+    def difference(self, end: StateVector, start: StateVector) -> ChangeVector:
         nq = self.scene.model.nq
         moved = position_change(self.scene.model, start[:nq], end[:nq])
         return jnp.concatenate([moved, end[nq:] - start[nq:]])
@@ -157,16 +188,3 @@ class SceneSystem(System):
     def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
         """Give the system with another smoothing; None takes it away."""
         return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
-
-    def _advance(self, data: mjx.Data) -> mjx.Data:
-        return step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
-
-    def _data(self, state: Float[Array, " state"], control: Float[Array, " m"]) -> mjx.Data:
-        nq, nv = self.scene.model.nq, self.scene.model.nv
-        return self.scene.data.replace(
-            qpos=state[:nq],
-            qvel=state[nq : nq + nv],
-            act=state[nq + nv :],
-            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
-            ctrl=control,
-        )

@@ -1,20 +1,31 @@
 """Trajectory optimisation on smoothed linear models, whose smoothing decreases as the plan improves."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad.planning.backward import Feedback, backward_pass
-from mjxgrad.planning.cost import Cost, stage_model, terminal_model
-from mjxgrad.planning.models import Smoother
-from mjxgrad.planning.system import System
+from mjxgrad.planning.cost import Cost, Quadratic, stage_model, terminal_model
+from mjxgrad.planning.linear_model import LinearModel, Smoother
+from mjxgrad.planning.system import ControlVector, System
 
+_Row = Float[Array, "*iterations"]
+_Scalar = Float[Array, ""]
+_Matrix = Float[Array, "m m"]
+_Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 # A plan has converged once its model promises to lower the cost by no more than this share of it.
 _TOLERANCE = 1e-4
+# Below this many units of rounding of the largest one, an influence of controls on a coordinate is none.
+_ROUNDINGS = 100
+# Newton steps of the projected method. Each settles bounds that are active for good, or shortens the way by backtracking; two or
+# three suffice for a few controls, and the rest cost nothing beside a step of the dynamics.
+_NEWTON_STEPS = 12
+_SHORTENING = 0.5 ** np.arange(8)
 
 
 class Iterations(eqx.Module):
@@ -30,13 +41,13 @@ class Iterations(eqx.Module):
         finite_fraction: the least share of finite samples behind a linear model.
     """
 
-    factor: Float[Array, "*iterations"]
-    smoothed_cost: Float[Array, "*iterations"]
-    cost: Float[Array, "*iterations"]
-    step: Float[Array, "*iterations"]
-    promised: Float[Array, "*iterations"]
-    regularisation: Float[Array, "*iterations"]
-    finite_fraction: Float[Array, "*iterations"]
+    factor: _Row
+    smoothed_cost: _Row
+    cost: _Row
+    step: _Row
+    promised: _Row
+    regularisation: _Row
+    finite_fraction: _Row
 
 
 class Plan(eqx.Module):
@@ -49,26 +60,57 @@ class Plan(eqx.Module):
         start_cost: of the controls that were given.
         cost: of the best ones, never above `start_cost`; both without smoothing.
         iterations: the course.
-        converged: whether the last model promised almost nothing more.
+        unmoved: coordinates of a change of the state that cost something and that no control moves, by the last model. There
+            nothing is touched: their derivatives are zero, and no iteration can improve on them.
+        converged: whether the last model promised almost nothing more; never where a coordinate is unmoved.
         diverged: whether the smoothed system left finite numbers, so that iterations were lost.
     """
 
-    controls: Float[Array, "horizon m"]
+    controls: _Controls
     states: Float[Array, "states state"]
     gain: Float[Array, "horizon m n"]
-    start_cost: Float[Array, ""]
-    cost: Float[Array, ""]
+    start_cost: _Scalar
+    cost: _Scalar
     iterations: Iterations
+    unmoved: Bool[Array, " n"]
     converged: Bool[Array, ""]
     diverged: Bool[Array, ""]
+
+    def verdict(self) -> str:
+        """Say in one sentence how it ended; on the host, of a single plan."""
+        if self.unmoved.any():
+            return (
+                f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
+                "which cost, so their derivatives are zero; begin with controls that touch, or smooth by Analytic or Sampled"
+            )
+        if self.diverged:
+            return "the smoothed system left finite numbers; take smaller steps of time, or tighter limits"
+        return "converged" if self.converged else "not converged; take more iterations"
+
+
+class Feedback(eqx.Module):
+    """The law du = step k + K dx around a trajectory; rows of K of controls that a limit holds are zero.
+
+    `slope` and `curvature` are the derivatives of the cost by the step at 0; it is sound if every step's program was solved.
+    """
+
+    change: _Controls
+    gain: Float[Array, "horizon m n"]
+    slope: _Scalar
+    curvature: _Scalar
+    is_sound: Bool[Array, ""]
+
+    def promised(self, step: ArrayLike = 1.0) -> _Scalar:
+        """Return by how much the model says that the cost falls."""
+        return -jnp.asarray(step) * (self.slope + 0.5 * jnp.asarray(step) * self.curvature)
 
 
 class _Course(eqx.Module):
     """A trajectory, its controls and its cost."""
 
     states: Float[Array, "states state"]
-    controls: Float[Array, "horizon m"]
-    cost: Float[Array, ""]
+    controls: _Controls
+    cost: _Scalar
 
 
 class _Problem(eqx.Module):
@@ -78,8 +120,8 @@ class _Problem(eqx.Module):
     cost: Cost
     smoother: Smoother
     keys: Key[Array, " horizon"]
-    lower: Float[Array, " m"]
-    upper: Float[Array, " m"]
+    lower: ControlVector
+    upper: ControlVector
 
     def run(self, smoother: Smoother | None, course: _Course, law: Feedback, step: ArrayLike) -> _Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
@@ -100,19 +142,15 @@ class _Problem(eqx.Module):
         cost = self.cost.total(self.system, states, controls)
         return _Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def law(self, smoother: Smoother, course: _Course, regularisation: Float[Array, ""]):
-        """Return the feedback law around a course, and the least share of finite samples."""
+    def law(self, smoother: Smoother, course: _Course, regularisation: _Scalar):
+        """Return the feedback law around a course, the least share of finite samples, and which coordinates are unmoved."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
-
-        def model(state, control, key):
-            return smoother.linear_model(system, state, control, key)
-
-        models = jax.vmap(model)(states[:-1], controls, self.keys)
-        stages = jax.vmap(lambda state, control: stage_model(cost, system, state, control))(states[:-1], controls)
+        models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
+        stages = jax.vmap(lambda *at: stage_model(cost, system, *at))(states[:-1], controls)
         terminal = terminal_model(cost, system, states[-1])
         low, high = self.lower - controls, self.upper - controls
-        law = backward_pass(models.A, models.B, stages, terminal, low, high, regularisation)
-        return law, models.finite_fraction.min()
+        law = backward_pass(models, stages, terminal, low, high, regularisation)
+        return law, models.finite_fraction.min(), _unmoved(models, stages, terminal, course.cost)
 
 
 def optimise_trajectory(
@@ -124,8 +162,8 @@ def optimise_trajectory(
     *,
     smoother: Smoother,
     schedule: Float[ArrayLike, " iterations"],
-    lower: ArrayLike = -jnp.inf,
-    upper: ArrayLike = jnp.inf,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
 ) -> Plan:
     """Improve controls by iterating on linear-quadratic models of the smoothed system (iLQR), ever less smoothed.
 
@@ -143,11 +181,14 @@ def optimise_trajectory(
         smoother: which linear models, at factor 1; `Exact()` is plain iLQR.
         schedule: the factor of the smoothing in each iteration, positive. Let it fall to where the smoothed course is the
             true one.
-        lower: limits of the controls, a number or one per control.
+        lower: limits of the controls, a number or one per control; None are the actuators' own, `ctrlrange`.
         upper: likewise.
 
     Returns:
-        The plan.
+        The plan; `plan.verdict()` says how it ended.
+
+    Warns:
+        UserWarning: if the smoothing reaches contacts with friction that hold bodies to the floor.
 
     Raises:
         ValueError: if shapes do not fit, a limit is above its opposite, or the schedule is empty or not positive.
@@ -158,19 +199,23 @@ def optimise_trajectory(
     """
     start, controls = jnp.asarray(start), jnp.asarray(controls)
     factors = jnp.asarray(schedule, start.dtype)
-    lower, upper = (jnp.broadcast_to(jnp.asarray(x, start.dtype), (system.num_controls,)) for x in (lower, upper))
+    lower, upper = system.limits(lower, upper, start.dtype)
+    for message in smoother.warnings(system, start):
+        warnings.warn(message, stacklevel=2)
     _check(system, controls, factors, lower, upper)
     horizon = len(controls)
     problem = _Problem(system, cost, smoother, jax.random.split(key, horizon), lower, upper)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
-    rest = _no_law(system, horizon, start.dtype)
+    zero, m = jnp.zeros((), start.dtype), system.num_controls
+    no_gain = jnp.zeros((horizon, m, system.num_changes), start.dtype)
+    rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, zero, jnp.asarray(True))
     at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
     given = _Course(at_start, jnp.clip(controls, lower, upper), jnp.asarray(jnp.inf, start.dtype))
 
     def iterate(carry, inputs):
-        course, best, regularisation, _ = carry
+        course, best, regularisation, *_ = carry
         factor, following, is_first = inputs
-        law, fraction = problem.law(smoother.scaled(factor), course, regularisation)
+        law, fraction, unmoved = problem.law(smoother.scaled(factor), course, regularisation)
         tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
         index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
         course = jax.tree.map(lambda x: x[index], tried)
@@ -180,13 +225,14 @@ def optimise_trajectory(
         after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
         after = jnp.where(is_first, regularisation, after)
         row = Iterations(factor, course.cost, true.cost, steps[index], law.promised(), regularisation, fraction)
-        return (course, best, after, law.gain), row
+        return (course, best, after, law.gain, unmoved), row
 
     # A turn of the loop before the first finds the given controls' course: outside, it would be compiled once more.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
-    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), rest.gain)
-    (course, best, _, gain), rows = jax.lax.scan(iterate, carry, inputs)
+    nothing = jnp.zeros(system.num_changes, bool)
+    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), rest.gain, nothing)
+    (course, best, _, gain, unmoved), rows = jax.lax.scan(iterate, carry, inputs)
     start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
     return Plan(
         controls=best.controls,
@@ -195,23 +241,43 @@ def optimise_trajectory(
         start_cost=start_cost,
         cost=best.cost,
         iterations=rows,
-        converged=rows.promised[-1] <= _TOLERANCE * jnp.abs(course.cost),
+        unmoved=unmoved,
+        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(course.cost)) & ~unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
     )
 
 
-def _no_law(system: System, horizon: int, dtype: jnp.dtype) -> Feedback:
-    m, zero = system.num_controls, jnp.zeros((), dtype)
-    gain = jnp.zeros((horizon, m, system.num_changes), dtype)
-    return Feedback(jnp.zeros((horizon, m), dtype), gain, zero, zero, jnp.asarray(True))
+def shifted(plan: Plan, num_steps: int = 1) -> _Controls:
+    """Return the controls of a plan some steps later, its last one held: where a receding horizon plans again.
+
+    Args:
+        plan: of which the first steps were taken.
+        num_steps: how many.
+    """
+    return plan.controls[np.minimum(np.arange(len(plan.controls)) + num_steps, len(plan.controls) - 1)]
+
+
+def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:
+    """Return which coordinates of the state cost more than rounding, and are moved by no control in any step."""
+    n = models.A.shape[-1]
+    slopes = jnp.concatenate([stages.gradient[1:, :n], terminal.gradient[None]])
+    curvatures = jax.vmap(jnp.diag)(jnp.concatenate([stages.hessian[1:, :n, :n], terminal.hessian[None]]))
+    gain = jnp.sum(0.5 * slopes**2 / jnp.where(curvatures > 0, curvatures, 1.0), axis=0)
+
+    def spread(moved, model):
+        A, B = jnp.abs(model[0]), jnp.abs(model[1])
+        return A @ moved + B.sum(axis=1), None
+
+    moved, _ = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models.A, models.B))
+    return (gain > _TOLERANCE * jnp.abs(cost)) & (moved <= _ROUNDINGS * jnp.finfo(moved.dtype).eps * jnp.max(moved))
 
 
 def _check(
     system: System,
     controls: Float[Array, "_ _"],
     factors: Float[Array, "..."],
-    lower: Float[Array, " m"],
-    upper: Float[Array, " m"],
+    lower: ControlVector,
+    upper: ControlVector,
 ) -> None:
     if controls.shape[1] != system.num_controls or not len(controls):
         raise ValueError(
@@ -225,3 +291,96 @@ def _check(
         return
     if not (np.asarray(lower) <= np.asarray(upper)).all():
         raise ValueError(f"lower must be at most upper, got {np.asarray(lower)} and {np.asarray(upper)}")
+
+
+def backward_pass(
+    models: LinearModel,
+    stages: Quadratic,
+    terminal: Quadratic,
+    lower: _Controls,
+    upper: _Controls,
+    regularisation: _Scalar,
+) -> Feedback:
+    """Minimise the quadratic model of the cost-to-go step by step, the last first.
+
+    Models and stages have a leading axis; a control may fall to `lower`, at most 0, and rise to `upper`, from where it is.
+    The regularisation is added to the curvature by the controls, in units of its largest entry; it shortens the steps.
+
+    References:
+        Li, Todorov. Iterative Linear Quadratic Regulator Design for Nonlinear Biological Movement Systems. ICINCO 2004.
+        Tassa, Mansard, Todorov. Control-Limited Differential Dynamic Programming. ICRA 2014 (limits).
+    """
+    n = models.A.shape[-1]
+
+    def back(carry, inputs):
+        value, slope_sum, curvature_sum, sound = carry
+        A, B, stage, low, high = inputs
+        both = jnp.concatenate([A, B], axis=1)
+        gradient = stage.gradient + both.T @ value.gradient
+        hessian = stage.hessian + both.T @ value.hessian @ both
+        q_u, q_uu, q_ux = gradient[n:], hessian[n:, n:], hessian[n:, :n]
+        held = q_uu + regularisation * jnp.max(jnp.diag(q_uu)) * jnp.eye(len(q_u), dtype=q_u.dtype)
+        minimum = minimise_in_box(held, q_u, low, high)
+        k, K = minimum.value, -_solve_free(held, q_ux, minimum.is_free)
+        # The exact cost-to-go of this law: the shorter forms of it hold without regularisation and limits only.
+        closed = jnp.concatenate([jnp.eye(n, dtype=K.dtype), K])
+        affine = jnp.concatenate([jnp.zeros(n, k.dtype), k])
+        value_hessian = closed.T @ hessian @ closed
+        value = Quadratic(closed.T @ (gradient + hessian @ affine), 0.5 * (value_hessian + value_hessian.T))
+        carry = (value, slope_sum + q_u @ k, curvature_sum + k @ q_uu @ k, sound & minimum.is_sound)
+        return carry, (k, K)
+
+    zero = jnp.zeros((), models.A.dtype)
+    start = (terminal, zero, zero, jnp.asarray(True))
+    inputs = (models.A, models.B, stages, lower, upper)
+    (_, slope, curvature, sound), (k, K) = jax.lax.scan(back, start, inputs, reverse=True)
+    sound &= jnp.all(jnp.isfinite(k)) & jnp.all(jnp.isfinite(K))
+    return Feedback(k, K, slope, curvature, sound)
+
+
+class BoxMinimum(eqx.Module):
+    """The minimiser in a box, which coordinates no bound holds, and whether the gradient of these vanishes, up to rounding."""
+
+    value: ControlVector
+    is_free: Bool[Array, " m"]
+    is_sound: Bool[Array, ""]
+
+
+def minimise_in_box(
+    hessian: _Matrix, gradient: ControlVector, lower: ControlVector, upper: ControlVector
+) -> BoxMinimum:
+    """Minimise ½ xᵀ H x + gᵀ x between bounds, by projected Newton steps; H must be positive definite.
+
+    References:
+        Tassa, Mansard, Todorov. Control-Limited Differential Dynamic Programming. ICRA 2014, section III.
+    """
+
+    def value(x):
+        return 0.5 * x @ hessian @ x + gradient @ x
+
+    def free(x):
+        slope = hessian @ x + gradient
+        return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
+
+    def improve(_, x):
+        slope, is_free = free(x)
+        direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
+        tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
+        values = jax.vmap(value)(tried)
+        best = jnp.argmin(values)
+        return jnp.where(values[best] < value(x), tried[best], x)
+
+    x = jax.lax.fori_loop(0, _NEWTON_STEPS, improve, jnp.clip(jnp.zeros_like(gradient), lower, upper))
+    slope, is_free = free(x)
+    rounding = 1e3 * jnp.finfo(x.dtype).eps * (jnp.abs(hessian) @ jnp.abs(x) + jnp.abs(gradient))
+    is_sound = jnp.all(jnp.isfinite(x)) & jnp.all(~is_free | (jnp.abs(slope) <= rounding))
+    return BoxMinimum(x, is_free, is_sound)
+
+
+def _solve_free(
+    hessian: _Matrix, right: Float[Array, "m columns"], is_free: Bool[Array, " m"]
+) -> Float[Array, "m columns"]:
+    """Solve H y = b for the free coordinates, the others held at zero."""
+    both = is_free[:, None] & is_free
+    held = jnp.where(both, hessian, jnp.eye(len(hessian), dtype=hessian.dtype))
+    return jnp.linalg.solve(held, jnp.where(is_free[:, None], right, 0.0))

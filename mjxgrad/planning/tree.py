@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad.planning.linear_model import LinearModel
-from mjxgrad.planning.models import Smoother
-from mjxgrad.planning.system import System
+from mjxgrad.planning.linear_model import LinearModel, Smoother
+from mjxgrad.planning.system import ControlVector, StateVector, System
 from mjxgrad.task import optional_pytree
+
+Index = Int[Array, ""]
 
 # Kinds of samples: a pose of what the goal is about, wherever the rest may be; or all positions.
 _POSE, _EVERYTHING = 0, 1
@@ -27,19 +28,17 @@ class Reach(eqx.Module):
     coordinate that does not count has infinite resolution, so that its inverse, the weight, is zero; and by Woodbury's identity
     only an m by m inverse is needed, one per set of weights.
 
-    Attributes:
-        c: the mean next state.
-        B: of positions, times the reach of each control.
-        inverse: (I + Bᵀ W B)⁻¹ for each set W of weights.
+    Here c is the mean next state, B that of positions times the reach of each control, and `inverse` (I + Bᵀ W B)⁻¹ for each
+    set W of weights.
     """
 
-    c: Float[Array, " state"]
+    c: StateVector
     B: Float[Array, "p m"]
     inverse: Float[Array, "kinds m m"]
 
     def distance(
-        self, system: System, sample: Float[Array, " state"], weights: Float[Array, "kinds p"], kind: Int[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, " m"]]:
+        self, system: System, sample: StateVector, weights: Float[Array, "kinds p"], kind: Index
+    ) -> tuple[Float[Array, ""], ControlVector]:
         """Return the squared distance of a sample, and the control that leads there as far as one does, in units of the reach."""
         away = system.difference(sample, self.c)[: system.num_positions]
         weighted = weights[kind] * away
@@ -48,13 +47,10 @@ class Reach(eqx.Module):
         return away @ weighted - pulled @ control, control
 
 
-def reach(model: LinearModel, radius: Float[Array, " m"], weights: Float[Array, "kinds p"]) -> Reach:
-    """Return what the controls reach according to a linear model.
+def reach(model: LinearModel, radius: ControlVector, weights: Float[Array, "kinds p"]) -> Reach:
+    """Return what controls reach that can go as far as `radius` from where a linear model was made.
 
-    Args:
-        model: of a step.
-        radius: how far each control can go from where the model was made.
-        weights: inverse squared resolution of each coordinate, 0 where it does not count; one row per kind of sample.
+    The weights are inverse squared resolutions, 0 where a coordinate does not count; one row per kind of sample.
     """
     B = model.B[: weights.shape[1]] * radius
     gram = jnp.einsum("pm,kp,pn->kmn", B, weights, B)
@@ -78,7 +74,7 @@ class Nodes(eqx.Module):
     parents: Int[Array, "*capacity"]
     errors: Float[Array, "*capacity"]
     reaches: Reach
-    size: Int[Array, ""]
+    size: Index
 
     @property
     def is_node(self) -> Bool[Array, " capacity"]:
@@ -86,7 +82,7 @@ class Nodes(eqx.Module):
         return jnp.arange(len(self.parents)) < self.size
 
     @property
-    def best(self) -> Int[Array, ""]:
+    def best(self) -> Index:
         """The node nearest to the goal."""
         return jnp.argmin(jnp.where(self.is_node, self.errors, jnp.inf))
 
@@ -106,14 +102,10 @@ class Nodes(eqx.Module):
         def put(old: Array, rows: Array) -> Array:
             return old.at[places].set(rows.reshape(many, *old.shape[1:]).astype(old.dtype), mode="drop")
 
-        return Nodes(
-            states=put(self.states, new.states),
-            controls=put(self.controls, new.controls),
-            parents=put(self.parents, parents),
-            errors=put(self.errors, new.errors),
-            reaches=jax.tree.map(put, self.reaches, new.reaches),
-            size=jnp.minimum(self.size + valid.sum(), len(self.parents)),
-        )
+        size = jnp.minimum(self.size + valid.sum(), len(self.parents))
+        old = (self.states, self.controls, self.parents, self.errors, self.reaches)
+        rows = jax.tree.map(put, old, (new.states, new.controls, parents, new.errors, new.reaches))
+        return Nodes(*rows, size)  # pyright: ignore[reportCallIssue]
 
 
 class Search(eqx.Module):
@@ -127,7 +119,7 @@ class Search(eqx.Module):
 
     nodes: Nodes
     is_solved: Bool[Array, ""]
-    num_steps: Int[Array, ""]
+    num_steps: Index
 
 
 class Path(eqx.Module):
@@ -165,7 +157,7 @@ class Sampling(eqx.Module):
     resolution: Float[Array, " p"] = eqx.field(converter=jnp.asarray)
     goal_share: float = 0.2
     transit_share: float = 0.3
-    transit: Callable[[PRNGKeyArray, Float[Array, " state"]], Float[Array, " state"]] | None = eqx.field(
+    transit: Callable[[PRNGKeyArray, StateVector], StateVector] | None = eqx.field(
         converter=optional_pytree, default=None
     )
     batch: int = eqx.field(static=True, default=16)
@@ -181,8 +173,8 @@ def search(
     *,
     smoother: Smoother,
     sampling: Sampling,
-    lower: ArrayLike,
-    upper: ArrayLike,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
     capacity: int = 4000,
     max_turns: int = 1000,
 ) -> Search:
@@ -201,7 +193,8 @@ def search(
         key: consumed here.
         smoother: which linear models.
         sampling: where to sample.
-        lower: limits of the controls, a number or one per control; finite. Models are made at their middle.
+        lower: limits of the controls, a number or one per control; finite. Models are made at their middle. None are the
+            actuators' own, `ctrlrange`.
         upper: likewise.
         capacity: how many nodes there is room for.
         max_turns: of sampling and extending.
@@ -219,13 +212,14 @@ def search(
         afterwards; here it moves there within the tree.
     """
     start, goal, tolerance = jnp.asarray(start), jnp.asarray(goal), np.asarray(tolerance, float)
-    low, high = (jnp.broadcast_to(jnp.asarray(x, start.dtype), (system.num_controls,)) for x in (lower, upper))
+    low, high = system.limits(lower, upper, start.dtype)
     _check(system, sampling, tolerance, low, high, capacity)
     matters = np.isfinite(tolerance)[: system.num_positions]
     weight = 1 / sampling.resolution**2
     weights = jnp.stack([jnp.where(matters, weight, 0.0), weight])
     grower = _Grower(system, smoother, sampling, start, goal, jnp.asarray(tolerance), weights, low, high)
-    root = _planted(grower.root(), capacity)
+    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x), grower.root())
+    root = eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
 
     def may_go_on(carry: tuple) -> Bool[Array, ""]:
         nodes, _, turn, _ = carry
@@ -257,32 +251,30 @@ class _Grower(eqx.Module):
     system: System
     smoother: Smoother
     sampling: Sampling
-    start: Float[Array, " state"]
-    goal: Float[Array, " state"]
+    start: StateVector
+    goal: StateVector
     tolerance: Float[Array, " n"]
     weights: Float[Array, "kinds p"]
-    lower: Float[Array, " m"]
-    upper: Float[Array, " m"]
+    lower: ControlVector
+    upper: ControlVector
 
-    def node(
-        self, state: Float[Array, " state"], control: Float[Array, " m"], parent: Int[Array, ""], key: PRNGKeyArray
-    ) -> Nodes:
+    def node(self, state: StateVector, control: ControlVector, parent: Index, key: PRNGKeyArray) -> Nodes:
         """Return a node, with what it can reach."""
         model = self.smoother.linear_model(self.system, state, self.middle, key, wrt_state=False)
         here = reach(model, self.radius, self.weights)
         return Nodes(state, control, parent, self.error(state), here, jnp.asarray(1))
 
     @property
-    def middle(self) -> Float[Array, " m"]:
+    def middle(self) -> ControlVector:
         """The controls at which models are made."""
         return 0.5 * (self.lower + self.upper)
 
     @property
-    def radius(self) -> Float[Array, " m"]:
+    def radius(self) -> ControlVector:
         """How far the controls go from there."""
         return 0.5 * (self.upper - self.lower)
 
-    def error(self, state: Float[Array, " state"]) -> Float[Array, ""]:
+    def error(self, state: StateVector) -> Float[Array, ""]:
         """Return the distance from the goal in units of its tolerance."""
         return jnp.max(jnp.abs(self.system.difference(state, self.goal)) / self.tolerance)
 
@@ -296,7 +288,7 @@ class _Grower(eqx.Module):
         here = Reach(self.start, jnp.zeros((p, m), dtype), jnp.broadcast_to(jnp.eye(m, dtype=dtype), (kinds, m, m)))
         return Nodes(self.start, jnp.zeros(m, dtype), jnp.asarray(-1), self.error(self.start), here, jnp.asarray(1))
 
-    def grow(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Nodes, Int[Array, ""]]:
+    def grow(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Nodes, Index]:
         """Extend the tree towards a batch of samples; return it and the number of steps tried."""
         draw_key, model_key = jax.random.split(key)
         keys = jax.random.split(draw_key, self.sampling.batch)
@@ -307,12 +299,12 @@ class _Grower(eqx.Module):
         )
         return nodes.add(new, is_valid), jnp.asarray(self.sampling.batch * self.sampling.max_extension)
 
-    def nearest(self, nodes: Nodes, sample: Float[Array, " state"], kind: Int[Array, ""]) -> Int[Array, ""]:
+    def nearest(self, nodes: Nodes, sample: StateVector, kind: Index) -> Index:
         """Return the node from whose reach a sample is least far."""
         distances, _ = jax.vmap(lambda one: one.distance(self.system, sample, self.weights, kind))(nodes.reaches)
         return jnp.argmin(jnp.where(nodes.is_node & jnp.isfinite(distances), distances, jnp.inf))
 
-    def draw(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[Float[Array, " state"], Int[Array, ""]]:
+    def draw(self, nodes: Nodes, key: PRNGKeyArray) -> tuple[StateVector, Index]:
         """Return a sample and its kind."""
         kind_key, place_key, node_key, best_key = jax.random.split(key, 4)
         settings, p = self.sampling, self.system.num_positions
@@ -331,24 +323,18 @@ class _Grower(eqx.Module):
         sample = jnp.where(is_goal, self.goal, jnp.where(is_transit, elsewhere, anywhere))
         return sample, jnp.where(is_transit, _EVERYTHING, _POSE)
 
-    def _moved(self, place: Float[Array, " p"]) -> Float[Array, " state"]:
+    def _moved(self, place: Float[Array, " p"]) -> StateVector:
         """Return the start with its positions changed."""
         change = jnp.zeros(self.system.num_changes, place.dtype).at[: place.size].set(place)
         return self.system.retract(self.start, change)
 
     def extend(
-        self,
-        nodes: Nodes,
-        key: PRNGKeyArray,
-        number: Int[Array, ""],
-        nearest: Int[Array, ""],
-        sample: Float[Array, " state"],
-        kind: Int[Array, ""],
+        self, nodes: Nodes, key: PRNGKeyArray, number: Index, nearest: Index, sample: StateVector, kind: Index
     ) -> tuple[Nodes, Bool[Array, " steps"]]:
         """Go from a node towards a sample as long as it comes nearer."""
         most = self.sampling.max_extension
 
-        def advance(carry, step: Int[Array, ""]):
+        def advance(carry, step: Index):
             state, here, is_on = carry
             distance, control = here.distance(self.system, sample, self.weights, kind)
             control = self.middle + self.radius * control / jnp.maximum(1, jnp.max(jnp.abs(control)))
@@ -366,27 +352,12 @@ class _Grower(eqx.Module):
         return new, is_valid
 
 
-def _planted(root: Nodes, capacity: int) -> Nodes:
-    """Return a tree of one node with room for others.
-
-    Args:
-        root: the node, without leading axes.
-        capacity: how many nodes there will be room for.
-    """
-
-    def spread(x: Array) -> Array:
-        return jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x)
-
-    rows = jax.tree.map(spread, root)
-    return eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
-
-
 def _check(
     system: System,
     sampling: Sampling,
     tolerance: Float[np.ndarray, "..."],
-    lower: Float[Array, " m"],
-    upper: Float[Array, " m"],
+    lower: ControlVector,
+    upper: ControlVector,
     capacity: int,
 ) -> None:
     p = system.num_positions

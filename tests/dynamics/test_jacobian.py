@@ -14,9 +14,9 @@ from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, constraint, kinematics, linear
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import Bend
-from mjxgrad.dynamics.contact import slot_bodies
-from mjxgrad.dynamics.inertia import inertia_of
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows
+from mjxgrad.dynamics.kinematics import inertia_of
+from mjxgrad.dynamics.rows import joined, slot_bodies
 from mjxgrad.dynamics.sparse import SparseRows
 
 # Two free balls on a plane and on each other, one of them heavy and rolling; an arm that bends back on itself, touches
@@ -53,7 +53,7 @@ def _rows(cone):
     def prepare(data):
         data = kinematics.com_pos(model, kinematics.kinematics(model, data))
         data = collide(model, kinematics.com_vel(model, kinematics.crb(model, data)))
-        block = assembly.joined(assembly.gather(model, data))
+        block = joined(assembly.gather(model, data))
         return data, block, block.map.matrix()
 
     data, block, matrix = jax.jit(prepare)(mjx.put_data(mj_model, mj_data))

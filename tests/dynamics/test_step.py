@@ -9,7 +9,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly
-from mjxgrad.dynamics.integrate import integrate_position
+from mjxgrad.dynamics.kinematics import integrate_position
 from tests.dynamics.scenes import published, zoo
 
 _SLOW = pytest.mark.slow

@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from mjxgrad.dynamics import Smoothing
-from mjxgrad.dynamics.integrate import position_change
-from mjxgrad.planning.linear_model import analytic, first_order, mean_step, zeroth_order
+from mjxgrad.dynamics.kinematics import position_change
+from mjxgrad.planning.linear_model import Analytic, Exact, analytic, first_order, mean_step, zeroth_order
 from mjxgrad.planning.system import FunctionSystem, SceneSystem
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
@@ -220,6 +220,36 @@ def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
         np.testing.assert_allclose(model.A, one_a @ one_a, atol=1e-10)
         np.testing.assert_allclose(model.B, one_a @ one_b + one_b, atol=1e-10)
         np.testing.assert_allclose(model.c, model.A @ at + (model.B @ control), atol=1e-10)
+
+
+def test_a_step_can_be_jitted_as_it_is():
+    system = SceneSystem(mg.load_scene(SPRING))
+    at, control = jnp.array([0.1, -0.3]), jnp.array([0.7])
+    np.testing.assert_allclose(jax.jit(system.step)(at, control), system.step(at, control), rtol=1e-12)
+
+
+def test_limits_are_those_of_the_actuators_unless_others_are_given():
+    ranged = SPRING.replace('<motor joint="x"/>', '<motor joint="x"/><motor joint="x" ctrlrange="-2 3"/>')
+    system = SceneSystem(mg.load_scene(ranged))
+    np.testing.assert_array_equal(system.limits(None, None, np.dtype(float)), [[-np.inf, -2], [np.inf, 3]])
+    np.testing.assert_array_equal(system.limits(-1.0, None, np.dtype(float)), [[-1, -1], [np.inf, 3]])
+
+
+RAILS = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+  <body pos="0 0 {height}"><freejoint/><geom name="ball" size=".1"/></body>
+  <body pos=".5 0 .2"><joint type="slide"/><geom name="pusher" size=".1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.0999, 1), (0.15, 0)])
+def test_smoothing_that_reaches_the_floor_under_a_resting_body_is_warned_about(height, expected):
+    system = SceneSystem(mg.load_scene(RAILS.format(height=height)))
+    start = jnp.concatenate([system.scene.data.qpos, system.scene.data.qvel])
+    found = Analytic(Smoothing(0.01)).warnings(system, start)
+    assert len(found) == expected
+    assert all("smoothing also reaches floor – ball, which touch at the start" in sentence for sentence in found)
+    assert not Exact().warnings(system, start)
+    # Under a trace nothing is known of the start.
+    jax.eval_shape(lambda x: Analytic(Smoothing(0.01)).warnings(system, x), start)
 
 
 BALL = """<mujoco><option timestep="{h}" gravity="0 0 0" tolerance="1e-12"/><worldbody>

@@ -19,10 +19,11 @@ from mjxgrad.planning import (
     optimise_trajectory,
     path,
     search,
+    shifted,
 )
-from mjxgrad.planning.backward import minimise_in_box
 from mjxgrad.planning.cost import terminal_model
 from mjxgrad.planning.linear_model import LinearModel
+from mjxgrad.planning.trajectory import minimise_in_box
 from mjxgrad.planning.tree import reach
 
 A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.02, 0.0], [0.1, 0.05]])
@@ -177,12 +178,22 @@ def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(pushing, 
     assert plan.start_cost == 5.0
     np.testing.assert_allclose(plan.states[-1, 1], 1.0, atol=0.01)
     assert np.all(np.abs(plan.controls) <= 0.4)
+    assert not plan.unmoved.any()
+
+
+def test_a_shifted_plan_goes_on_where_the_first_steps_end_and_holds_its_last_control(planned):
+    plan = planned(jnp.array(2.0))
+    np.testing.assert_array_equal(shifted(plan, 2), [*plan.controls[2:], plan.controls[-1], plan.controls[-1]])
 
 
 def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves(pushing):
     plan = pushing(Exact())
     assert plan.cost == plan.start_cost
     np.testing.assert_array_equal(plan.controls, 0)
+    # The block costs and no control moves it; the finger, which one moves, costs nothing.
+    assert plan.unmoved.tolist() == [False, True]
+    assert not plan.converged
+    assert plan.verdict().startswith("nothing is touched: no control moves the coordinates [1]")
 
 
 def test_a_plan_is_the_rollout_of_its_controls(pushing):
