@@ -3,20 +3,17 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad._rollout import Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
-
-Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 
 
 class Outcome(eqx.Module):
@@ -24,7 +21,7 @@ class Outcome(eqx.Module):
 
     Attributes:
         cost: of the whole rollout, NaN if it diverged.
-        states: in which the controls were chosen, with a leading axis of `horizon`.
+        states: in which the controls were chosen, with a leading axis of `horizon`: what a policy was called with.
         step_costs: what was charged at steps 0 to `horizon`, with the sum `cost`. Entry t depends only on states and
             controls up to t, so a control at t answers for the entries from t on and for no others. None where only
             the total is known.
@@ -129,10 +126,12 @@ class SceneTask(Task, InScene):
     Attributes:
         state: the nominal start.
         cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
-            and controls up to t, whose sum is the cost; traceable.
+            and controls up to t, whose sum is the cost; traceable. It may read `trajectory.observations`.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
         smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
+        observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
+        policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
     """
 
     state: State
@@ -140,6 +139,8 @@ class SceneTask(Task, InScene):
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
+    observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
         """Give the same with contact averaged over noise."""
@@ -171,7 +172,6 @@ class SceneTask(Task, InScene):
             ValueError: if the cost is neither a number nor one number per state.
         """
         start = self.state if start is None else start
-        has_activations = self.scene.model.na > 0
         trajectory = rollout(
             self.scene,
             start,
@@ -179,15 +179,17 @@ class SceneTask(Task, InScene):
             params,
             noise,
             horizon=self.horizon,
-            observe=_activations if has_activations else None,
+            observe=self.observe,
+            policy_sees=self.policy_sees,
             gradient=self.gradient,
             onset=self.onset,
             smoothing=self.smoothing,
         )
-        elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
-        activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))
-        qpos, qvel = trajectory.qpos[:-1], trajectory.qvel[:-1]
-        states = jax.vmap(State)(qpos, qvel, activations, start.time + elapsed, jnp.zeros_like(qvel))
+        states = trajectory.seen
+        if states is None:
+            qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
+            time = start.time + self.scene.model.opt.timestep * jnp.arange(self.horizon)
+            states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
         charged = finite_cost(jnp.asarray(self.cost(trajectory)), trajectory)
         if charged.shape not in ((), (self.horizon + 1,)):
             raise ValueError(
@@ -200,7 +202,3 @@ class SceneTask(Task, InScene):
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
     """Give the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
     return jnp.where(trajectory.diverged, jnp.nan, cost)
-
-
-def _activations(model: mjx.Model, data: mjx.Data) -> Float[Array, " na"]:
-    return data.act

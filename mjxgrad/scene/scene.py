@@ -1,14 +1,17 @@
 """What `load_scene` returns, and how it describes itself."""
 
 import copy
+import difflib
 import textwrap
 import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
@@ -18,6 +21,9 @@ from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission
 
 _WIDTH = 118  # characters; what a laptop's terminal shows
+_EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
+# What MuJoCo computes from mass and inertia when it compiles a model.
+_COMPILED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "dof_M0")
 
 
 class SceneWarning(UserWarning):
@@ -37,7 +43,7 @@ class Scene(eqx.Module):
             contact parameters of the file: see `to_mujoco`.
         omissions: what a step leaves out, and why.
         conversions: settings replaced by others, and why.
-        pairs: geoms that can touch, in the order of `contact_parameters`.
+        pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
         omitted_pairs: pairs whose contact is left out although the file has it, as `LeaveOut` asked.
         name: where the scene came from.
     """
@@ -72,9 +78,54 @@ class Scene(eqx.Module):
         """
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
         for message in softness_warnings(softness, scene.model, self.mj_model) + scene.warnings():
-            # Equinox wraps methods, so the caller is one level further up.
-            warnings.warn(f"{self.name}: {message}", SceneWarning, stacklevel=3)
+            _warn(self, message)
         return scene
+
+    def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
+        """Replace numbers of the MJX model, such as `geom_friction`, `body_mass` or `dof_damping`.
+
+        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo
+        computes from mass and size when it compiles a model stays as it is, unless it is given, too; a warning says so.
+
+        Args:
+            **fields: new values of the model's floating-point arrays, each of the shape that it has.
+
+        Returns:
+            The scene with these values.
+
+        Raises:
+            ValueError: if there is no such field, it is not an array of numbers, or the shape is another.
+        """
+        known = {
+            f.name for f in self.model.fields() if jnp.issubdtype(_dtype(getattr(self.model, f.name)), jnp.floating)
+        }
+        for name, value in fields.items():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=3)
+                remedy = f"did you mean {' or '.join(near)}?" if near else "see mujoco's documentation of mjModel"
+                raise ValueError(f"with_model must name arrays of numbers of the MJX model, got {name}; {remedy}")
+            shape = getattr(self.model, name).shape
+            if np.shape(value) != shape:
+                raise ValueError(f"{name} must have shape {shape} in this scene, got {np.shape(value)}")
+        changed = {name: jnp.asarray(value, getattr(self.model, name).dtype) for name, value in fields.items()}
+        if {"body_mass", "body_inertia"} & fields.keys() and not set(_COMPILED) & fields.keys():
+            _warn(
+                self,
+                f"{', '.join(_COMPILED)} do not follow the mass: MuJoCo computes them when it compiles a model; "
+                "give them, too, or know that contacts are as stiff as for the old mass",
+            )
+        is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
+        if "dof_damping" in fields and is_explicit:
+            _warn(
+                self, "loaded without damping, so dof_damping is integrated explicitly; load with keep_everything=True"
+            )
+        return eqx.tree_at(lambda s: s.model, self, self.model.replace(**changed))
+
+    @property
+    def ctrlrange(self) -> Float[Array, "nu 2"]:
+        """Least and largest control of each actuator, beyond which MuJoCo clips it; infinite where there is no limit."""
+        limited = np.asarray(self.model.actuator_ctrllimited, bool)[:, None]
+        return jnp.where(limited, self.model.actuator_ctrlrange, jnp.array([-jnp.inf, jnp.inf]))
 
     def warnings(self) -> list[str]:
         """Sentences on contacts that `refsafe` alters or that the time step cannot follow.
@@ -132,6 +183,15 @@ class Scene(eqx.Module):
             _bullets("Warnings", self.warnings()),
         ]  # fmt: skip
         return "\n\n".join(section for section in sections if section)
+
+
+def _warn(scene: Scene, message: str) -> None:
+    """Warn whoever called a method of the scene; Equinox wraps methods, so this is one level further up."""
+    warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
+
+
+def _dtype(value: object) -> object:
+    return getattr(value, "dtype", object)
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
@@ -207,6 +267,8 @@ def _contacts(scene: Scene) -> str:
     legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
         "; stable while h²k + 2hb < 4" if is_euler else ""
     )
+    if len(rows) < count:
+        legend += "\n  all of them: scene.pairs"
     columns = _COLUMNS
     if has_rest:
         columns = tuple((*column, cell) for column, cell in zip(_COLUMNS, ("at rest", "mm"), strict=True))
