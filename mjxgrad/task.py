@@ -64,7 +64,7 @@ class Task(eqx.Module):
         """
 
     def nominal_start(self) -> PyTree:
-        """Give where a rollout begins if nothing else is said; None if that has no name outside the task."""
+        """Return where a rollout begins if nothing else is said; None if that has no name outside the task."""
         return None
 
     def sample_start(self, key: PRNGKeyArray) -> PyTree:
@@ -96,14 +96,16 @@ class InScene(eqx.Module):
         gradient: of each step, "discrete" or "event", see `step`.
         onset: lets contacts begin within the step, so that the cost has no jumps but real ones and its plain derivative is right
             sample by sample; None is MuJoCo's motion. A leaf.
+        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
     scene: Scene
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
+    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self: Same, gradient: Gradient) -> Same:
-        """Give the same with MuJoCo's own motion and one of its derivatives.
+        """Return the same with MuJoCo's own motion and one of its derivatives.
 
         Raises:
             ValueError: if there is no such gradient.
@@ -112,12 +114,16 @@ class InScene(eqx.Module):
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_onset(self: Same, onset: Onset | None) -> Same:
-        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
+        """Return the same with contacts that begin otherwise; None is MuJoCo's motion."""
         return dataclasses.replace(self, gradient="discrete", onset=onset)
 
+    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
+        """Return the same with contact averaged over noise."""
+        return dataclasses.replace(self, smoothing=smoothing)
+
     def with_softness(self: Same, softness: Softness) -> Same:
-        """Give the same with other contact softness."""
-        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
+        """Return the same with other contact softness."""
+        return dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
 class SceneTask(Task, InScene):
@@ -129,7 +135,6 @@ class SceneTask(Task, InScene):
             and controls up to t, whose sum is the cost; traceable. It may read `trajectory.observations`.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
-        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
         observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
         policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
     """
@@ -138,21 +143,16 @@ class SceneTask(Task, InScene):
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
-    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
     observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
-    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
-        """Give the same with contact averaged over noise."""
-        return dataclasses.replace(self, smoothing=smoothing)
-
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give the number of actuators."""
+        """Return the number of actuators."""
         return self.scene.model.nu
 
     def nominal_start(self) -> State:
-        """Give `state`."""
+        """Return `state`."""
         return self.state
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:
@@ -200,5 +200,5 @@ class SceneTask(Task, InScene):
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
-    """Give the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
+    """Return the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
     return jnp.where(trajectory.diverged, jnp.nan, cost)

@@ -4,10 +4,10 @@ import numpy as np
 
 from experiments.cube_toss.figures import draw
 from experiments.cube_toss.outcome import METHODS, Course, Outcome, Point
+from experiments.cube_toss.throw import PUBLISHED_DERIVATIVE
 from experiments.report import Report, Table
 from experiments.words import quantity
 from experiments.workspace import Workspace
-from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE
 
 _CONTACTS = {"published": "With a contact that begins continuously", "default": "With MuJoCo's default contact"}
 

@@ -53,14 +53,8 @@ def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
 
     Most stages cost nothing once the model has no element for them, for their arrays have no
     rows, and what is computed for reading only is removed by XLA from a compiled rollout, which
-    carries nothing but the state. One flag has to be set: Euler integration would factorise the
+    carries nothing but the state. One flag has to be set, in place: Euler integration would factorise the
     mass matrix a second time for damping that is zero.
-
-    Args:
-        model: changed in place.
-
-    Returns:
-        The omissions, in the order of a step.
     """
     omissions = tuple(Omission(what, reason) for what, find in _TABLE if (reason := find(model)))
     if _has_needless_eulerdamp(model):
@@ -166,14 +160,7 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
 
 
 def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ...], tuple[Omission, ...]]:
-    """Leave out pairs and limits.
-
-    Args:
-        model: changed in place.
-        wanted: what to leave out.
-
-    Returns:
-        The pairs left out, and what was done in words.
+    """Leave out pairs and limits of a model, in place; return the pairs, and what was done in words.
 
     Raises:
         ValueError: if a name is unknown, a pair is listed as `<pair>` in the file, or there are too many different
@@ -199,18 +186,12 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
 
 
 def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
-    """Set `contype` and `conaffinity` so that of all pairs of geoms only these collide, in the same order as before.
+    """Set `contype` and `conaffinity` in place so that of all pairs only these collide, in the same order as before.
 
     Geoms that collide with the same others share a bit: theirs is the type, the others have the affinity. Bits are given
     out until every pair has one, first to those that settle most pairs. What MuJoCo filters by other rules (geoms of one
-    rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs stay as they are.
-
-    Args:
-        model: changed in place.
-        kept: pairs of this model that are not explicit.
-
-    Raises:
-        TooManyMasksError: if 31 bits do not suffice.
+    rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs, which `kept` has none of, stay as they
+    are. Raises TooManyMasksError if 31 bits do not suffice.
     """
     neighbours: dict[int, set[int]] = {}
     for pair in kept:

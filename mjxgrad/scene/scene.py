@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
-from mjxgrad.scene.contact_check import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission
 

@@ -34,7 +34,7 @@ class JumpCost(eqx.Module):
     height_weight: Float[Array, ""]
 
     def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
-        """Give minus the distance forward, less the weighted height, in m."""
+        """Return minus the distance forward, less the weighted height, in m."""
         return -trajectory.qpos[-1, 0] - self.height_weight * trajectory.qpos[-1, 1]
 
 
@@ -51,7 +51,14 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
     Returns:
         The task.
     """
-    model = mujoco.MjModel.from_xml_path(str(_path()))
+    # Imported here: only this task needs it.
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
+
+    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = load_scene(model)
     policy, zero = linear_policy(6, 3, observe=joints)
@@ -72,13 +79,3 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
 def joints(state: State) -> Float[Array, " 6"]:
     """Observe the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
     return jnp.concatenate([state.qpos[3:], state.qvel[3:]])
-
-
-def _path() -> Path:
-    # Imported here: only this task needs it.
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
-
-    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"

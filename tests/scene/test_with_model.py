@@ -88,7 +88,9 @@ def test_sensors_and_sites_are_read_by_name_as_in_c():
     def look(model, data):
         return mg.sensor(model, data, "touch"), mg.sensor(model, data, "place"), mg.site_position(model, data, "tip")
 
-    touch, place, tip = mg.rollout(scene, mg.initial_state(scene), horizon=1, observe=look).observations
+    touch, place, tip = jax.jit(
+        lambda: mg.rollout(scene, mg.initial_state(scene), horizon=1, observe=look).observations
+    )()
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
     assert data.sensor("touch").data[0] > 1
