@@ -227,7 +227,7 @@ def rollout(
 
             _, tangent, stepped = jax.jvp(take, (state.qpos, state.qvel), tangent, has_aux=True)
             tangent = jax.lax.stop_gradient(tangent)
-            growth = jnp.maximum(growth, _length(tangent))  # a NaN stays one
+            growth = jnp.maximum(growth, jnp.linalg.norm(jnp.concatenate(tangent)))  # a NaN stays one
         else:
             stepped = step(scene.model, data, gradient=gradient, **settings)
         moved = state_of(stepped)
@@ -279,10 +279,6 @@ def _direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
     parts = (random.normal(size=state.qpos.shape), random.normal(size=state.qvel.shape))
     size = np.sqrt(sum((part**2).sum() for part in parts))
     return tuple(jnp.asarray(part / size, state.qvel.dtype) for part in parts)  # pyright: ignore[reportReturnType]
-
-
-def _length(tangent: tuple[Array, Array]) -> Float[Array, ""]:
-    return jnp.sqrt(sum(jnp.sum(part**2) for part in tangent))
 
 
 def check_trajectory(trajectory: Trajectory) -> None:

@@ -87,7 +87,10 @@ def adaptive_rollout(
     is_known = not isinstance(tolerance, jax.core.Tracer)
     if (is_known and not np.all(np.asarray(tolerance) > 0)) or max_steps < 1:
         raise ValueError(f"tolerance and max_steps must be positive, got {tolerance} and {max_steps}")
-    diffrax = _diffrax()
+    try:
+        import diffrax
+    except ImportError as error:
+        raise ImportError("adaptive_rollout needs diffrax, not installed: pip install 'mjxgrad[adaptive]'") from error
     moments = jnp.asarray(times, state.qpos.dtype)
     if not isinstance(moments, jax.core.Tracer):
         known = np.asarray(moments)
@@ -127,13 +130,3 @@ def adaptive_rollout(
         num_rejected=jnp.asarray(solution.stats["num_rejected_steps"]),
         has_failed=has_failed,
     )
-
-
-def _diffrax() -> Any:
-    try:
-        import diffrax
-    except ImportError as error:
-        raise ImportError(
-            "adaptive_rollout needs diffrax, which is not installed: pip install 'mjxgrad[adaptive]'"
-        ) from error
-    return diffrax

@@ -37,28 +37,19 @@ class Affine(eqx.Module):
         return self.gain @ inputs if self.offset is None else self.gain @ inputs + self.offset
 
 
-class LinearPolicy(eqx.Module):
-    """See `linear_policy`."""
-
-    observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
-
-    def __call__(self, params: Affine, state: Any) -> Float[Array, " nu"]:
-        """Give the controls in a state."""
-        return params(self.observe(state))
-
-
-class MLPPolicy(eqx.Module):
-    """See `mlp_policy`."""
+class FeedforwardPolicy(eqx.Module):
+    """See `linear_policy` and `mlp_policy`, which differ in the number of layers."""
 
     observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
     limits: Float[Array, "nu 2"] | None = None
 
-    def __call__(self, params: tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
-        """Give the controls in a state."""
+    def __call__(self, params: Affine | tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
+        """Return the controls in a state."""
+        *layers, last = (params,) if isinstance(params, Affine) else params
         hidden = self.observe(state)
-        for layer in params[:-1]:
+        for layer in layers:
             hidden = jnp.tanh(layer(hidden))
-        action = params[-1](hidden)
+        action = last(hidden)
         if self.limits is None:
             return action
         low, high = self.limits.T
@@ -89,7 +80,7 @@ def linear_policy(
     *,
     bias: bool = True,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
-) -> tuple[LinearPolicy, Affine]:
+) -> tuple[FeedforwardPolicy, Affine]:
     """Make the policy u = K x + k, all zero at the start.
 
         policy, params = linear_policy(4, 1)
@@ -112,7 +103,7 @@ def linear_policy(
     """
     _check_positive(num_states=num_states, num_controls=num_controls)
     offset = jnp.zeros(num_controls) if bias else None
-    return LinearPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
+    return FeedforwardPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
 
 
 def mlp_policy(
@@ -124,7 +115,7 @@ def mlp_policy(
     key: PRNGKeyArray,
     limits: Float[ArrayLike, "nu 2"] | None = None,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
-) -> tuple[MLPPolicy, tuple[Affine, ...]]:
+) -> tuple[FeedforwardPolicy, tuple[Affine, ...]]:
     r"""Make a multilayer perceptron with tanh between its layers.
 
     After the last layer there is none, unless there are limits: within $m \pm l$ the action is then
@@ -164,7 +155,7 @@ def mlp_policy(
         Affine(scale * jax.random.normal(k, (outputs, inputs)) / inputs**0.5, jnp.zeros(outputs))
         for k, scale, inputs, outputs in zip(keys, scales, sizes[:-1], sizes[1:], strict=True)
     ]
-    return MLPPolicy(observe, bounds), tuple(layers)
+    return FeedforwardPolicy(observe, bounds), tuple(layers)
 
 
 def _check_positive(**numbers: int) -> None:

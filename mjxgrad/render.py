@@ -72,7 +72,7 @@ def frames(
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
     data, option = mujoco.MjData(mj_model), mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = show_contacts
-    view = _free_camera(mj_model) if camera is None else camera
+    view = -1 if camera is None else camera
     drawn = []
     with _renderer(mj_model, height, width) as renderer:
         for state in _nearest(len(positions), timestep, speed / fps):
@@ -135,12 +135,6 @@ def _nearest(num_states: int, timestep: Number, interval: Number) -> np.ndarray:
     num_frames = int((num_states - 1) * timestep / interval + 1e-6) + 1
     times = np.arange(num_frames) * interval
     return np.minimum(np.rint(times / timestep).astype(int), num_states - 1)
-
-
-def _free_camera(mj_model: mujoco.MjModel) -> mujoco.MjvCamera:
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(mj_model, camera)
-    return camera
 
 
 # A broken driver may end the process that tries it, so another one does.

@@ -20,7 +20,14 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import compensated_stiffness
-from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import (
+    ContactPair,
+    ContactParameters,
+    contact_pairs,
+    contact_parameters,
+    deciding_geoms,
+    named_pairs,
+)
 
 _PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
 _SUBSETS = ("geoms", "pairs", "bodies", "groups")
@@ -172,15 +179,7 @@ class Softness(eqx.Module):
         """
         everything = contact_pairs(model)
         if self.pairs is not None:
-            wanted = {frozenset(names) for names in self.pairs}
-            known = {frozenset(pair.names) for pair in everything}
-            for names in self.pairs:
-                if frozenset(names) not in known:
-                    raise ValueError(
-                        f"softness.pairs must name pairs of geoms that can touch, got {names!r}; "
-                        f"those that can: {', '.join(str(p) for p in everything) or 'none'}"
-                    )
-            return tuple(p for p in everything if frozenset(p.names) in wanted)
+            return named_pairs(everything, self.pairs, "softness.pairs")
         if self.geoms is not None:
             return _with_any(everything, "geoms", self.geoms, [set(pair.names) for pair in everything])
         if self.bodies is not None:
@@ -193,15 +192,9 @@ class Softness(eqx.Module):
     def apply(self, model: mjx.Model) -> mjx.Model:
         r"""Write this softness into a model.
 
-        Traceable and differentiable with respect to every part and to the model's leaves. If only
-        one of stiffness and damping ratio is given, a geom that takes part in several pairs can
-        keep the other's present value only if those pairs agree in it.
-
-        Args:
-            model: of MJX.
-
-        Returns:
-            The model with other `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`.
+        That is `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`. Traceable and
+        differentiable with respect to every part and to the model's leaves. If only one of stiffness and damping ratio is given,
+        a geom that takes part in several pairs can keep the other's present value only if those pairs agree in it.
 
         Raises:
             ValueError: if a part has a leading axis; if a name is unknown; if a geom to be changed

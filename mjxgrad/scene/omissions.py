@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import make_efc_type
-from mjxgrad.contact.parameters import ContactPair, contact_pairs
+from mjxgrad.contact.parameters import ContactPair, contact_pairs, named_pairs
 from mjxgrad.scene.refusals import has_medium
 
 _NUM_MASK_BITS = 31  # of a signed integer, the sign left alone
@@ -166,9 +166,14 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
         ValueError: if a name is unknown, a pair is listed as `<pair>` in the file, or there are too many different
             pairs to leave out.
     """
-    rows = _num_rows(model)
+    rows = len(make_efc_type(model))
     everything = contact_pairs(model)
-    omitted = _named(everything, wanted)
+    omitted = named_pairs(everything, wanted.pairs, "leave_out.pairs")
+    for pair in omitted:
+        if pair.explicit >= 0:
+            raise ValueError(
+                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
+            )
     if omitted:
         try:
             keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
@@ -181,8 +186,8 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
     model.jnt_limited[without_limit] = 0
     omissions = _in_words(omitted, len(everything), wanted)
     if omissions:
-        omissions.append(Omission("constraint rows", f"{_num_rows(model)} remain of {rows}"))
-    return tuple(omitted), tuple(omissions)
+        omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
+    return omitted, tuple(omissions)
 
 
 def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
@@ -219,25 +224,6 @@ def _between(geoms: Iterable[int], others: Iterable[int]) -> set[frozenset[int]]
     return {frozenset((geom, other)) for geom in geoms for other in others}
 
 
-def _named(everything: tuple[ContactPair, ...], wanted: LeaveOut) -> list[ContactPair]:
-    by_names = {frozenset(pair.names): pair for pair in everything}
-    omitted = []
-    for names in dict.fromkeys(map(frozenset, wanted.pairs)):
-        pair = by_names.get(names)
-        shown = " – ".join(sorted(names))
-        if pair is None:
-            listed = ", ".join(map(str, everything[:20])) + (" ..." if len(everything) > 20 else "")
-            raise ValueError(
-                f"leave_out.pairs must name pairs of geoms that can touch, got {shown!r}; those that can: {listed or 'none'}"
-            )
-        if pair.explicit >= 0:
-            raise ValueError(
-                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {shown!r}; remove it there"
-            )
-        omitted.append(pair)
-    return omitted
-
-
 def _limited_joint(model: mujoco.MjModel, name: str) -> int:
     joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if joint >= 0 and model.jnt_limited[joint]:
@@ -249,7 +235,7 @@ def _limited_joint(model: mujoco.MjModel, name: str) -> int:
     )
 
 
-def _in_words(omitted: list[ContactPair], total: int, wanted: LeaveOut) -> list[Omission]:
+def _in_words(omitted: tuple[ContactPair, ...], total: int, wanted: LeaveOut) -> list[Omission]:
     omissions = []
     if omitted:
         more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
@@ -258,7 +244,3 @@ def _in_words(omitted: list[ContactPair], total: int, wanted: LeaveOut) -> list[
     if wanted.limits:
         omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
     return omissions
-
-
-def _num_rows(model: mujoco.MjModel) -> int:
-    return len(make_efc_type(model))

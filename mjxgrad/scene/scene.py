@@ -4,7 +4,7 @@ import copy
 import difflib
 import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -128,11 +128,7 @@ class Scene(eqx.Module):
         return jnp.where(limited, self.model.actuator_ctrlrange, jnp.array([-jnp.inf, jnp.inf]))
 
     def warnings(self) -> list[str]:
-        """Sentences on contacts that `refsafe` alters or that the time step cannot follow.
-
-        Returns:
-            An empty list while the model is traced or batched, for its values are not known then.
-        """
+        """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
         leaves = (self.model.geom_solref, self.model.pair_solref, self.model.opt.timestep)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return []
@@ -141,11 +137,7 @@ class Scene(eqx.Module):
         return contact_warnings(self.model, self.pairs)
 
     def to_mujoco(self) -> mujoco.MjModel:
-        """Copy of the C model with the present values of `model`, softness included.
-
-        Returns:
-            A model that C MuJoCo steps as MJX steps this scene. Sizes and flags are those of
-            `mj_model`.
+        """Return the C model with the present values of `model`, softness included; sizes and flags are those of `mj_model`.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -162,10 +154,7 @@ class Scene(eqx.Module):
         return target
 
     def summary(self) -> str:
-        """Describe the scene for a human: sizes, options, contacts, conversions, omissions.
-
-        Returns:
-            Text of several lines, fit for a terminal about 120 characters wide.
+        """Describe the scene in text for a terminal 120 characters wide: sizes, options, contacts, conversions, omissions.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -245,65 +234,49 @@ def _heading(scene: Scene) -> str:
     return "\n".join([scene.name, "  " + ", ".join(counted), "  " + ", ".join(options)])
 
 
-_COLUMNS = (
-    ("pair", "condim", "solref", "k", "b", "ω₀", "τ", "ζ", "impedance", "width", "h²k+2hb",
-     "friction", "margin"),
-    ("", "", "", "1/s²", "1/s", "rad/s", "ms", "", "", "mm", "", "", "mm"),
-)  # fmt: skip
-
-
 def _contacts(scene: Scene) -> str:
-    """One line for all pairs with the same parameters."""
+    """Return one line for all pairs with the same parameters."""
     if not scene.pairs:
         return ""
+    columns = list(_columns(scene))
     groups: dict[tuple[str, ...], list] = {}
-    for pair, cells in zip(scene.pairs, _contact_cells(scene), strict=True):
+    for pair, cells in zip(scene.pairs, zip(*(cells for _, _, cells in columns), strict=True), strict=True):
         groups.setdefault(cells, []).append(pair)
     rows = [(name_pairs(pairs), *cells) for cells, pairs in groups.items()]
-    has_rest = len(rows[0]) > len(_COLUMNS[0])
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
     legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
         "; stable while h²k + 2hb < 4" if is_euler else ""
     )
+    if columns[-1][0] == "at rest":
+        legend += "\n  at rest: distance under gravity, negative for a depth"
     if len(rows) < count:
         legend += "\n  all of them: scene.pairs"
-    columns = _COLUMNS
-    if has_rest:
-        columns = tuple((*column, cell) for column, cell in zip(_COLUMNS, ("at rest", "mm"), strict=True))
-        legend += "\n  at rest: distance under gravity, negative for a depth"
-    return _table(title, [*columns, *rows], is_numeric=True) + f"\n  {legend}"
+    heads = [("pair", *(name for name, _, _ in columns)), ("", *(unit for _, unit, _ in columns))]
+    return _table(title, heads + rows, is_numeric=True) + f"\n  {legend}"
 
 
-def _contact_cells(scene: Scene) -> list[tuple[str, ...]]:
-    """What the table says of each pair, without its names."""
+def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield what the table says of each pair: the name of a column, its unit, its cells."""
     parameters = scene.contact_parameters()
-    columns = (
-        [str(pair.condim) for pair in scene.pairs],
-        [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()],
-        _numbers(parameters.stiffness),
-        _numbers(parameters.damping),
-        _numbers(parameters.natural_frequency),
-        _numbers(1e3 * parameters.time_constant),
-        _numbers(parameters.damping_ratio),
-        [_range(row) for row in np.asarray(parameters.impedance)],
-        _numbers(1e3 * parameters.width),
-        _numbers(parameters.stability),
-        [_friction(pair.condim, row)
-         for pair, row in zip(scene.pairs, np.asarray(parameters.friction).tolist(), strict=True)],
-        _numbers(1e3 * parameters.margin),
-        *_rest_column(scene, parameters),
-    )  # fmt: skip
-    return list(zip(*columns, strict=True))
-
-
-def _rest_column(scene: Scene, parameters: ContactParameters) -> list[list[str]]:
-    """Where bodies rest under gravity, if some margin makes it worth a column."""
+    yield "condim", "", [str(pair.condim) for pair in scene.pairs]
+    yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]
+    yield "k", "1/s²", _numbers(parameters.stiffness)
+    yield "b", "1/s", _numbers(parameters.damping)
+    yield "ω₀", "rad/s", _numbers(parameters.natural_frequency)
+    yield "τ", "ms", _numbers(1e3 * parameters.time_constant)
+    yield "ζ", "", _numbers(parameters.damping_ratio)
+    yield "impedance", "", [_range(row) for row in np.asarray(parameters.impedance)]
+    yield "width", "mm", _numbers(1e3 * parameters.width)
+    yield "h²k+2hb", "", _numbers(parameters.stability)
+    frictions = np.asarray(parameters.friction).tolist()
+    yield "friction", "", [_friction(pair.condim, row) for pair, row in zip(scene.pairs, frictions, strict=True)]
+    yield "margin", "mm", _numbers(1e3 * parameters.margin)
     gravity = float(np.linalg.norm(np.asarray(scene.model.opt.gravity)))
-    if gravity == 0 or not np.any(parameters.margin) or not np.all(parameters.stiffness > 0):
-        return []
-    return [_numbers(1e3 * parameters.rest_distance(gravity))]
+    # Some margin makes where bodies rest under gravity worth a column.
+    if gravity > 0 and np.any(parameters.margin) and np.all(parameters.stiffness > 0):
+        yield "at rest", "mm", _numbers(1e3 * parameters.rest_distance(gravity))
 
 
 def _numbers(values) -> list[str]:
@@ -311,7 +284,7 @@ def _numbers(values) -> list[str]:
 
 
 def _friction(condim: int, friction: Sequence[float]) -> str:
-    """Sliding, torsional and rolling coefficients, as far as the contact has them."""
+    """Return sliding, torsional and rolling coefficients, as far as the contact has them."""
     if condim == 1:
         return "none"
     sliding = [format_number(x) for x in friction[:2]]

@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._rollout import State, Trajectory, initial_state
@@ -27,20 +28,11 @@ PUSH_CONTACT = (("pusher", "pushed"),)
 REDUCED_MASS = 0.05  # kg
 
 
-class StateCost(eqx.Module):
-    """A quadratic cost of positions and velocities, in this order.
-
-    Attributes:
-        quadratic: of the state vector and the controls.
-    """
-
-    quadratic: published.QuadraticCost
-
-    def __call__(self, trajectory: Trajectory) -> Float[Array, " steps"]:
-        """Return the cost of every state: that of a step, and after the last step the final one."""
-        states = jnp.concatenate([trajectory.qpos, trajectory.qvel], axis=1)
-        charged = jax.vmap(self.quadratic.stage)(states[:-1], trajectory.ctrl)
-        return jnp.append(charged, self.quadratic.terminal(states[-1]))
+def quadratic_cost(quadratic: published.QuadraticCost, trajectory: Trajectory) -> Float[Array, " steps"]:
+    """Return the cost of every state, positions before velocities: that of a step, and after the last the final one."""
+    states = jnp.concatenate([trajectory.qpos, trajectory.qvel], axis=1)
+    charged = jax.vmap(quadratic.stage)(states[:-1], trajectory.ctrl)
+    return jnp.append(charged, quadratic.terminal(states[-1]))
 
 
 def push(stiffness: float = 10.0, *, horizon: int = 200) -> ActionTask:
@@ -182,7 +174,7 @@ def _quadratic_task(
     return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,
         state=initial_state(scene) if state is None else state,
-        cost=StateCost(cost),
+        cost=Partial(quadratic_cost, cost),
         horizon=horizon,
         start_params=start_params,
         **options,

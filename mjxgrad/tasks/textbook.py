@@ -197,11 +197,7 @@ class SoftHeaviside(Textbook):
 
 
 def heaviside() -> Heaviside:
-    r"""Return the step, 1 from zero on: $F' = \varphi(\theta/\sigma)/\sigma$, and no derivative that sees it.
-
-    Returns:
-        The problem.
-    """
+    r"""Return the step, 1 from zero on: $F' = \varphi(\theta/\sigma)/\sigma$, and no derivative that sees it."""
     return Heaviside()
 
 
@@ -213,9 +209,6 @@ def soft_heaviside(width: ArrayLike) -> SoftHeaviside:
 
     Args:
         width: $\nu > 0$ of the slope; $1/\nu$ is the stiffness.
-
-    Returns:
-        The problem.
 
     Raises:
         ValueError: if `width` is not positive.
@@ -295,9 +288,6 @@ def quadratic_sine(amplitude: ArrayLike, frequency: ArrayLike) -> QuadraticSine:
     Args:
         amplitude: $m$.
         frequency: $\omega$, in rad per unit of the parameter.
-
-    Returns:
-        The problem.
     """
     return QuadraticSine(number(amplitude), number(frequency))
 
@@ -379,9 +369,6 @@ def ball_over_wall(
         gravity: in m/s².
         distance: of the wall, in m.
         height: of the wall, in m.
-
-    Returns:
-        The problem.
 
     Raises:
         ValueError: if a number is not positive, or no throw clears the wall.
