@@ -235,16 +235,17 @@ def rollout(
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
-        carry = (kept, None if before is None else ctrl, first_bad, unsolved, tangent, growth)
+        carry = (kept, None if before is None else ctrl.astype(before.dtype), first_bad, unsolved, tangent, growth)
         return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
 
     if checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
+    policy_looks = policy is not None and policy_sees == "observations"
     start = (
         state,
-        scene.data.ctrl if policy is not None and policy_sees == "observations" else None,
+        scene.data.ctrl if policy_looks else None,  # the control before, under which a policy looks
         jnp.full((), -1, jnp.int32),
         jnp.zeros((), jnp.int32),
         _direction(state) if measure_growth else None,
@@ -374,10 +375,8 @@ def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
         raise ValueError(
             f"{name} must have shape {shape}, one row per step and one column per actuator, got {value.shape}"
         )
-    if isinstance(value, jax.core.Tracer):
+    numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
+    if numbers is None or np.isfinite(numbers).all():
         return
-    known = np.asarray(value)  # not jnp, whose operations are traced inside jit even on known values
-    if np.isfinite(known).all():
-        return
-    row, column = np.argwhere(~np.isfinite(known))[0]
-    raise ValueError(f"{name} must be finite, got {known[row, column]} in step {row} for actuator {column}")
+    row, column = np.argwhere(~np.isfinite(numbers))[0]
+    raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")

@@ -1,9 +1,4 @@
-"""What a scene's sensors read and where its sites are, by name.
-
-For `observe=` of a rollout or a task, beside `contact_force`, which is called alike:
-
-    observe=lambda model, data: {"touch": mg.sensor(model, data, "touch"), "tip": mg.site_position(model, data, "tip")}
-"""
+"""What a scene's sensors read and where its sites are, by name: for `observe=`, beside `contact_force`, called alike."""
 
 import mujoco
 from jaxtyping import Array, Float

@@ -96,29 +96,24 @@ class Scene(eqx.Module):
         Raises:
             ValueError: if there is no such field, it is not an array of numbers, or the shape is another.
         """
-        known = {
-            f.name for f in self.model.fields() if jnp.issubdtype(_dtype(getattr(self.model, f.name)), jnp.floating)
+        present = {field.name: getattr(self.model, field.name) for field in self.model.fields()}
+        arrays = {
+            k: v for k, v in present.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)
         }
         for name, value in fields.items():
-            if name not in known:
-                near = difflib.get_close_matches(name, known, n=3)
-                remedy = f"did you mean {' or '.join(near)}?" if near else "see mujoco's documentation of mjModel"
+            if name not in arrays:
+                near = difflib.get_close_matches(name, arrays, n=3)
+                remedy = f"did you mean {' or '.join(near)}?" if near else "see MuJoCo's documentation of mjModel"
                 raise ValueError(f"with_model must name arrays of numbers of the MJX model, got {name}; {remedy}")
-            shape = getattr(self.model, name).shape
-            if np.shape(value) != shape:
-                raise ValueError(f"{name} must have shape {shape} in this scene, got {np.shape(value)}")
-        changed = {name: jnp.asarray(value, getattr(self.model, name).dtype) for name, value in fields.items()}
+            if np.shape(value) != arrays[name].shape:
+                raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
+        changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
         if {"body_mass", "body_inertia"} & fields.keys() and not set(_COMPILED) & fields.keys():
-            _warn(
-                self,
-                f"{', '.join(_COMPILED)} do not follow the mass: MuJoCo computes them when it compiles a model; "
-                "give them, too, or know that contacts are as stiff as for the old mass",
-            )
+            constants = ", ".join(_COMPILED)
+            _warn(self, f"{constants} do not follow the mass; give them, too, or contacts yield as for the old one")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
-            _warn(
-                self, "loaded without damping, so dof_damping is integrated explicitly; load with keep_everything=True"
-            )
+            _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
         return eqx.tree_at(lambda s: s.model, self, self.model.replace(**changed))
 
     @property
@@ -177,10 +172,6 @@ class Scene(eqx.Module):
 def _warn(scene: Scene, message: str) -> None:
     """Warn whoever called a method of the scene; Equinox wraps methods, so this is one level further up."""
     warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
-
-
-def _dtype(value: object) -> object:
-    return getattr(value, "dtype", object)
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:

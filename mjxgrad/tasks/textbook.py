@@ -22,6 +22,7 @@ from jax.scipy.stats import norm
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mjxgrad._static import known
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import Scene, load_scene
@@ -67,9 +68,9 @@ class Textbook(eqx.Module):
     def gradient(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
         """Return what is to be estimated, F'(θ)."""
 
-    @abstractmethod
     def first_order_mean(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
-        """Return what the first-order estimate converges to, E f'(θ + w): without the jumps."""
+        """Return what the first-order estimate converges to, E f'(θ + w): the gradient, but for jumps of the cost."""
+        return self.gradient(point, stddev)
 
     @abstractmethod
     def first_order_variance(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
@@ -134,8 +135,8 @@ def number(value: ArrayLike) -> Float[Array, ""]:
 def positive(value: ArrayLike, name: str) -> Float[Array, ""]:
     """Return a number as an array of floating point, refusing one that is not positive."""
     array = number(value)
-    # A traced value (a sweep) cannot be looked at here.
-    if not isinstance(array, jax.core.Tracer) and not bool((array > 0).all()):
+    values = known(array)  # None in a sweep
+    if values is not None and not (values > 0).all():
         raise ValueError(f"{name} must be positive, got {value}")
     return array
 
@@ -187,9 +188,6 @@ class SoftHeaviside(Textbook):
 
     def gradient(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
         return 2 * self.slope_probability(point, stddev) / self.width
-
-    def first_order_mean(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
-        return self.gradient(point, stddev)
 
     def first_order_variance(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
         p = self.slope_probability(point, stddev)
@@ -250,9 +248,6 @@ class QuadraticSine(Textbook):
     def gradient(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
         slope = self.amplitude * self.frequency * self.damping(stddev)
         return 2 * jnp.asarray(point) + slope * jnp.cos(self.frequency * point)
-
-    def first_order_mean(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
-        return self.gradient(point, stddev)
 
     def first_order_variance(self, point: ArrayLike, stddev: ArrayLike) -> Float[Array, ""]:
         slope, left, angle = self.amplitude * self.frequency, self.damping(stddev), self.frequency * point
