@@ -22,7 +22,7 @@ Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """From model and data to anything made of arrays."""
 Sees = Literal["state", "observations"]
-_ROUNDING = 1e-6  # m or rad, within single precision's of a range
+_NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
 class State(eqx.Module):
@@ -334,14 +334,17 @@ def _part(name: str, value: Any, template: Array, size: int) -> Array:
 def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
     """Say which limited hinges and slides a pose holds beyond their range, where both are known."""
     pose, ranges = known(qpos), known(model.jnt_range)
-    if pose is None or ranges is None or pose.shape != (model.nq,) or ranges.ndim != 2:
+    if pose is None or ranges is None or pose.shape != (model.nq,) or ranges.shape != (model.njnt, 2):
         return
-    scalar = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    for joint in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, scalar)).tolist():
+    if model.opt.disableflags & _NO_LIMITS:
+        return
+    units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
+    for joint in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, list(units))).tolist():
         value, (low, high) = pose[model.jnt_qposadr[joint]], ranges[joint]
-        if not low - _ROUNDING <= value <= high + _ROUNDING:
+        slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
+        if not low - slack <= value <= high + slack:
             name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
-            unit = "rad" if model.jnt_type[joint] == scalar[0] else "m"
+            unit = units[int(model.jnt_type[joint])]
             yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
 
 

@@ -131,23 +131,24 @@ def look(model, data):
 
 @pytest.fixture(scope="module")
 def seeing(cart):
-    """Its cost is of what is observed of the last state: the place, and the acceleration under the last control."""
+    """Its cost is of what is observed: the place, and the acceleration under the control of the step."""
     return SceneTask(
-        cart.scene, cart.state, lambda t: t.observations[-1].sum(), 3, observe=look, policy_sees="observations"
+        cart.scene, cart.state, lambda t: t.observations.sum(axis=1), 3, observe=look, policy_sees="observations"
     )
 
 
 def test_a_policy_that_sees_observations_looks_before_it_chooses_and_the_cost_reads_them(seeing):
     """The recursion u_t = k·(x_t + u_{t−1}/m) + ½, semi-implicit Euler of 2 kg."""
     outcome = eqx.filter_jit(seeing.run)(lambda gain, seen: gain * seen.sum(keepdims=True) + 0.5, -0.7)
-    x, v, u, states = 0.0, 0.0, 0.0, []
+    x, v, u, states, costs = 0.0, 0.0, 0.0, [], []
     for _ in range(3):
         states.append((x, u / 2))
         u = -0.7 * (x + u / 2) + 0.5
+        costs.append(x + u / 2)
         v += 0.05 * u / 2
         x += 0.05 * v
     np.testing.assert_allclose(outcome.states, states, rtol=1e-9)
-    np.testing.assert_allclose(outcome.cost, x + u / 2, rtol=1e-9)
+    np.testing.assert_allclose(outcome.step_costs, [*costs, x + u / 2], rtol=1e-9)
 
 
 def test_a_policy_that_sees_observations_is_differentiated_by_its_noise(seeing, key):
