@@ -18,11 +18,10 @@ _ABOVE_NOTHING = 1e-6  # m; a body that hovers by less rests where it should
 def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:
     r"""Return the largest $h \omega_0$ at which a contact at full impedance does not gain energy.
 
-    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and
-    $\zeta = b / (2 \omega_0)$. Semi-implicit Euler, as which `implicitfast` treats contact too,
-    is stable while $h^2 k + 2 h b < 4$, that is up to $2 (\sqrt{1 + \zeta^2} - \zeta)$. RK4 is
-    stable while its amplification factor at both eigenvalues is at most 1.
-    The limit of $h b$ is $2 \zeta$ times this.
+    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit Euler, as
+    which `implicitfast` treats contact too, is stable while $h^2 k + 2 h b < 4$, that is up to
+    $2 (\sqrt{1 + \zeta^2} - \zeta)$. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The limit of
+    $h b$ is $2 \zeta$ times this.
     """
     if integrator != mujoco.mjtIntegrator.mjINT_RK4:
         # The difference of two large numbers, in a form that does not cancel.
@@ -58,9 +57,8 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
 
     def found() -> Iterator[tuple[ContactPair, str]]:
-        for pair, first, k, b, bounds, over in zip(
-            pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True
-        ):
+        rows = zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True)
+        for pair, first, k, b, bounds, over in rows:
             for message in (
                 altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
                 beyond_stability(*steepest(k, b, bounds, over), timestep, integrator),

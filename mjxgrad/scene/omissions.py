@@ -8,7 +8,7 @@ import numpy as np
 
 from mjxgrad._mjx import make_efc_type
 from mjxgrad.contact.parameters import ContactPair, contact_pairs, named_pairs
-from mjxgrad.scene.refusals import has_medium
+from mjxgrad.scene.refusals import has_friction_loss, has_limits, has_medium
 
 _NUM_MASK_BITS = 31  # of a signed integer, the sign left alone
 _DISABLE = mujoco.mjtDisableBit
@@ -118,14 +118,6 @@ def _num_render_meshes(model: mujoco.MjModel) -> int:
     return model.nmesh - len(collided)
 
 
-def _has_limits(model: mujoco.MjModel) -> bool:
-    return bool(model.jnt_limited.any() or model.tendon_limited.any())
-
-
-def _has_friction_loss(model: mujoco.MjModel) -> bool:
-    return bool((model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any())
-
-
 _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("tendons", _absent("none in the scene", lambda m: m.ntendon > 0)),
     ("collision detection",
@@ -134,9 +126,9 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("equality constraints",
      _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
     ("friction loss",
-     _absent("no joint or tendon has any", _has_friction_loss,
+     _absent("no joint or tendon has any", has_friction_loss,
              _DISABLE.mjDSBL_FRICTIONLOSS)),
-    ("limits", _absent("no joint or tendon is limited", _has_limits, _DISABLE.mjDSBL_LIMIT)),
+    ("limits", _absent("no joint or tendon is limited", has_limits, _DISABLE.mjDSBL_LIMIT)),
     ("actuation", _absent("no actuators", lambda m: m.nu > 0, _DISABLE.mjDSBL_ACTUATION)),
     ("gravity compensation",
      _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),

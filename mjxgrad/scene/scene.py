@@ -33,14 +33,12 @@ class SceneWarning(UserWarning):
 class Scene(eqx.Module):
     """A scene ready to be stepped.
 
-    Indices of bodies, joints and geoms are those of the C model, so that
-    `scene.model.geom_friction[i]` is what a user of MuJoCo expects.
+    Indices of bodies, joints and geoms are those of the C model: `scene.model.geom_friction[i]` is as in MuJoCo.
 
     Attributes:
         model: for MJX; its array leaves may be differentiated, replaced and batched.
         data: template at `qpos0`; no stage of the dynamics has run.
-        mj_model: the C model of the same motion, complete, for rendering and names. It keeps the
-            contact parameters of the file: see `to_mujoco`.
+        mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`.
         omissions: what a step leaves out, and why.
         conversions: settings replaced by others, and why.
         pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
