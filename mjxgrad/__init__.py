@@ -26,7 +26,8 @@ from mjxgrad.optimiser import (
     optimise,
 )
 from mjxgrad.policy import linear_policy, mlp_policy
-from mjxgrad.scene import LeaveOut, Scene, load_scene
+from mjxgrad.scene import LeaveOut, Scene, load_scene, sensor, site_position
+from mjxgrad.task import SceneTask
 
 __all__ = [
     "Convergence",
@@ -39,6 +40,7 @@ __all__ = [
     "Plateau",
     "Progress",
     "Scene",
+    "SceneTask",
     "Smoothing",
     "Softness",
     "State",
@@ -67,6 +69,8 @@ __all__ = [
     "planning",
     "render",
     "rollout",
+    "sensor",
+    "site_position",
     "solve",
     "step",
     "tasks",

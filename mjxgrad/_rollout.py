@@ -1,8 +1,8 @@
 """Many steps: a scan with a lean carry, checkpointed, that says when it has gone wrong."""
 
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -12,12 +12,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._mjx import mjx
+from mjxgrad._static import known
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene, SceneWarning
 
-Policy = Callable[[PyTree, "State"], Float[Array, " nu"]]
+Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
+"""From its parameters and what it sees to controls."""
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
+"""From model and data to anything made of arrays."""
+Sees = Literal["state", "observations"]
+_NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
 class State(eqx.Module):
@@ -45,7 +50,9 @@ class Trajectory(eqx.Module):
         qpos: positions before each step and after the last.
         qvel: velocities, likewise.
         ctrl: controls applied in each step, noise included.
-        observations: what `observe` returned for each of these states, stacked; None without it.
+        observations: what `observe` returned for each of these states, stacked, under the control of the step that follows
+            (of the last step for the last state); None without it.
+        seen: what a policy that sees observations was called with, stacked; None for others.
         final: the last state, to continue from.
         diverged: whether some step gave a non-finite or runaway state.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
@@ -56,6 +63,7 @@ class Trajectory(eqx.Module):
             hardly have such a limit). Only `rollout` counts it.
         growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
             velocities and positions alike; None unless asked for.
+        act: activations of actuators, as positions; only `rollout` keeps them.
     """
 
     qpos: Float[Array, "states nq"]
@@ -67,6 +75,8 @@ class Trajectory(eqx.Module):
     first_bad_step: Int[Array, ""]
     unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
     growth: Float[Array, ""] | None = None
+    act: Float[Array, "states na"] | None = None
+    seen: PyTree = None
 
     @property
     def explodes(self) -> Bool[Array, "*batch"]:
@@ -90,6 +100,8 @@ def initial_state(
 ) -> State:
     """Return the state at the scene's reference pose, at rest, with the given parts replaced.
 
+    It warns of a joint that begins beyond its limits, where values are known: the limit would push it back from the first step.
+
     Args:
         scene: where it lives.
         qpos: generalised positions (m, rad, unit quaternions).
@@ -100,6 +112,9 @@ def initial_state(
         ValueError: if a part does not have the shape that the scene gives it.
     """
     data, model = scene.data, scene.model
+    if qpos is not None:
+        for message in _beyond_limits(model, qpos):
+            warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     parts = {
         "qpos": _part("qpos", qpos, data.qpos, model.nq),
         "qvel": _part("qvel", qvel, data.qvel, model.nv),
@@ -117,6 +132,7 @@ def rollout(
     *,
     horizon: int | None = None,
     observe: Observe | None = None,
+    policy_sees: Sees = "state",
     checkpoint: bool = True,
     gradient: Gradient = "discrete",
     onset: Onset | None = None,
@@ -133,11 +149,16 @@ def rollout(
         scene: from `load_scene`.
         state: where to begin, from `initial_state` or the end of another rollout.
         controls: one row per step; or a policy, called as `policy(params, state)`; or None for the scene's resting ones.
+            Beyond an actuator's `ctrlrange` a control has the effect of its end, and derivative zero.
         params: handed to the policy.
         noise: added to the controls, one row per step.
         horizon: number of steps; needed only where neither controls nor noise give it.
         observe: called as `observe(model, data)` with the data of every state, all positions, contacts and forces filled
-            in; its results are stacked. Name what you need: what it does not return is not kept.
+            in; its results are stacked. Name what you need: what it does not return is not kept. `mg.sensor`,
+            `mg.site_position` and `mg.contact_force` read things by name.
+        policy_sees: "state", or "observations": the policy is then called with what `observe` returns in place of the state.
+            It looks before it chooses: forces and accelerations are those under the control before, in the first step under the
+            scene's resting one. This takes a second solve per step where they are observed.
         checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
             a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
         gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same. The default is what
@@ -165,6 +186,10 @@ def rollout(
             warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     if onset is not None:
         onset.check(gradient)
+    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
+        raise ValueError(
+            f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}, {observe=}'
+        )
     nu = scene.model.nu
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
@@ -176,58 +201,76 @@ def rollout(
     resting = jnp.broadcast_to(scene.data.ctrl, (horizon, nu))
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
+    settings = {"onset": onset, "smoothing": smoothing}
+    has_stages = scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+
+    def look(state: State, ctrl: Array, stepped: mjx.Data | None = None) -> PyTree:
+        if observe is None:
+            return None
+        data = data_of(scene, state, ctrl)
+        if stepped is None or has_stages:  # what a step of several stages leaves is of its last
+            return observe(scene.model, forward(scene.model, data, **settings))
+        at_start = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
+        return observe(scene.model, stepped.replace(**at_start))
 
     def advance(carry: tuple, inputs: tuple[Array, Array, Array]):
-        state, first_bad, unsolved, tangent, growth = carry
+        state, before, first_bad, unsolved, tangent, growth = carry
         index, row, disturbance = inputs
-        ctrl = (row if policy is None else policy(params, state)) + disturbance
+        seen = None if before is None else look(state, before)
+        ctrl = (row if policy is None else policy(params, state if before is None else seen)) + disturbance
         data = data_of(scene, state, ctrl)
-
-        def take(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
-            here = data.replace(qpos=qpos, qvel=qvel)
-            stepped = step(scene.model, here, gradient=gradient, onset=onset, smoothing=smoothing)
-            return (stepped.qpos, stepped.qvel), stepped
-
         if measure_growth:
+
+            def take(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
+                stepped = step(scene.model, data.replace(qpos=qpos, qvel=qvel), gradient=gradient, **settings)
+                return (stepped.qpos, stepped.qvel), stepped
+
             _, tangent, stepped = jax.jvp(take, (state.qpos, state.qvel), tangent, has_aux=True)
             tangent = jax.lax.stop_gradient(tangent)
-            growth = jnp.maximum(growth, _length(tangent))  # a NaN stays one
+            growth = jnp.maximum(growth, jnp.linalg.norm(jnp.concatenate(tangent)))  # a NaN stays one
         else:
-            stepped = take(state.qpos, state.qvel)[1]
+            stepped = step(scene.model, data, gradient=gradient, **settings)
         moved = state_of(stepped)
         is_bad = ~is_sound(moved, velocity_limit)
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
-        seen = None if observe is None else _observed(scene, observe, data, stepped, onset, smoothing)
         unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
-        return (kept, first_bad, unsolved, tangent, growth), (state.qpos, state.qvel, ctrl, seen)
+        carry = (kept, None if before is None else ctrl.astype(before.dtype), first_bad, unsolved, tangent, growth)
+        return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
 
     if checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
-    tangent = _direction(state) if measure_growth else None
-    length = jnp.ones((), state.qvel.dtype) if measure_growth else None
-    start = (state, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32), tangent, length)
-    (final, first_bad, unsolved, _, growth), (qpos, qvel, ctrl, seen) = jax.lax.scan(
+    policy_looks = policy is not None and policy_sees == "observations"
+    start = (
+        state,
+        scene.data.ctrl if policy_looks else None,  # the control before, under which a policy looks
+        jnp.full((), -1, jnp.int32),
+        jnp.zeros((), jnp.int32),
+        _direction(state) if measure_growth else None,
+        jnp.ones((), state.qvel.dtype) if measure_growth else None,
+    )
+    (final, _, first_bad, unsolved, _, growth), (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(
         advance,
         start,
         (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
     )
     if observe is not None:
-        data = data_of(scene, final, ctrl[-1])
-        last = observe(scene.model, forward(scene.model, data, onset=onset, smoothing=smoothing))
-        seen = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, last)
+        last = look(final, ctrl[-1])
+        observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)
     return Trajectory(
         qpos=jnp.concatenate([qpos, final.qpos[None]]),
         qvel=jnp.concatenate([qvel, final.qvel[None]]),
         ctrl=ctrl,
-        observations=seen,
+        observations=observed,
         final=final,
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
         unsolved=unsolved,
         growth=None if growth is None else jnp.where(jnp.isnan(growth), jnp.inf, growth),
+        act=jnp.concatenate([act, final.act[None]]),
+        seen=seen,
     )
 
 
@@ -237,10 +280,6 @@ def _direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
     parts = (random.normal(size=state.qpos.shape), random.normal(size=state.qvel.shape))
     size = np.sqrt(sum((part**2).sum() for part in parts))
     return tuple(jnp.asarray(part / size, state.qvel.dtype) for part in parts)  # pyright: ignore[reportReturnType]
-
-
-def _length(tangent: tuple[Array, Array]) -> Float[Array, ""]:
-    return jnp.sqrt(sum(jnp.sum(part**2) for part in tangent))
 
 
 def check_trajectory(trajectory: Trajectory) -> None:
@@ -285,27 +324,28 @@ def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
 
 
-def _observed(
-    scene: Scene,
-    observe: Observe,
-    data: mjx.Data,
-    stepped: mjx.Data,
-    onset: Onset | None,
-    smoothing: Smoothing | None,
-) -> PyTree:
-    """Call `observe` with the data of the state before the step."""
-    if scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        # The step's own are of its last stage.
-        return observe(scene.model, forward(scene.model, data, onset=onset, smoothing=smoothing))
-    before = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
-    return observe(scene.model, stepped.replace(**before))
-
-
 def _part(name: str, value: Any, template: Array, size: int) -> Array:
     value = template if value is None else jnp.asarray(value, template.dtype)
     if value.shape != (size,):
         raise ValueError(f"{name} must have shape ({size},) in this scene, got {value.shape}")
     return value
+
+
+def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
+    """Say which limited hinges and slides a pose holds beyond their range, where both are known."""
+    pose, ranges = known(qpos), known(model.jnt_range)
+    if pose is None or ranges is None or pose.shape != (model.nq,) or ranges.shape != (model.njnt, 2):
+        return
+    if model.opt.disableflags & _NO_LIMITS:
+        return
+    units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
+    for joint in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, list(units))).tolist():
+        value, (low, high) = pose[model.jnt_qposadr[joint]], ranges[joint]
+        slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
+        if not low - slack <= value <= high + slack:
+            name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+            unit = units[int(model.jnt_type[joint])]
+            yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
 
 
 def _check_state(scene: Scene, state: State) -> None:
@@ -338,10 +378,8 @@ def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
         raise ValueError(
             f"{name} must have shape {shape}, one row per step and one column per actuator, got {value.shape}"
         )
-    if isinstance(value, jax.core.Tracer):
+    numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
+    if numbers is None or np.isfinite(numbers).all():
         return
-    known = np.asarray(value)  # not jnp, whose operations are traced inside jit even on known values
-    if np.isfinite(known).all():
-        return
-    row, column = np.argwhere(~np.isfinite(known))[0]
-    raise ValueError(f"{name} must be finite, got {known[row, column]} in step {row} for actuator {column}")
+    row, column = np.argwhere(~np.isfinite(numbers))[0]
+    raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")

@@ -15,6 +15,7 @@ References:
     Simulators for Learning and Control (DiffMJX). arXiv:2506.14186, which integrates so, too, with contact from a distance.
 """
 
+import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from mjxgrad._rollout import State, data_of
+from mjxgrad._static import known
 from mjxgrad.dynamics import forward
 from mjxgrad.dynamics.kinematics import integrate_position
 from mjxgrad.scene import Scene
@@ -84,15 +86,17 @@ def adaptive_rollout(
             known).
         ImportError: if diffrax is not installed.
     """
-    is_known = not isinstance(tolerance, jax.core.Tracer)
-    if (is_known and not np.all(np.asarray(tolerance) > 0)) or max_steps < 1:
+    accuracy = known(tolerance)
+    if (accuracy is not None and not np.all(accuracy > 0)) or max_steps < 1:
         raise ValueError(f"tolerance and max_steps must be positive, got {tolerance} and {max_steps}")
-    diffrax = _diffrax()
+    try:
+        diffrax: Any = importlib.import_module("diffrax")
+    except ImportError as error:
+        raise ImportError("adaptive_rollout needs diffrax, not installed: pip install 'mjxgrad[adaptive]'") from error
     moments = jnp.asarray(times, state.qpos.dtype)
-    if not isinstance(moments, jax.core.Tracer):
-        known = np.asarray(moments)
-        if not known.size or known[0] < 0 or np.any(np.diff(known) <= 0):
-            raise ValueError(f"times must increase and begin at or after 0, got {known.tolist()}")
+    asked = known(moments)
+    if asked is not None and (not asked.size or asked[0] < 0 or np.any(np.diff(asked) <= 0)):
+        raise ValueError(f"times must increase and begin at or after 0, got {asked.tolist()}")
     resting = scene.data.ctrl
 
     def rates(t: Float[Array, ""], y: Rates, _: None) -> Rates:
@@ -127,13 +131,3 @@ def adaptive_rollout(
         num_rejected=jnp.asarray(solution.stats["num_rejected_steps"]),
         has_failed=has_failed,
     )
-
-
-def _diffrax() -> Any:
-    try:
-        import diffrax
-    except ImportError as error:
-        raise ImportError(
-            "adaptive_rollout needs diffrax, which is not installed: pip install 'mjxgrad[adaptive]'"
-        ) from error
-    return diffrax

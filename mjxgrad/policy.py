@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from mjxgrad._rollout import State
 from mjxgrad.task import as_pytree
@@ -37,34 +37,32 @@ class Affine(eqx.Module):
         return self.gain @ inputs if self.offset is None else self.gain @ inputs + self.offset
 
 
-class LinearPolicy(eqx.Module):
-    """See `linear_policy`."""
+class FeedforwardPolicy(eqx.Module):
+    """See `linear_policy` and `mlp_policy`, which differ in the number of layers."""
 
     observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
+    limits: Float[Array, "nu 2"] | None = None
 
-    def __call__(self, params: Affine, state: Any) -> Float[Array, " nu"]:
-        """Give the controls in a state."""
-        return params(self.observe(state))
-
-
-class MLPPolicy(eqx.Module):
-    """See `mlp_policy`."""
-
-    observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
-
-    def __call__(self, params: tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
-        """Give the controls in a state."""
+    def __call__(self, params: Affine | tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
+        """Return the controls in a state."""
+        *layers, last = (params,) if isinstance(params, Affine) else params
         hidden = self.observe(state)
-        for layer in params[:-1]:
+        for layer in layers:
             hidden = jnp.tanh(layer(hidden))
-        return params[-1](hidden)
+        action = last(hidden)
+        if self.limits is None:
+            return action
+        low, high = self.limits.T
+        is_bounded = jnp.isfinite(high - low)
+        middle, half = (jnp.where(is_bounded, x / 2, 1.0) for x in (low + high, high - low))
+        return jnp.where(is_bounded, middle + half * jnp.tanh(action / half), action)
 
 
 def whole_state(state: Any) -> Float[Array, " observed"]:
     """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order.
 
     Args:
-        state: what a task hands to its policy.
+        state: what a task hands to its policy, its state or its observations.
 
     Raises:
         ValueError: if it is neither.
@@ -82,18 +80,20 @@ def linear_policy(
     *,
     bias: bool = True,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
-) -> tuple[LinearPolicy, Affine]:
+) -> tuple[FeedforwardPolicy, Affine]:
     """Make the policy u = K x + k, all zero at the start.
 
         policy, params = linear_policy(4, 1)
         objective = closed_loop(task, policy, stddev=0.1, params=params)
 
+    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero.
+
     Args:
         num_states: how many numbers are observed.
         num_controls: how many controls are given.
         bias: whether there is the constant k.
-        observe: from the task's state to a vector; positions of a free body hold a quaternion, and angles do not wrap,
-            so choose what you need.
+        observe: from what the task hands over, its state or its observations, to a vector; positions of a free body hold a
+            quaternion, and angles do not wrap, so choose what you need.
 
     Returns:
         The policy, called as `policy(params, state)`, and its parameters.
@@ -103,7 +103,7 @@ def linear_policy(
     """
     _check_positive(num_states=num_states, num_controls=num_controls)
     offset = jnp.zeros(num_controls) if bias else None
-    return LinearPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
+    return FeedforwardPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
 
 
 def mlp_policy(
@@ -113,9 +113,13 @@ def mlp_policy(
     width: int,
     depth: int,
     key: PRNGKeyArray,
+    limits: Float[ArrayLike, "nu 2"] | None = None,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
-) -> tuple[MLPPolicy, tuple[Affine, ...]]:
-    r"""Make a multilayer perceptron with tanh between its layers and none after the last.
+) -> tuple[FeedforwardPolicy, tuple[Affine, ...]]:
+    r"""Make a multilayer perceptron with tanh between its layers.
+
+    After the last layer there is none, unless there are limits: within $m \pm l$ the action is then
+    $m + l\tanh(y/l)$, of slope 1 in the middle, so that its derivative does not end where MuJoCo would clip it.
 
     Gains start as $N(0, 1/\text{inputs})$, those of the last layer 100 times smaller; offsets as zero.
 
@@ -125,19 +129,25 @@ def mlp_policy(
         width: of every hidden layer.
         depth: number of hidden layers.
         key: for the gains; consumed here.
+        limits: the least and largest of each control, such as `scene.ctrlrange`; those that are not finite do not bound.
         observe: from the task's state to a vector; see `linear_policy`.
 
     Returns:
         The policy, called as `policy(params, state)`, and its parameters, layer by layer.
 
     Raises:
-        ValueError: if a number is below 1.
+        ValueError: if a number is below 1, or there is not one pair of limits per control.
 
     References:
         Andrychowicz et al. What Matters for On-Policy Deep Actor-Critic Methods? A Large-Scale Study. ICLR 2021,
         arXiv:2006.05990, section 3.2.
     """
     _check_positive(num_states=num_states, num_controls=num_controls, width=width, depth=depth)
+    bounds = None if limits is None else jnp.asarray(limits, float)
+    if bounds is not None and bounds.shape != (num_controls, 2):
+        raise ValueError(
+            f"limits must have shape ({num_controls}, 2), low and high of each control, got {bounds.shape}"
+        )
     sizes = [num_states, *[width] * depth, num_controls]
     keys = jax.random.split(key, depth + 1)
     scales = [1.0] * depth + [FINAL_SCALE]
@@ -145,7 +155,7 @@ def mlp_policy(
         Affine(scale * jax.random.normal(k, (outputs, inputs)) / inputs**0.5, jnp.zeros(outputs))
         for k, scale, inputs, outputs in zip(keys, scales, sizes[:-1], sizes[1:], strict=True)
     ]
-    return MLPPolicy(observe), tuple(layers)
+    return FeedforwardPolicy(observe, bounds), tuple(layers)
 
 
 def _check_positive(**numbers: int) -> None:

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -19,7 +18,7 @@ from jaxtyping import Array, Float, UInt8
 from mjxgrad.scene import Scene
 
 Number = int | float
-# (frames, height, width, 3); unnamed, for the videos of one call may differ in length and a tiling in size.
+# (frames, height, width, 3)
 Frames = UInt8[np.ndarray, "_ _ _ 3"]
 
 
@@ -73,7 +72,7 @@ def frames(
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
     data, option = mujoco.MjData(mj_model), mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = show_contacts
-    view = _free_camera(mj_model) if camera is None else camera
+    view = -1 if camera is None else camera
     drawn = []
     with _renderer(mj_model, height, width) as renderer:
         for state in _nearest(len(positions), timestep, speed / fps):
@@ -82,33 +81,6 @@ def frames(
             renderer.update_scene(data, view, option)
             drawn.append(renderer.render())
     return np.stack(drawn)
-
-
-def tile(videos: Sequence[Frames], captions: Sequence[str], *, columns: int) -> Frames:
-    """Put videos side by side, each under its caption; one that ends early keeps its last frame.
-
-    Args:
-        videos: of the same height and width.
-        captions: one for each.
-        columns: videos in a row; the last row is filled up with black.
-
-    Returns:
-        The frames of the whole.
-
-    Raises:
-        ValueError: if there are no videos, if the captions are not as many, or if the sizes differ.
-    """
-    if not videos or len(videos) != len(captions):
-        raise ValueError(f"captions must be as many as videos, and at least 1, got {len(captions)} for {len(videos)}")
-    sizes = {video.shape[1:] for video in videos}
-    if len(sizes) > 1:
-        raise ValueError(f"videos must have one size, got {sorted(size[:2] for size in sizes)}")
-    length = max(len(video) for video in videos)
-    padded = [video[np.minimum(np.arange(length), len(video) - 1)] for video in videos]
-    cells = [_captioned(video, caption) for video, caption in zip(padded, captions, strict=True)]
-    cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
-    rows = [np.concatenate(cells[i : i + columns], axis=2) for i in range(0, len(cells), columns)]
-    return np.concatenate(rows, axis=1)
 
 
 def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
@@ -165,12 +137,6 @@ def _nearest(num_states: int, timestep: Number, interval: Number) -> np.ndarray:
     return np.minimum(np.rint(times / timestep).astype(int), num_states - 1)
 
 
-def _free_camera(mj_model: mujoco.MjModel) -> mujoco.MjvCamera:
-    camera = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(mj_model, camera)
-    return camera
-
-
 # A broken driver may end the process that tries it, so another one does.
 _PROBE = """
 import mujoco
@@ -212,18 +178,3 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Rende
             "rendering needs an OpenGL that works without a display, and none was found: install libosmesa6 (draws on "
             f"the processor) or libegl1 (with a GPU's driver); MuJoCo said: {reason}"
         ) from error
-
-
-def _captioned(video: np.ndarray, caption: str) -> np.ndarray:
-    """Put a band with a caption above every frame."""
-    # Pillow's own font lacks Greek letters; matplotlib brings one that has them, and Pillow.
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
-
-    width = video.shape[2]
-    size = max(11, width // 28)
-    band = Image.new("RGB", (width, 2 * size), (24, 28, 36))
-    draw = ImageDraw.Draw(band)
-    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
-    draw.text((width / 2, size), caption, font=font, fill=(238, 240, 244), anchor="mm")
-    return np.concatenate([np.broadcast_to(np.asarray(band), (len(video), *np.asarray(band).shape)), video], axis=1)

@@ -3,20 +3,17 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad._rollout import Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
-
-Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 
 
 class Outcome(eqx.Module):
@@ -24,7 +21,7 @@ class Outcome(eqx.Module):
 
     Attributes:
         cost: of the whole rollout, NaN if it diverged.
-        states: in which the controls were chosen, with a leading axis of `horizon`.
+        states: in which the controls were chosen, with a leading axis of `horizon`: what a policy was called with.
         step_costs: what was charged at steps 0 to `horizon`, with the sum `cost`. Entry t depends only on states and
             controls up to t, so a control at t answers for the entries from t on and for no others. None where only
             the total is known.
@@ -67,7 +64,7 @@ class Task(eqx.Module):
         """
 
     def nominal_start(self) -> PyTree:
-        """Give where a rollout begins if nothing else is said; None if that has no name outside the task."""
+        """Return where a rollout begins if nothing else is said; None if that has no name outside the task."""
         return None
 
     def sample_start(self, key: PRNGKeyArray) -> PyTree:
@@ -99,14 +96,16 @@ class InScene(eqx.Module):
         gradient: of each step, "discrete" or "event", see `step`.
         onset: lets contacts begin within the step, so that the cost has no jumps but real ones and its plain derivative is right
             sample by sample; None is MuJoCo's motion. A leaf.
+        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
     """
 
     scene: Scene
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
+    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self: Same, gradient: Gradient) -> Same:
-        """Give the same with MuJoCo's own motion and one of its derivatives.
+        """Return the same with MuJoCo's own motion and one of its derivatives.
 
         Raises:
             ValueError: if there is no such gradient.
@@ -115,12 +114,16 @@ class InScene(eqx.Module):
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_onset(self: Same, onset: Onset | None) -> Same:
-        """Give the same with contacts that begin otherwise; None is MuJoCo's motion."""
+        """Return the same with contacts that begin otherwise; None is MuJoCo's motion."""
         return dataclasses.replace(self, gradient="discrete", onset=onset)
 
+    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
+        """Return the same with contact averaged over noise."""
+        return dataclasses.replace(self, smoothing=smoothing)
+
     def with_softness(self: Same, softness: Softness) -> Same:
-        """Give the same with other contact softness."""
-        return eqx.tree_at(lambda task: task.scene, self, self.scene.with_softness(softness))
+        """Return the same with other contact softness."""
+        return dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
 class SceneTask(Task, InScene):
@@ -129,29 +132,27 @@ class SceneTask(Task, InScene):
     Attributes:
         state: the nominal start.
         cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
-            and controls up to t, whose sum is the cost; traceable.
+            and controls up to t, whose sum is the cost; traceable. It may read `trajectory.observations`.
         horizon: number of steps.
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
-        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
+        observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
+        policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
     """
 
     state: State
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
-    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
-
-    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
-        """Give the same with contact averaged over noise."""
-        return dataclasses.replace(self, smoothing=smoothing)
+    observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Give the number of actuators."""
+        """Return the number of actuators."""
         return self.scene.model.nu
 
     def nominal_start(self) -> State:
-        """Give `state`."""
+        """Return `state`."""
         return self.state
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:
@@ -171,7 +172,6 @@ class SceneTask(Task, InScene):
             ValueError: if the cost is neither a number nor one number per state.
         """
         start = self.state if start is None else start
-        has_activations = self.scene.model.na > 0
         trajectory = rollout(
             self.scene,
             start,
@@ -179,15 +179,17 @@ class SceneTask(Task, InScene):
             params,
             noise,
             horizon=self.horizon,
-            observe=_activations if has_activations else None,
+            observe=self.observe,
+            policy_sees=self.policy_sees,
             gradient=self.gradient,
             onset=self.onset,
             smoothing=self.smoothing,
         )
-        elapsed = self.scene.model.opt.timestep * jnp.arange(self.horizon)
-        activations = trajectory.observations[:-1] if has_activations else jnp.zeros((self.horizon, 0))
-        qpos, qvel = trajectory.qpos[:-1], trajectory.qvel[:-1]
-        states = jax.vmap(State)(qpos, qvel, activations, start.time + elapsed, jnp.zeros_like(qvel))
+        states = trajectory.seen
+        if states is None:
+            qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
+            time = start.time + self.scene.model.opt.timestep * jnp.arange(self.horizon)
+            states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
         charged = finite_cost(jnp.asarray(self.cost(trajectory)), trajectory)
         if charged.shape not in ((), (self.horizon + 1,)):
             raise ValueError(
@@ -198,9 +200,5 @@ class SceneTask(Task, InScene):
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
-    """Give the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
+    """Return the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
     return jnp.where(trajectory.diverged, jnp.nan, cost)
-
-
-def _activations(model: mjx.Model, data: mjx.Data) -> Float[Array, " na"]:
-    return data.act

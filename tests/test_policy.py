@@ -108,3 +108,18 @@ def test_sizes_are_positive(key):
         mlp(key, width=0)
     with pytest.raises(ValueError, match="num_controls must be at least 1, got 0"):
         mg.linear_policy(3, 0)
+
+
+def test_a_perceptron_with_limits_stays_within_them_and_moves_freely_in_the_middle(key):
+    """M + l tanh(y/l): the middle for y = 0 with slope 1, an end for y far away; no bound where a limit is infinite."""
+    limits = jnp.array([[-1.0, 3.0], [-jnp.inf, jnp.inf]])
+    policy, (hidden, last) = mg.mlp_policy(1, 2, width=1, depth=1, key=key, limits=limits)
+
+    def act(offset):
+        return policy((hidden, Affine(0 * last.gain, offset * jnp.ones(2))), jnp.ones(1))
+
+    np.testing.assert_allclose(act(0.0), [1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(act)(0.0), [1.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose([act(-100.0), act(100.0)], [[-1.0, -100.0], [3.0, 100.0]], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"limits must have shape \(2, 2\)"):
+        mg.mlp_policy(1, 2, width=1, depth=1, key=key, limits=limits[:1])

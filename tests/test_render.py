@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.render import RenderingUnavailableError, frames, tile, write_video
+from experiments.video import tile
+from mjxgrad.render import RenderingUnavailableError, frames, write_video
 
 # A white ball that slides along x, seen from a camera that looks along y: its place in the picture is its place in x.
 SLIDER = """

@@ -122,3 +122,45 @@ def test_a_scene_whose_cost_has_another_length_is_refused(cart):
         ValueError, match=r"scalar of shape \(\) or one number per state, shape \(4,\), got shape \(3,\)"
     ):
         jax.eval_shape(wrong.run, THRUSTS)
+
+
+def look(model, data):
+    """Where the cart is, and how it is pushed: the control before, while a policy looks."""
+    return jnp.stack([data.qpos[0], data.qacc[0]])
+
+
+@pytest.fixture(scope="module")
+def seeing(cart):
+    """Its cost is of what is observed: the place, and the acceleration under the control of the step."""
+    return SceneTask(
+        cart.scene, cart.state, lambda t: t.observations.sum(axis=1), 3, observe=look, policy_sees="observations"
+    )
+
+
+def test_a_policy_that_sees_observations_looks_before_it_chooses_and_the_cost_reads_them(seeing):
+    """The recursion u_t = k·(x_t + u_{t−1}/m) + ½, semi-implicit Euler of 2 kg."""
+    outcome = eqx.filter_jit(seeing.run)(lambda gain, seen: gain * seen.sum(keepdims=True) + 0.5, -0.7)
+    x, v, u, states, costs = 0.0, 0.0, 0.0, [], []
+    for _ in range(3):
+        states.append((x, u / 2))
+        u = -0.7 * (x + u / 2) + 0.5
+        costs.append(x + u / 2)
+        v += 0.05 * u / 2
+        x += 0.05 * v
+    np.testing.assert_allclose(outcome.states, states, rtol=1e-9)
+    np.testing.assert_allclose(outcome.step_costs, [*costs, x + u / 2], rtol=1e-9)
+
+
+def test_a_policy_that_sees_observations_is_differentiated_by_its_noise(seeing, key):
+    objective = closed_loop(seeing, lambda gain, seen: gain @ seen, STDDEV, params=jnp.ones((1, 2)))
+    params, noise = jnp.array([0.3, -0.4]), objective.sample_noise(key)
+    found = eqx.filter_jit(objective.differentiate)(params, noise)
+    gradient = jax.jit(jax.grad(objective.value))(params, noise)
+    assert np.abs(gradient).min() > 1e-6
+    np.testing.assert_allclose(found.pull_back(found.gradient_by_noise), gradient, rtol=1e-8)
+
+
+def test_observations_without_a_function_that_observes_are_refused(cart):
+    blind = SceneTask(cart.scene, cart.state, per_state, 3, policy_sees="observations")
+    with pytest.raises(ValueError, match='policy_sees must be "state", or "observations" with observe='):
+        blind.run(THRUSTS)

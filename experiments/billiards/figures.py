@@ -9,7 +9,7 @@ from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplot
 from experiments.video import film
 from experiments.workspace import Workspace
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks import scene_path
 
 _COLOURS = (FIRST, "#8c6d31", ZEROTH, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6ecf", "#393b79", "#8b94a1")
 _MARKERS = "osD^vP*X<>"

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 import mjxgrad as mg
 from experiments.cube_toss.outcome import Course, Outcome, Point
 from experiments.cube_toss.settings import Settings
+from experiments.cube_toss.throw import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 from experiments.failure import ExperimentError
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
@@ -20,7 +21,6 @@ from mjxgrad._rollout import data_of
 from mjxgrad.dynamics import Gradient, assembly
 from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration import adaptive_rollout
-from mjxgrad.tasks.cube_toss import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10

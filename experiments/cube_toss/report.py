@@ -3,9 +3,9 @@
 import numpy as np
 
 from experiments.cube_toss.outcome import METHODS, Course, Outcome, Point
+from experiments.cube_toss.throw import PUBLISHED_DERIVATIVE
 from experiments.report import Table
 from experiments.words import quantity
-from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE
 
 _CONTACTS = {"published": "With a contact that begins continuously", "default": "With MuJoCo's default contact"}
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 import mjxgrad as mg
 from mjxgrad._rollout import State, data_of, state_of
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks import scene_path
 from mjxgrad.tasks.hopper import hopper
 
 _START_ANGLES = (2.4, 0.5)  # rad from hanging: high enough that the elbow turns over

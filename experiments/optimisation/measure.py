@@ -7,11 +7,11 @@ import numpy as np
 import mjxgrad as mg
 from experiments.optimisation.methods import estimator, problem, runner, scene
 from experiments.optimisation.outcome import Outcome, Run
+from experiments.optimisation.published import Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import Reason
-from mjxgrad.tasks.published import Published
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:

@@ -10,11 +10,11 @@ import optax
 from jaxtyping import Array, Key
 
 import mjxgrad as mg
+from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from mjxgrad.diagnostics import Rollouts
 from mjxgrad.diagnostics.budget import affordable
 from mjxgrad.estimators import GradientEstimate, rules
-from mjxgrad.tasks.published import TASKS, Published
 
 Run = Callable[..., mg.Optimisation]
 

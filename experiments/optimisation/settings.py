@@ -91,7 +91,7 @@ class Settings(RunSettings):
     """A published task, optimised by several methods from the same start at equal rollouts, over many seeds."""
 
     task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"]
-    """What is optimised; see `mjxgrad.tasks.published`."""
+    """What is optimised; see `experiments.optimisation.published`."""
     dynamics: Literal["published", "mjx"] = "published"
     """Whether the paper's own equations simulate the task, or MJX with contact."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]

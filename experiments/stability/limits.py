@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from experiments.stability.grid import Points
 from experiments.stability.scenes import RADIUS, StabilityScene, effective
-from mjxgrad.scene.contact_check import largest_stable_step, steepest
+from mjxgrad.contact.warnings import largest_stable_step, steepest
 from mjxgrad.tasks.textbook import Bounce
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.sawtooth.cases import case as landing_case
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks import scene_path
 
 
 @dataclass(frozen=True)

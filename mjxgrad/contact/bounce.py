@@ -37,26 +37,21 @@ class Bounce(eqx.Module):
 
     @property
     def frequency(self) -> Float[Array, "..."]:
-        r"""Give $\omega_0 = 1 / (t_c \zeta)$, in rad/s."""
+        r"""Return $\omega_0 = 1 / (t_c \zeta)$, in rad/s."""
         return 1 / (self.time_constant * self.damping_ratio)
 
     @property
     def restitution(self) -> Float[Array, "..."]:
-        r"""Give $e = \exp(-2 \zeta \arccos\zeta / \sqrt{1 - \zeta^2})$, continued beyond $\zeta = 1$, where it is $e^{-2}$."""
+        r"""Return $e = \exp(-2 \zeta \arccos\zeta / \sqrt{1 - \zeta^2})$, continued beyond $\zeta = 1$, where it is $e^{-2}$."""
         return jnp.exp(-2 * self.damping_ratio * _angle(self.damping_ratio))
 
     @property
     def duration(self) -> Float[Array, "..."]:
-        r"""Give how long the ball is pushed, $2 \arccos\zeta / (\omega_0 \sqrt{1 - \zeta^2})$, in s."""
+        r"""Return how long the ball is pushed, $2 \arccos\zeta / (\omega_0 \sqrt{1 - \zeta^2})$, in s."""
         return 2 * _angle(self.damping_ratio) / self.frequency
 
     def height(self, start: Float[ArrayLike, "..."], time: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-        """Give the height after the bounce, in m.
-
-        Args:
-            start: height at time zero, in m above the floor.
-            time: after the contact has ended, in s.
-        """
+        """Return the height (m) at a time (s) after the bounce, from a height (m) at time zero."""
         released = -2 * self.damping_ratio * self.speed * self.restitution / self.frequency
         flown = jnp.asarray(time) - start / self.speed - self.duration
         return released + self.restitution * self.speed * flown

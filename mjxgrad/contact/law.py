@@ -102,15 +102,9 @@ def stiffness_damping(
 def rest_depth(
     acceleration: Float[ArrayLike, "..."], stiffness: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]
 ) -> Float[Array, "*shape"]:
-    r"""Solve for the depth at rest; differentiable by the implicit function theorem.
+    r"""Solve for the depth at rest (m) under $c\,a_0$ (m/s²) at stiffness $k$ (1/s²), both positive.
 
-    Args:
-        acceleration: $c\,a_0$, in m/s²; positive.
-        stiffness: $k$, in 1/s²; positive.
-        solimp: five numbers, as MuJoCo's.
-
-    Returns:
-        The depth below the distance at which contact begins, in m.
+    It is counted from where contact begins, and differentiable by the implicit function theorem.
     """
     acceleration = jnp.broadcast_to(jnp.asarray(acceleration, stiffness.dtype), stiffness.shape)
     largest = impedance(solimp, jnp.zeros_like(stiffness)).full
@@ -134,7 +128,7 @@ def rest_depth(
 
 
 def static_response(depth: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]) -> Float[Array, "*shape"]:
-    r"""Give $d(\rho)^2 \rho / (d_w^2 (1 - d(\rho)))$, which the stiffness turns into an acceleration (m)."""
+    r"""Return $d(\rho)^2 \rho / (d_w^2 (1 - d(\rho)))$, which the stiffness turns into an acceleration (m)."""
     profile = impedance(solimp, depth)
     return profile.present**2 * depth / (profile.full**2 * (1 - profile.present))
 
@@ -145,20 +139,11 @@ def compensated_stiffness(
     margin: Float[Array, "*shape"],
     acceleration: Float[ArrayLike, "..."],
 ) -> Float[Array, "*shape"]:
-    r"""Give the stiffness at which a contact with a margin rests where it would without.
+    r"""Return the stiffness at which a contact with a margin rests where it would without.
 
     Without margin it rests at depth $\rho_0$; with margin $m$ the same place is at depth $m + \rho_0$ below the beginning of
     the force, so the stiffness must fall by the ratio of `static_response` at both. For a constant impedance $d$ that
-    is $k' = (1 - d) a_0 / (m + \rho_0)$.
-
-    Args:
-        stiffness: without margin, in 1/s².
-        solimp: five numbers, as MuJoCo's.
-        margin: in m.
-        acceleration: $c\,a_0$ under which the place of rest is kept, in m/s².
-
-    Returns:
-        One stiffness per contact, in 1/s²; never above the one given.
+    is $k' = (1 - d) a_0 / (m + \rho_0)$, in 1/s², never above the one given. `acceleration` is $c\,a_0$ (m/s²).
     """
     depth = rest_depth(acceleration, stiffness, solimp)
     return stiffness * static_response(depth, solimp) / static_response(depth + margin, solimp)

@@ -102,28 +102,21 @@ class ContactParameters(eqx.Module):
         return timestep**2 * self.stiffness + 2.0 * timestep * self.damping
 
     def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
-        """Depth at rest below the distance at which contact begins; $(1 - d_w) a_0 / k$ for constant impedance.
+        """Depth at rest below the distance at which contact begins (m); $(1 - d_w) a_0 / k$ for constant impedance.
 
         Args:
             acceleration: $a_0$ at which the bodies would approach without contact, in m/s²; for one body on the ground
                 gravity's, for a stack of n alike n times that. See `contact.law` for when this is exact.
-
-        Returns:
-            One depth per pair, in m.
         """
         return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
 
     def rest_distance(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
-        """Distance of the geoms at rest, margin less `rest_depth`: positive where they hover (m).
-
-        Args:
-            acceleration: as for `rest_depth`.
-        """
+        """Distance of the geoms at rest, margin less `rest_depth`: positive where they hover (m)."""
         return self.margin - self.rest_depth(acceleration)
 
 
 def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
-    """Name of a geom, or of its body with the geom's place in it."""
+    """Return the name of a geom, or of its body with the geom's place in it."""
     name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
     if name:
         return name
@@ -153,6 +146,20 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
         )
         for geom1, geom2, explicit in geom_pairs(model)
     )
+
+
+def named_pairs(
+    pairs: tuple[ContactPair, ...], wanted: tuple[tuple[str, str], ...], what: str
+) -> tuple[ContactPair, ...]:
+    """Return the pairs of these names, in the order of `pairs`; refuse unknown names as those of `what`."""
+    known = {frozenset(pair.names) for pair in pairs}
+    for names in wanted:
+        if frozenset(names) not in known:
+            listed = ", ".join(map(str, pairs[:20])) + (" ..." if len(pairs) > 20 else "")
+            raise ValueError(
+                f"{what} must name pairs of geoms that can touch, got {names!r}; those that can: {listed or 'none'}"
+            )
+    return tuple(pair for pair in pairs if frozenset(pair.names) in set(map(frozenset, wanted)))
 
 
 def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tuple[int, ...]:

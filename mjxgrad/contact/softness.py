@@ -8,7 +8,6 @@ $a_0$ the depth is $(1 - d_w) a_0 / k$. With a margin the force begins at that d
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +20,14 @@ from mjxgrad._math import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
 from mjxgrad.contact.law import compensated_stiffness
-from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import (
+    ContactPair,
+    ContactParameters,
+    contact_pairs,
+    contact_parameters,
+    deciding_geoms,
+    named_pairs,
+)
 
 _PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
 _SUBSETS = ("geoms", "pairs", "bodies", "groups")
@@ -138,7 +144,7 @@ class Softness(eqx.Module):
 
         Stiffness, width and rest acceleration change by equal factors, the rest by equal amounts. Where a smoothing of
         `optimise` lowers a scale from 1, `lambda scale: objective(Softness.between(hard, soft, scale))` hardens the
-        contact with it.
+        contact with it; `progress = step / num_steps` makes a schedule.
 
         Args:
             start: at progress 0.
@@ -165,40 +171,30 @@ class Softness(eqx.Module):
                 parts[name] = first ** (1 - share) * last**share if is_geometric else (1 - share) * first + share * last
         return cls(**parts)
 
-    def schedule(self, end: "Softness", num_steps: int) -> Callable[[ArrayLike], "Softness"]:
-        """Give a softness that goes to another in a number of steps and stays there, as a function of the step.
-
-        Args:
-            end: see `between`.
-            num_steps: at least 1.
-
-        Raises:
-            ValueError: if `num_steps` is below 1.
-        """
-        if num_steps < 1:
-            raise ValueError(f"num_steps must be at least 1, got {num_steps}")
-        return lambda step: Softness.between(self, end, jnp.asarray(step) / num_steps)
-
     def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
-        """Give the pairs that this changes.
+        """Return the pairs that this changes, all without a subset.
 
         Raises:
             ValueError: if a name is unknown or can touch nothing.
         """
-        return _select(model, geoms=self.geoms, pairs=self.pairs, bodies=self.bodies, groups=self.groups)
+        everything = contact_pairs(model)
+        if self.pairs is not None:
+            return named_pairs(everything, self.pairs, "softness.pairs")
+        if self.geoms is not None:
+            return _with_any(everything, "geoms", self.geoms, [set(pair.names) for pair in everything])
+        if self.bodies is not None:
+            return _with_any(everything, "bodies", self.bodies, [_body_names(model, pair) for pair in everything])
+        if self.groups is not None:
+            members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
+            return _with_any(everything, "groups", self.groups, members)
+        return everything
 
     def apply(self, model: mjx.Model) -> mjx.Model:
         r"""Write this softness into a model.
 
-        Traceable and differentiable with respect to every part and to the model's leaves. If only
-        one of stiffness and damping ratio is given, a geom that takes part in several pairs can
-        keep the other's present value only if those pairs agree in it.
-
-        Args:
-            model: of MJX.
-
-        Returns:
-            The model with other `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`.
+        That is `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`. Traceable and
+        differentiable with respect to every part and to the model's leaves. If only one of stiffness and damping ratio is given,
+        a geom that takes part in several pairs can keep the other's present value only if those pairs agree in it.
 
         Raises:
             ValueError: if a part has a leading axis; if a name is unknown; if a geom to be changed
@@ -293,53 +289,8 @@ def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
     return values.at[np.array(list(places))].set(per_pair[np.array(list(places.values()))])
 
 
-def _select(
-    model: mjx.Model,
-    *,
-    geoms: tuple[str, ...] | None = None,
-    pairs: tuple[tuple[str, str], ...] | None = None,
-    bodies: tuple[str, ...] | None = None,
-    groups: tuple[int, ...] | None = None,
-) -> _Pairs:
-    """Give the pairs that are named in one of four ways; all of them without a name.
-
-    Args:
-        model: of MJX.
-        geoms: pairs with at least one of these geoms.
-        pairs: exactly these.
-        bodies: pairs with at least one geom of these bodies.
-        groups: pairs with at least one geom of these groups, MJCF's `group`.
-
-    Raises:
-        ValueError: if a name is unknown or can touch nothing.
-    """
-    everything = contact_pairs(model)
-    if pairs is not None:
-        known = {frozenset(pair.names) for pair in everything}
-        for names in pairs:
-            if frozenset(names) not in known:
-                raise ValueError(
-                    f"softness.pairs must name pairs of geoms that can touch, got {names!r}; "
-                    f"those that can: {', '.join(str(p) for p in everything) or 'none'}"
-                )
-        wanted = {frozenset(names) for names in pairs}
-        return tuple(p for p in everything if frozenset(p.names) in wanted)
-    if geoms is not None:
-        return _with_any(everything, "geoms", geoms, [set(pair.names) for pair in everything])
-    if bodies is not None:
-        return _with_any(everything, "bodies", bodies, [_body_names(model, pair) for pair in everything])
-    if groups is not None:
-        members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
-        return _with_any(everything, "groups", groups, members)
-    return everything
-
-
 def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
-    """Refuse to change pairs whose geoms also decide the contact of others.
-
-    Raises:
-        ValueError: naming both pairs and the geom.
-    """
+    """Refuse to change pairs whose geoms also decide the contact of others."""
     decided_by = {geom: pair for pair in selected for geom in deciding_geoms(model, pair)}
     for other in contact_pairs(model):
         if other in selected:
@@ -350,11 +301,7 @@ def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
 
 
 def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part: str, remedy: str) -> None:
-    """Refuse to write one value per pair where pairs with different ones share a geom; not looked at if traced.
-
-    Raises:
-        ValueError: naming both pairs and their values.
-    """
+    """Refuse to write one value per pair where pairs with different ones share a geom; not looked at if traced."""
     if not is_known(values):
         return
     known, first = np.asarray(values), {}
@@ -372,18 +319,11 @@ def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.n
     r"""Say how a margin of pairs becomes margins of geoms, which MuJoCo adds, and leaves other pairs alone.
 
     A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
-    each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair.
-
-    Args:
-        model: of MJX.
-        selected: the pairs; those with parameters of their own have no part in it.
+    each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair. Pairs with parameters of
+    their own have no part in it.
 
     Returns:
         The geoms to write; the matrix from what each pair misses to their margins; the matrix P over all geoms.
-
-    Raises:
-        ValueError: if the margins of the pairs cannot be set without those of others, or a geom is a mesh or height field,
-            for which MJX computes no distances.
     """
     for pair in selected:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):

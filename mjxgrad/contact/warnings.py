@@ -1,10 +1,11 @@
-"""What a softness does not do, or does besides."""
+"""What contacts do otherwise than their numbers say: altered by MuJoCo, too stiff for the time step, hovering, without effect."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._static import is_known
@@ -14,16 +15,141 @@ from mjxgrad.contact.softness import Softness
 _ABOVE_NOTHING = 1e-6  # m; a body that hovers by less rests where it should
 
 
+def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:
+    r"""Return the largest $h \omega_0$ at which a contact at full impedance does not gain energy.
+
+    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit Euler, as
+    which `implicitfast` treats contact too, is stable while $h^2 k + 2 h b < 4$, that is up to
+    $2 (\sqrt{1 + \zeta^2} - \zeta)$. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The limit of
+    $h b$ is $2 \zeta$ times this.
+    """
+    if integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        # The difference of two large numbers, in a form that does not cancel.
+        return 2.0 / (np.sqrt(1.0 + damping_ratio**2) + damping_ratio)
+    stable, unstable = 0.0, 3.0
+    for _ in range(50):
+        middle = (stable + unstable) / 2
+        if _runge_kutta_growth(middle, damping_ratio) <= 1.0:
+            stable = middle
+        else:
+            unstable = middle
+    return stable
+
+
+def _runge_kutta_growth(step: float, damping_ratio: float) -> float:
+    root = np.emath.sqrt(damping_ratio**2 - 1.0)
+    z = step * np.array([-damping_ratio + root, -damping_ratio - root])
+    return float(np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max())
+
+
+def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[str]:
+    """Say which contacts of a model with known values are altered by `refsafe` or too stiff for the time step."""
+    if not pairs:
+        return []
+    # Inside jit, operations on known values would be traced, too.
+    with jax.ensure_compile_time_eval():
+        parameters = contact_parameters(model, pairs)
+    solref, stiffness, damping, impedance, width = (
+        np.asarray(getattr(parameters, name), dtype=float)
+        for name in ("solref", "stiffness", "damping", "impedance", "width")
+    )
+    timestep = float(model.opt.timestep)
+    integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
+
+    def found() -> Iterator[tuple[ContactPair, str]]:
+        rows = zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True)
+        for pair, first, k, b, bounds, over in rows:
+            for message in (
+                altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
+                beyond_stability(*steepest(k, b, bounds, over), timestep, integrator),
+            ):
+                if message:
+                    yield pair, message
+
+    return _grouped(found())
+
+
+def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
+    """Say where MJX finds other contact points than C MuJoCo does, in one sentence per kind of difference."""
+    geom = mujoco.mjtGeom
+    kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
+    messages = []
+    if frozenset((geom.mjGEOM_PLANE, geom.mjGEOM_MESH)) in kinds:
+        messages.append("mesh on plane: MJX keeps only corners within 1 mm of the deepest one")
+    if frozenset((geom.mjGEOM_CAPSULE,)) in kinds:
+        messages.append("parallel capsules: MJX makes one contact, C MuJoCo two")
+    return messages
+
+
+def name_pairs(pairs: Sequence[object]) -> str:
+    """Return two pairs, or whatever else has a name, by name; or the first of them and how many more there are."""
+    if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
+        return ", ".join(str(pair) for pair in pairs)
+    return f"{pairs[0]} + {len(pairs) - 1} more"
+
+
+def format_number(x: float) -> str:
+    """Write three digits; whole numbers up to 99999 in full."""
+    if np.isinf(x):
+        return "∞" if x > 0 else "−∞"
+    if 1e3 <= abs(x) < 99999.5:
+        return f"{x:.0f}"
+    return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def steepest(
+    stiffness: float, damping: float, impedance: Float[np.ndarray, "2"] | tuple[float, float], width: float
+) -> tuple[float, float]:
+    r"""Return stiffness and damping where the impedance is largest, which is at first touch if it falls with depth.
+
+    The force on a body is $d(r)$ of the acceleration $-B \dot r - K d(r) r$ that is asked for, so that stiffness goes as the
+    square of the impedance and damping as the impedance.
+
+    Args:
+        stiffness: at full depth, $k = K d_w^2$, in 1/s².
+        damping: at full depth, $b = B d_w$, in 1/s.
+        impedance: $d_0$ and $d_w$.
+        width: over which it changes; without one it is $d_w$ everywhere.
+    """
+    share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
+    return float(share**2 * stiffness), float(share * damping)
+
+
+def altered_by_refsafe(time_constant: float, damping: float, timestep: float, remedy: str) -> str | None:
+    """Return the end of a sentence if `refsafe` replaces a time constant (s; negative for the direct format)."""
+    # A relative margin, because float32 rounds a time constant of exactly two steps.
+    if time_constant <= 0 or 2.0 / damping <= time_constant * (1 + 1e-5):
+        return None
+    return (
+        f"its time constant {time_constant:g} s is below two time steps, so refsafe replaces it by "
+        f"{2 * timestep:g} s and smaller values have no effect; use a time step of at most "
+        f"{time_constant / 2:g} s, or {remedy}"
+    )
+
+
+def beyond_stability(stiffness: float, damping: float, timestep: float, integrator: mujoco.mjtIntegrator) -> str | None:
+    """Return the end of a sentence if a spring and damper gains energy at a time step (1/s², 1/s, s)."""
+    if stiffness <= 0:
+        return None
+    frequency = np.sqrt(stiffness)
+    limit = largest_stable_step(damping / (2 * frequency), integrator)
+    if timestep * frequency < limit:
+        return None
+    is_euler = integrator != mujoco.mjtIntegrator.mjINT_RK4
+    measure = timestep**2 * stiffness + 2 * timestep * damping
+    criterion = f"h²k + 2hb = {measure:.3g}, stable below 4" if is_euler else "RK4"
+    return (
+        f"stiffness {format_number(stiffness)} 1/s² and damping {format_number(damping)} 1/s are "
+        f"beyond what a time step of {timestep:g} s integrates without gaining energy "
+        f"({criterion}); use a time step below {format_number(limit / frequency)} s, or at this "
+        f"damping ratio a stiffness below {format_number((limit / timestep) ** 2)} 1/s²"
+    )
+
+
 def softness_warnings(softness: Softness, model: mjx.Model, mj_model: mujoco.MjModel | None = None) -> list[str]:
     """Say which parts of a softness have no effect on a model, and where bodies rest otherwise than they touch.
 
-    Args:
-        softness: as applied; parts that are traced are not looked at.
-        model: of MJX, with the softness applied.
-        mj_model: the same in C MuJoCo, to measure distances at the reference pose; without it they are not looked at.
-
-    Returns:
-        Sentences; none if every part has its effect and no other.
+    Parts that are traced are not looked at, nor distances at the reference pose without the C model.
     """
     if not contact_pairs(model):
         return ["softness has no effect: no two geoms of the scene can touch"]
@@ -93,7 +219,7 @@ def _pushed_apart(
 
 
 def _smaller_size(model: mjx.Model, pair: ContactPair) -> float:
-    """Give the least half extent of two geoms, planes left out (m)."""
+    """Return the least half extent of two geoms, planes left out (m)."""
     sizes = []
     for geom in (pair.geom1, pair.geom2):
         kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), np.asarray(model.geom_size[geom], float)
@@ -104,11 +230,9 @@ def _smaller_size(model: mjx.Model, pair: ContactPair) -> float:
     return float(min(sizes, default=np.inf))
 
 
-def _grouped(found: Iterator[tuple[ContactPair, str]]) -> list[str]:
+def _grouped(found: Iterable[tuple[ContactPair, str]]) -> list[str]:
+    """Return one sentence for all pairs of which the same is said."""
     messages: dict[str, list[ContactPair]] = {}
     for pair, text in found:
         messages.setdefault(text, []).append(pair)
-    return [
-        f"contact of {pairs[0]}" + (f" + {len(pairs) - 1} more" if len(pairs) > 1 else "") + f": {text}"
-        for text, pairs in messages.items()
-    ]
+    return [f"contact of {name_pairs(same)}: {text}" for text, same in messages.items()]

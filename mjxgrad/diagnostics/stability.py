@@ -24,9 +24,7 @@ from mjxgrad._mjx import COLLISION_FUNCTIONS
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.parameters import ContactPair
-from mjxgrad.diagnostics.onset import LARGEST_JUMP, STEPS_NEEDED
-from mjxgrad.scene import Scene
-from mjxgrad.scene.contact_check import (
+from mjxgrad.contact.warnings import (
     altered_by_refsafe,
     beyond_stability,
     format_number,
@@ -34,6 +32,8 @@ from mjxgrad.scene.contact_check import (
     name_pairs,
     steepest,
 )
+from mjxgrad.diagnostics.onset import LARGEST_JUMP, STEPS_NEEDED
+from mjxgrad.scene import Scene
 
 LEAST_FRICTION = 0.01
 """Of pyramids, in single precision."""

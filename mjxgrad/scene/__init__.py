@@ -2,6 +2,7 @@
 
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.load import SceneError, load_scene
+from mjxgrad.scene.named import sensor, site_position
 from mjxgrad.scene.omissions import LeaveOut, Omission
 from mjxgrad.scene.scene import Scene, SceneWarning
 
@@ -13,4 +14,6 @@ __all__ = [
     "SceneError",
     "SceneWarning",
     "load_scene",
+    "sensor",
+    "site_position",
 ]

@@ -12,6 +12,7 @@ import numpy as np
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
+from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.scene.refusals import describe_pair, element_name, has_medium
 
 _DISABLE = mujoco.mjtDisableBit
@@ -162,23 +163,20 @@ def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
 def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
     """C clips every coefficient from below, MJX does not and divides by it."""
     used = {1: [], 3: [0], 4: [0, 1], 6: [0, 1, 2]}
-    raised: list[str] = []
+    raised = []
     for pair in contact_pairs(model):
         if pair.explicit >= 0:
-            rows = [model.pair_friction[pair.explicit][: max(pair.condim - 1, 0)]]
+            rows, needed = model.pair_friction[[pair.explicit]], list(range(pair.condim - 1))
         else:
-            rows = [model.geom_friction[g] for g in deciding_geoms(model, pair)]
-            rows = rows if np.max([r[used[pair.condim]] for r in rows], axis=0).size else []
-        if not rows:
-            continue
-        needed = slice(None) if pair.explicit >= 0 else used[pair.condim]
-        if (np.max([r[needed] for r in rows], axis=0) < mujoco.mjMINMU).any():
-            raised.append(str(pair))
+            rows, needed = model.geom_friction[list(deciding_geoms(model, pair))], used[pair.condim]
+        if (rows[:, needed].max(axis=0) < mujoco.mjMINMU).any():
+            raised.append(pair)
     if raised:
         for field in ("geom_friction", "pair_friction"):
             np.maximum(getattr(model, field), mujoco.mjMINMU, out=getattr(model, field))
-        what = f"friction of {raised[0]}" + (f" + {len(raised) - 1}" if len(raised) > 1 else "")
-        yield Conversion(what, "0", f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it")
+        yield Conversion(
+            f"friction of {name_pairs(raised)}", "0", f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it"
+        )
 
 
 def _no_width(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -232,12 +230,10 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     clamped = model.actuator_ctrllimited[model.actuator_ctrladr].astype(bool)
     differs = muscle | ((affine_gain | affine_bias) & limited) | (affine_gain & clamped)
     if differs.any():
-        which = np.flatnonzero(differs).tolist()
-        first = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, which[0])
-        more = f" + {len(which) - 1}" if len(which) > 1 else ""
+        names = [element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in np.flatnonzero(differs).tolist()]
         reason = "its velocity derivative ignores force and control limits and muscles"
         yield Conversion(
-            f"integrator at {first}{more}",
+            f"integrator at {name_pairs(names)}",
             "implicitfast",
             "MJX's implicitfast",
             reason,
@@ -264,9 +260,8 @@ def _distance_field_pairs(model: mujoco.MjModel) -> Iterator[Conversion]:
         if frozenset(_GEOM(t) for t in model.geom_type[[pair.geom1, pair.geom2]]) in searched
     ]
     if found:
-        more = f" + {len(found) - 1} more" if len(found) > 1 else ""
         reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
-        what = f"contact of {found[0]}{more}"
+        what = f"contact of {name_pairs(found)}"
         yield Conversion(what, "exact", "search on distance fields", reason, exact=False)
 
 

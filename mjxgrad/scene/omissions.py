@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import make_efc_type
-from mjxgrad.contact.parameters import ContactPair, contact_pairs
-from mjxgrad.scene.refusals import has_medium
+from mjxgrad.contact.parameters import ContactPair, contact_pairs, named_pairs
+from mjxgrad.scene.refusals import has_friction_loss, has_limits, has_medium
 
 _NUM_MASK_BITS = 31  # of a signed integer, the sign left alone
 _DISABLE = mujoco.mjtDisableBit
@@ -53,14 +53,8 @@ def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
 
     Most stages cost nothing once the model has no element for them, for their arrays have no
     rows, and what is computed for reading only is removed by XLA from a compiled rollout, which
-    carries nothing but the state. One flag has to be set: Euler integration would factorise the
+    carries nothing but the state. One flag has to be set, in place: Euler integration would factorise the
     mass matrix a second time for damping that is zero.
-
-    Args:
-        model: changed in place.
-
-    Returns:
-        The omissions, in the order of a step.
     """
     omissions = tuple(Omission(what, reason) for what, find in _TABLE if (reason := find(model)))
     if _has_needless_eulerdamp(model):
@@ -124,14 +118,6 @@ def _num_render_meshes(model: mujoco.MjModel) -> int:
     return model.nmesh - len(collided)
 
 
-def _has_limits(model: mujoco.MjModel) -> bool:
-    return bool(model.jnt_limited.any() or model.tendon_limited.any())
-
-
-def _has_friction_loss(model: mujoco.MjModel) -> bool:
-    return bool((model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any())
-
-
 _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("tendons", _absent("none in the scene", lambda m: m.ntendon > 0)),
     ("collision detection",
@@ -140,9 +126,9 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("equality constraints",
      _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
     ("friction loss",
-     _absent("no joint or tendon has any", _has_friction_loss,
+     _absent("no joint or tendon has any", has_friction_loss,
              _DISABLE.mjDSBL_FRICTIONLOSS)),
-    ("limits", _absent("no joint or tendon is limited", _has_limits, _DISABLE.mjDSBL_LIMIT)),
+    ("limits", _absent("no joint or tendon is limited", has_limits, _DISABLE.mjDSBL_LIMIT)),
     ("actuation", _absent("no actuators", lambda m: m.nu > 0, _DISABLE.mjDSBL_ACTUATION)),
     ("gravity compensation",
      _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
@@ -166,22 +152,20 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
 
 
 def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ...], tuple[Omission, ...]]:
-    """Leave out pairs and limits.
-
-    Args:
-        model: changed in place.
-        wanted: what to leave out.
-
-    Returns:
-        The pairs left out, and what was done in words.
+    """Leave out pairs and limits of a model, in place; return the pairs, and what was done in words.
 
     Raises:
         ValueError: if a name is unknown, a pair is listed as `<pair>` in the file, or there are too many different
             pairs to leave out.
     """
-    rows = _num_rows(model)
+    rows = len(make_efc_type(model))
     everything = contact_pairs(model)
-    omitted = _named(everything, wanted)
+    omitted = named_pairs(everything, wanted.pairs, "leave_out.pairs")
+    for pair in omitted:
+        if pair.explicit >= 0:
+            raise ValueError(
+                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
+            )
     if omitted:
         try:
             keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
@@ -194,23 +178,17 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
     model.jnt_limited[without_limit] = 0
     omissions = _in_words(omitted, len(everything), wanted)
     if omissions:
-        omissions.append(Omission("constraint rows", f"{_num_rows(model)} remain of {rows}"))
-    return tuple(omitted), tuple(omissions)
+        omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
+    return omitted, tuple(omissions)
 
 
 def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
-    """Set `contype` and `conaffinity` so that of all pairs of geoms only these collide, in the same order as before.
+    """Set `contype` and `conaffinity` in place so that of all pairs only these collide, in the same order as before.
 
     Geoms that collide with the same others share a bit: theirs is the type, the others have the affinity. Bits are given
     out until every pair has one, first to those that settle most pairs. What MuJoCo filters by other rules (geoms of one
-    rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs stay as they are.
-
-    Args:
-        model: changed in place.
-        kept: pairs of this model that are not explicit.
-
-    Raises:
-        TooManyMasksError: if 31 bits do not suffice.
+    rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs, which `kept` has none of, stay as they
+    are. Raises TooManyMasksError if 31 bits do not suffice.
     """
     neighbours: dict[int, set[int]] = {}
     for pair in kept:
@@ -238,25 +216,6 @@ def _between(geoms: Iterable[int], others: Iterable[int]) -> set[frozenset[int]]
     return {frozenset((geom, other)) for geom in geoms for other in others}
 
 
-def _named(everything: tuple[ContactPair, ...], wanted: LeaveOut) -> list[ContactPair]:
-    by_names = {frozenset(pair.names): pair for pair in everything}
-    omitted = []
-    for names in dict.fromkeys(map(frozenset, wanted.pairs)):
-        pair = by_names.get(names)
-        shown = " – ".join(sorted(names))
-        if pair is None:
-            listed = ", ".join(map(str, everything[:20])) + (" ..." if len(everything) > 20 else "")
-            raise ValueError(
-                f"leave_out.pairs must name pairs of geoms that can touch, got {shown!r}; those that can: {listed or 'none'}"
-            )
-        if pair.explicit >= 0:
-            raise ValueError(
-                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {shown!r}; remove it there"
-            )
-        omitted.append(pair)
-    return omitted
-
-
 def _limited_joint(model: mujoco.MjModel, name: str) -> int:
     joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if joint >= 0 and model.jnt_limited[joint]:
@@ -268,7 +227,7 @@ def _limited_joint(model: mujoco.MjModel, name: str) -> int:
     )
 
 
-def _in_words(omitted: list[ContactPair], total: int, wanted: LeaveOut) -> list[Omission]:
+def _in_words(omitted: tuple[ContactPair, ...], total: int, wanted: LeaveOut) -> list[Omission]:
     omissions = []
     if omitted:
         more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
@@ -277,7 +236,3 @@ def _in_words(omitted: list[ContactPair], total: int, wanted: LeaveOut) -> list[
     if wanted.limits:
         omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
     return omissions
-
-
-def _num_rows(model: mujoco.MjModel) -> int:
-    return len(make_efc_type(model))

@@ -99,15 +99,20 @@ def has_medium(model: mujoco.MjModel) -> bool:
     return model.opt.density > 0 or model.opt.viscosity > 0
 
 
+def has_limits(model: mujoco.MjModel) -> bool:
+    """Whether a joint or tendon is limited."""
+    return bool(model.jnt_limited.any() or model.tendon_limited.any())
+
+
+def has_friction_loss(model: mujoco.MjModel) -> bool:
+    """Whether a joint or tendon has any."""
+    return bool((model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any())
+
+
 def has_constraints(model: mujoco.MjModel) -> bool:
     """Whether any constraint can ever act."""
     return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value and bool(
-        model.neq
-        or model.jnt_limited.any()
-        or model.tendon_limited.any()
-        or (model.dof_frictionloss > 0).any()
-        or (model.tendon_frictionloss > 0).any()
-        or contact_pairs(model)
+        model.neq or has_limits(model) or has_friction_loss(model) or contact_pairs(model)
     )
 
 
@@ -157,11 +162,7 @@ def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _has_frictional_rows(model: mujoco.MjModel) -> bool:
-    return bool(
-        any(pair.condim > 1 for pair in contact_pairs(model))
-        or (model.dof_frictionloss > 0).any()
-        or (model.tendon_frictionloss > 0).any()
-    )
+    return any(pair.condim > 1 for pair in contact_pairs(model)) or has_friction_loss(model)
 
 
 def _is_scalar_joint(model: mujoco.MjModel) -> np.ndarray:

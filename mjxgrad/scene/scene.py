@@ -1,23 +1,29 @@
 """What `load_scene` returns, and how it describes itself."""
 
 import copy
+import difflib
 import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
-from mjxgrad.scene.contact_check import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission
 
 _WIDTH = 118  # characters; what a laptop's terminal shows
+_EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
+# What MuJoCo computes from mass and inertia when it compiles a model.
+_COMPILED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "dof_M0")
 
 
 class SceneWarning(UserWarning):
@@ -27,17 +33,15 @@ class SceneWarning(UserWarning):
 class Scene(eqx.Module):
     """A scene ready to be stepped.
 
-    Indices of bodies, joints and geoms are those of the C model, so that
-    `scene.model.geom_friction[i]` is what a user of MuJoCo expects.
+    Indices of bodies, joints and geoms are those of the C model: `scene.model.geom_friction[i]` is as in MuJoCo.
 
     Attributes:
         model: for MJX; its array leaves may be differentiated, replaced and batched.
         data: template at `qpos0`; no stage of the dynamics has run.
-        mj_model: the C model of the same motion, complete, for rendering and names. It keeps the
-            contact parameters of the file: see `to_mujoco`.
+        mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`.
         omissions: what a step leaves out, and why.
         conversions: settings replaced by others, and why.
-        pairs: geoms that can touch, in the order of `contact_parameters`.
+        pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
         omitted_pairs: pairs whose contact is left out although the file has it, as `LeaveOut` asked.
         name: where the scene came from.
     """
@@ -72,16 +76,52 @@ class Scene(eqx.Module):
         """
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
         for message in softness_warnings(softness, scene.model, self.mj_model) + scene.warnings():
-            # Equinox wraps methods, so the caller is one level further up.
-            warnings.warn(f"{self.name}: {message}", SceneWarning, stacklevel=3)
+            _warn(self, message)
         return scene
 
-    def warnings(self) -> list[str]:
-        """Sentences on contacts that `refsafe` alters or that the time step cannot follow.
+    def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
+        """Replace numbers of the MJX model, such as `geom_friction`, `body_mass` or `dof_damping`.
+
+        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo
+        computes from mass and size when it compiles a model stays as it is, unless it is given, too; a warning says so.
+
+        Args:
+            **fields: new values of the model's floating-point arrays, each of the shape that it has.
 
         Returns:
-            An empty list while the model is traced or batched, for its values are not known then.
+            The scene with these values.
+
+        Raises:
+            ValueError: if there is no such field, it is not an array of numbers, or the shape is another.
         """
+        present = {field.name: getattr(self.model, field.name) for field in self.model.fields()}
+        arrays = {
+            k: v for k, v in present.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)
+        }
+        for name, value in fields.items():
+            if name not in arrays:
+                near = difflib.get_close_matches(name, arrays, n=3)
+                remedy = f"did you mean {' or '.join(near)}?" if near else "see MuJoCo's documentation of mjModel"
+                raise ValueError(f"with_model must name arrays of numbers of the MJX model, got {name}; {remedy}")
+            if np.shape(value) != arrays[name].shape:
+                raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
+        changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
+        if {"body_mass", "body_inertia"} & fields.keys() and not set(_COMPILED) & fields.keys():
+            constants = ", ".join(_COMPILED)
+            _warn(self, f"{constants} do not follow the mass; give them, too, or contacts yield as for the old one")
+        is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
+        if "dof_damping" in fields and is_explicit:
+            _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
+        return eqx.tree_at(lambda s: s.model, self, self.model.replace(**changed))
+
+    @property
+    def ctrlrange(self) -> Float[Array, "nu 2"]:
+        """Least and largest control of each actuator, beyond which MuJoCo clips it; infinite where there is no limit."""
+        limited = np.asarray(self.model.actuator_ctrllimited, bool)[:, None]
+        return jnp.where(limited, self.model.actuator_ctrlrange, jnp.array([-jnp.inf, jnp.inf]))
+
+    def warnings(self) -> list[str]:
+        """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
         leaves = (self.model.geom_solref, self.model.pair_solref, self.model.opt.timestep)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return []
@@ -90,11 +130,7 @@ class Scene(eqx.Module):
         return contact_warnings(self.model, self.pairs)
 
     def to_mujoco(self) -> mujoco.MjModel:
-        """Copy of the C model with the present values of `model`, softness included.
-
-        Returns:
-            A model that C MuJoCo steps as MJX steps this scene. Sizes and flags are those of
-            `mj_model`.
+        """Return the C model with the present values of `model`, softness included; sizes and flags are those of `mj_model`.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -111,10 +147,7 @@ class Scene(eqx.Module):
         return target
 
     def summary(self) -> str:
-        """Describe the scene for a human: sizes, options, contacts, conversions, omissions.
-
-        Returns:
-            Text of several lines, fit for a terminal about 120 characters wide.
+        """Describe the scene in text for a terminal 120 characters wide: sizes, options, contacts, conversions, omissions.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -132,6 +165,11 @@ class Scene(eqx.Module):
             _bullets("Warnings", self.warnings()),
         ]  # fmt: skip
         return "\n\n".join(section for section in sections if section)
+
+
+def _warn(scene: Scene, message: str) -> None:
+    """Warn whoever called a method of the scene; Equinox wraps methods, so this is one level further up."""
+    warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
@@ -185,63 +223,49 @@ def _heading(scene: Scene) -> str:
     return "\n".join([scene.name, "  " + ", ".join(counted), "  " + ", ".join(options)])
 
 
-_COLUMNS = (
-    ("pair", "condim", "solref", "k", "b", "ω₀", "τ", "ζ", "impedance", "width", "h²k+2hb",
-     "friction", "margin"),
-    ("", "", "", "1/s²", "1/s", "rad/s", "ms", "", "", "mm", "", "", "mm"),
-)  # fmt: skip
-
-
 def _contacts(scene: Scene) -> str:
-    """One line for all pairs with the same parameters."""
+    """Return one line for all pairs with the same parameters."""
     if not scene.pairs:
         return ""
+    columns = list(_columns(scene))
     groups: dict[tuple[str, ...], list] = {}
-    for pair, cells in zip(scene.pairs, _contact_cells(scene), strict=True):
+    for pair, cells in zip(scene.pairs, zip(*(cells for _, _, cells in columns), strict=True), strict=True):
         groups.setdefault(cells, []).append(pair)
     rows = [(name_pairs(pairs), *cells) for cells, pairs in groups.items()]
-    has_rest = len(rows[0]) > len(_COLUMNS[0])
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
     legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
         "; stable while h²k + 2hb < 4" if is_euler else ""
     )
-    columns = _COLUMNS
-    if has_rest:
-        columns = tuple((*column, cell) for column, cell in zip(_COLUMNS, ("at rest", "mm"), strict=True))
+    if columns[-1][0] == "at rest":
         legend += "\n  at rest: distance under gravity, negative for a depth"
-    return _table(title, [*columns, *rows], is_numeric=True) + f"\n  {legend}"
+    if len(rows) < count:
+        legend += "\n  all of them: scene.pairs"
+    heads = [("pair", *(name for name, _, _ in columns)), ("", *(unit for _, unit, _ in columns))]
+    return _table(title, heads + rows, is_numeric=True) + f"\n  {legend}"
 
 
-def _contact_cells(scene: Scene) -> list[tuple[str, ...]]:
-    """What the table says of each pair, without its names."""
+def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield what the table says of each pair: the name of a column, its unit, its cells."""
     parameters = scene.contact_parameters()
-    columns = (
-        [str(pair.condim) for pair in scene.pairs],
-        [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()],
-        _numbers(parameters.stiffness),
-        _numbers(parameters.damping),
-        _numbers(parameters.natural_frequency),
-        _numbers(1e3 * parameters.time_constant),
-        _numbers(parameters.damping_ratio),
-        [_range(row) for row in np.asarray(parameters.impedance)],
-        _numbers(1e3 * parameters.width),
-        _numbers(parameters.stability),
-        [_friction(pair.condim, row)
-         for pair, row in zip(scene.pairs, np.asarray(parameters.friction).tolist(), strict=True)],
-        _numbers(1e3 * parameters.margin),
-        *_rest_column(scene, parameters),
-    )  # fmt: skip
-    return list(zip(*columns, strict=True))
-
-
-def _rest_column(scene: Scene, parameters: ContactParameters) -> list[list[str]]:
-    """Where bodies rest under gravity, if some margin makes it worth a column."""
+    yield "condim", "", [str(pair.condim) for pair in scene.pairs]
+    yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]
+    yield "k", "1/s²", _numbers(parameters.stiffness)
+    yield "b", "1/s", _numbers(parameters.damping)
+    yield "ω₀", "rad/s", _numbers(parameters.natural_frequency)
+    yield "τ", "ms", _numbers(1e3 * parameters.time_constant)
+    yield "ζ", "", _numbers(parameters.damping_ratio)
+    yield "impedance", "", [_range(row) for row in np.asarray(parameters.impedance)]
+    yield "width", "mm", _numbers(1e3 * parameters.width)
+    yield "h²k+2hb", "", _numbers(parameters.stability)
+    frictions = np.asarray(parameters.friction).tolist()
+    yield "friction", "", [_friction(pair.condim, row) for pair, row in zip(scene.pairs, frictions, strict=True)]
+    yield "margin", "mm", _numbers(1e3 * parameters.margin)
     gravity = float(np.linalg.norm(np.asarray(scene.model.opt.gravity)))
-    if gravity == 0 or not np.any(parameters.margin) or not np.all(parameters.stiffness > 0):
-        return []
-    return [_numbers(1e3 * parameters.rest_distance(gravity))]
+    # Some margin makes where bodies rest under gravity worth a column.
+    if gravity > 0 and np.any(parameters.margin) and np.all(parameters.stiffness > 0):
+        yield "at rest", "mm", _numbers(1e3 * parameters.rest_distance(gravity))
 
 
 def _numbers(values) -> list[str]:
@@ -249,7 +273,7 @@ def _numbers(values) -> list[str]:
 
 
 def _friction(condim: int, friction: Sequence[float]) -> str:
-    """Sliding, torsional and rolling coefficients, as far as the contact has them."""
+    """Return sliding, torsional and rolling coefficients, as far as the contact has them."""
     if condim == 1:
         return "none"
     sliding = [format_number(x) for x in friction[:2]]

@@ -2,23 +2,18 @@
 
 from mjxgrad.task import Outcome, SceneTask, Task
 from mjxgrad.tasks import published, textbook
-from mjxgrad.tasks.action_task import ActionTask
+from mjxgrad.tasks.action_task import ActionTask, scene_path
 from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
 from mjxgrad.tasks.billiards import Billiards, billiards
-from mjxgrad.tasks.cube_toss import CubeToss, cube_toss
-from mjxgrad.tasks.friction import friction
 from mjxgrad.tasks.hopper import hopper
-from mjxgrad.tasks.motion_planning import motion_planning
 from mjxgrad.tasks.planar_pusher import PlanarPusher, planar_pusher
-from mjxgrad.tasks.push import push, push_softness
+from mjxgrad.tasks.published_scenes import friction, motion_planning, push, push_softness, tennis
 from mjxgrad.tasks.rolling_pin import RollingPin, rolling_pin
-from mjxgrad.tasks.tennis import tennis
 
 __all__ = [
     "ActionTask",
     "BallWall",
     "Billiards",
-    "CubeToss",
     "Outcome",
     "PlanarPusher",
     "RollingPin",
@@ -26,7 +21,6 @@ __all__ = [
     "Task",
     "ball_wall",
     "billiards",
-    "cube_toss",
     "friction",
     "hopper",
     "motion_planning",
@@ -35,6 +29,7 @@ __all__ = [
     "push",
     "push_softness",
     "rolling_pin",
+    "scene_path",
     "tennis",
     "textbook",
     "wall_softness",

@@ -1,36 +1,17 @@
-"""A scene to be controlled by actions under noise, and where its optimisation starts; the published tasks in MJX are such."""
+"""A scene to be controlled by actions under noise, with where its optimisation starts; and where the scenes of tasks are."""
 
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.scene import Scene
-from mjxgrad.task import SceneTask
-from mjxgrad.tasks.published import QuadraticCost
+from mjxgrad.task import Policy, SceneTask
 
-
-class StateCost(eqx.Module):
-    """A quadratic cost of positions and velocities, in this order.
-
-    Attributes:
-        quadratic: of the state vector and the controls.
-    """
-
-    quadratic: QuadraticCost
-
-    def __call__(self, trajectory: Trajectory) -> Float[Array, " steps"]:
-        """Give the cost of every state: that of a step, and after the last step the final one."""
-        states = jnp.concatenate([trajectory.qpos, trajectory.qvel], axis=1)
-        charged = jax.vmap(self.quadratic.stage)(states[:-1], trajectory.ctrl)
-        return jnp.append(charged, self.quadratic.terminal(states[-1]))
+# Beside the package in a checkout, inside it when installed from a wheel.
+_FOLDERS = (Path(__file__).parents[2] / "mjcf", Path(__file__).parents[1] / "mjcf")
 
 
 class ActionTask(SceneTask):
@@ -43,13 +24,13 @@ class ActionTask(SceneTask):
     """
 
     start_params: PyTree = eqx.field(kw_only=True)
-    policy: Callable[[PyTree, Any], Float[Array, " nu"]] | None = eqx.field(kw_only=True, default=None)
+    policy: Policy | None = eqx.field(kw_only=True, default=None)
     stddev: float = eqx.field(static=True, kw_only=True, default=0.1)
 
     def objective(
         self, stddev: float | Float[Array, "..."] | None = None, softness: Softness | None = None
     ) -> ActionNoise:
-        """Give the cost under noise on the actions.
+        """Return the cost under noise on the actions.
 
         Args:
             stddev: of the noise, in units of the controls; None takes that of the task.
@@ -65,38 +46,25 @@ class ActionTask(SceneTask):
         return closed_loop(task, self.policy, stddev, params=self.start_params)
 
     def initial_params(self) -> Float[Array, " dim"]:
-        """Give where the optimisation starts, as the flat vector that estimators take."""
+        """Return where the optimisation starts, as the flat vector that estimators take."""
         return ravel_pytree(self.start_params)[0]
 
 
-def quadratic_task(
-    scene: Scene,
-    cost: QuadraticCost,
-    horizon: int,
-    *,
-    start_params: PyTree,
-    state: State | None = None,
-    **options: Any,
-) -> ActionTask:
-    """Make a task with a quadratic cost.
+def scene_path(name: str) -> Path:
+    """Find the MJCF file of a task.
 
     Args:
-        scene: from `load_scene`.
-        cost: of the vector of positions and velocities, and of the controls.
-        horizon: number of steps.
-        start_params: the controls, or the policy's parameters.
-        state: the nominal start; None is the scene's reference pose at rest.
-        **options: `policy`, `stddev`, `start_distribution` and `gradient` of `ActionTask`, where they are not the default.
+        name: the task's.
 
     Returns:
-        The task.
+        The path of its scene.
+
+    Raises:
+        FileNotFoundError: if there is no such file; the message says where it was looked for.
     """
-    # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
-    return ActionTask(  # pyright: ignore[reportCallIssue]
-        scene=scene,
-        state=initial_state(scene) if state is None else state,
-        cost=StateCost(cost),
-        horizon=horizon,
-        start_params=start_params,
-        **options,
-    )
+    for folder in _FOLDERS:
+        path = folder / f"{name}.xml"
+        if path.is_file():
+            return path
+    looked = " nor ".join(str(folder) for folder in _FOLDERS)
+    raise FileNotFoundError(f"no scene {name}.xml in {looked}: run from a checkout, or install the wheel again")

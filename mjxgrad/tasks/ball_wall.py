@@ -10,7 +10,6 @@ References:
 
 import equinox as eqx
 import jax.numpy as jnp
-import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Trajectory, initial_state, rollout
@@ -18,7 +17,7 @@ from mjxgrad.contact import Softness
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import load_scene
 from mjxgrad.task import InScene, finite_cost
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.action_task import scene_path
 
 # The knob is the wall alone: with the floor softened as well, the ball would sink and slide farther, too.
 WALL_CONTACT = (("ball", "wall"),)
@@ -38,37 +37,23 @@ class BallWall(InScene):
     horizon: int = eqx.field(static=True)
 
     def trajectory(self, angle: Float[Array, " 1"]) -> Trajectory:
-        """Throw once.
-
-        Args:
-            angle: above the floor, in rad.
-
-        Returns:
-            The course of the ball.
-        """
-        velocity = self.speed * jnp.array([jnp.cos(angle[0]), 0, jnp.sin(angle[0])])
-        is_free = self.scene.model.nv == 6
-        qvel = jnp.concatenate([velocity, jnp.zeros(3)]) if is_free else velocity[jnp.array([0, 2])]
-        dtype = self.scene.data.qvel.dtype
+        """Throw once, at an angle above the floor, in rad."""
+        qvel = self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])])
         return rollout(
             self.scene,
-            initial_state(self.scene, qvel=qvel.astype(dtype)),
+            initial_state(self.scene, qvel=qvel),
             horizon=self.horizon,
             gradient=self.gradient,
             onset=self.onset,
         )
 
-    def end(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Give how far from the start the ball ends, in m; NaN if the rollout diverged."""
-        trajectory = self.trajectory(angle)
-        return finite_cost(trajectory.qpos[-1, 0], trajectory)
-
     def cost(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Give the squared distance from the ball's end to the target, in m²."""
-        return (self.end(angle) - self.target) ** 2
+        """Return the squared distance from the ball's end to the target, in m²; NaN if the rollout diverged."""
+        trajectory = self.trajectory(angle)
+        return finite_cost((trajectory.qpos[-1, 0] - self.target) ** 2, trajectory)
 
     def objective(self, stddev: float | Float[Array, ""] = 0.1, softness: Softness | None = None) -> ParameterNoise:
-        """Give the cost as a function of the angle, with noise on the angle.
+        """Return the cost as a function of the angle, with noise on the angle.
 
         Args:
             stddev: of the noise, in rad.
@@ -83,7 +68,6 @@ class BallWall(InScene):
 
 def ball_wall(
     *,
-    free: bool = False,
     speed: float = 2.0,
     target: float = 0.38,
     horizon: int = 210,
@@ -95,7 +79,6 @@ def ball_wall(
     the landscape jumps at 35; the best throw at the target is at 57 degrees.
 
     Args:
-        free: give the ball all six degrees of freedom: it then spins, and rolls on where it lands. Planar otherwise.
         speed: of the throw, in m/s.
         target: where the ball should end, in m from the start.
         horizon: number of steps; the default is 0.42 s, when every throw has landed and stopped.
@@ -104,7 +87,7 @@ def ball_wall(
     Returns:
         The task.
     """
-    scene = load_scene(_free_model() if free else scene_path("ball_wall"), timestep=timestep)
+    scene = load_scene(scene_path("ball_wall"), timestep=timestep)
     return BallWall(scene, jnp.asarray(speed), jnp.asarray(target), horizon)
 
 
@@ -120,12 +103,3 @@ def wall_softness(stiffness: float | Float[Array, "..."], damping_ratio: float |
     """
     stiffness, damping_ratio = jnp.broadcast_arrays(jnp.asarray(stiffness, float), jnp.asarray(damping_ratio, float))
     return Softness(stiffness, damping_ratio, pairs=WALL_CONTACT)
-
-
-def _free_model() -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_file(str(scene_path("ball_wall")))
-    ball = spec.body("ball")
-    for joint in ball.joints:
-        spec.delete(joint)
-    ball.add_freejoint(name="ball")
-    return spec.compile()

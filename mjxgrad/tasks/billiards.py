@@ -16,11 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Trajectory, initial_state, rollout
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import load_scene
 from mjxgrad.task import InScene, finite_cost
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.action_task import scene_path
 
 BILLIARDS_CONTACT = (("driven", "knocked"),)
 _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)
@@ -34,21 +33,19 @@ class Billiards(InScene):
         effort: $\epsilon$, price of the squared force, in m²/(N² s).
         num_pieces: the force is constant over as many pieces of the time.
         horizon: number of steps, a multiple of `num_pieces`.
-        smoothing: as for `rollout`.
     """
 
     target: Float[Array, " 2"]
     effort: Float[Array, ""]
     num_pieces: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
-    smoothing: Smoothing | None = None
 
     def start(self, force: float = 1.0) -> Float[Array, " dim"]:
-        """Give a constant force towards the other ball; below 1.43 N per axis the balls do not touch."""
+        """Return a constant force towards the other ball; below 1.43 N per axis the balls do not touch."""
         return jnp.full(2 * self.num_pieces, force)
 
     def controls(self, params: Float[Array, " dim"]) -> Float[Array, "horizon 2"]:
-        """Give the force at each step, in N, from that of each piece, both axes of a piece side by side."""
+        """Return the force at each step, in N, from that of each piece, both axes of a piece side by side."""
         return jnp.repeat(params.reshape(self.num_pieces, 2), self.horizon // self.num_pieces, axis=0)
 
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
@@ -59,7 +56,7 @@ class Billiards(InScene):
         )
 
     def cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
-        """Give the squared distance to the target plus the price of the effort, in m²; NaN if the rollout diverged."""
+        """Return the squared distance to the target plus the price of the effort, in m²; NaN if the rollout diverged."""
         trajectory = self.trajectory(params)
         miss = jnp.array(_PLACE) + trajectory.qpos[-1, 2:] - self.target
         duration = self.horizon * self.scene.model.opt.timestep
@@ -67,17 +64,12 @@ class Billiards(InScene):
         return finite_cost(miss @ miss + effort, trajectory)
 
     def with_margin(self, margin: float | Float[Array, ""]) -> "Billiards":
-        """Give the same stroke with a contact that begins at another distance, in m: as if the balls were larger."""
-        model = self.scene.model
-        model = model.replace(pair_margin=jnp.full_like(model.pair_margin, margin))
-        return eqx.tree_at(lambda task: task.scene.model, self, model)
-
-    def with_smoothing(self, smoothing: Smoothing | None) -> "Billiards":
-        """Give the same stroke with its contact averaged over noise on the distance; see `rollout`."""
-        return dataclasses.replace(self, smoothing=smoothing)
+        """Return the same stroke with a contact that begins at another distance, in m: as if the balls were larger."""
+        scene = self.scene.with_model(pair_margin=jnp.full_like(self.scene.model.pair_margin, margin))
+        return dataclasses.replace(self, scene=scene)
 
     def objective(self, stddev: float | Float[Array, ""]) -> ParameterNoise:
-        """Give the cost as a function of the forces, with noise on each of them.
+        """Return the cost as a function of the forces, with noise on each of them.
 
         Args:
             stddev: of the noise, in N.

@@ -7,9 +7,9 @@ that is not zero at first touch, so that every parameter that moves the moment o
 import dataclasses
 from pathlib import Path
 
-import equinox as eqx
 import jax.numpy as jnp
 import mujoco
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import State, Trajectory, initial_state
@@ -24,18 +24,9 @@ START_VELOCITY = (0.5, -1.0, 0.0, 0.0, 0.0, 0.0)
 STIFFNESS, DAMPING = (0.5, 0.5, 0.3), (0.05, 0.05, 0.03)
 
 
-class JumpCost(eqx.Module):
-    """How far and high the torso comes, as a cost.
-
-    Attributes:
-        height_weight: of the final height.
-    """
-
-    height_weight: Float[Array, ""]
-
-    def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
-        """Give minus the distance forward, less the weighted height, in m."""
-        return -trajectory.qpos[-1, 0] - self.height_weight * trajectory.qpos[-1, 1]
+def jump_cost(height_weight: Float[Array, ""], trajectory: Trajectory) -> Float[Array, ""]:
+    """Return minus the distance forward, less the weighted height of the torso in the end, in m."""
+    return -trajectory.qpos[-1, 0] - height_weight * trajectory.qpos[-1, 1]
 
 
 def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
@@ -51,7 +42,14 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
     Returns:
         The task.
     """
-    model = mujoco.MjModel.from_xml_path(str(_path()))
+    # Imported here: only this task needs it.
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
+
+    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = load_scene(model)
     policy, zero = linear_policy(6, 3, observe=joints)
@@ -62,7 +60,7 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
     return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,
         state=initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY)),
-        cost=JumpCost(jnp.asarray(height_weight, float)),
+        cost=Partial(jump_cost, jnp.asarray(height_weight, float)),
         horizon=horizon,
         policy=policy,
         start_params=posture,
@@ -72,13 +70,3 @@ def hopper(*, horizon: int = 150, height_weight: float = 1.0) -> ActionTask:
 def joints(state: State) -> Float[Array, " 6"]:
     """Observe the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
     return jnp.concatenate([state.qpos[3:], state.qvel[3:]])
-
-
-def _path() -> Path:
-    # Imported here: only this task needs it.
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
-
-    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"

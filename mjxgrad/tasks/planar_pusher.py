@@ -12,9 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from mjxgrad._rollout import initial_state
 from mjxgrad.planning.system import SceneSystem
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.action_task import scene_path
 
-SPEED_LIMIT = 0.4  # m/s, per axis; the range of the scene's actuators
 # 0.1 s per decision: four time constants of the damped rod.
 _NUM_SUBSTEPS = 10
 _HALF_LENGTH = 0.1  # m, of the rod's axis
@@ -35,16 +34,11 @@ class PlanarPusher(eqx.Module):
     system: SceneSystem
     start: Float[Array, " state"]
     goal: Float[Array, " state"]
-    speed_limit: float = eqx.field(static=True, default=SPEED_LIMIT)
+    speed_limit: float = eqx.field(static=True, default=0.4)  # m/s, per axis; the range of the scene's actuators
 
 
 def beside_rod(key: PRNGKeyArray, state: Float[Array, " state"]) -> Float[Array, " state"]:
-    """Draw a state in which the finger has gone to somewhere just beside the rod, along its sides or before an end.
-
-    Args:
-        key: consumed here.
-        state: where the rod is; it stays, and all velocities become zero.
-    """
+    """Draw a state in which the finger is just beside the rod, along its sides or before an end; the rod stays, at rest."""
     side_key, end_key, along_key = jax.random.split(key, 3)
     side = jnp.where(jax.random.bernoulli(side_key), _BESIDE, -_BESIDE)
     along = jax.random.uniform(along_key, minval=-_HALF_LENGTH, maxval=_HALF_LENGTH)

@@ -13,6 +13,8 @@ References:
     Physics. ICLR 2021, arXiv:2104.03311 (the rolling pin, and soft contact of its tools).
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,10 +22,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._rollout import Trajectory, initial_state
-from mjxgrad.objective import ActionNoise, open_loop
 from mjxgrad.scene import load_scene
-from mjxgrad.task import SceneTask
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks.action_task import ActionTask, scene_path
 
 NUM_PILLARS = 8
 DENT = (2, 3, 4, 5)
@@ -49,7 +49,7 @@ class DentCost(eqx.Module):
     reach: Float[Array, ""]
 
     def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
-        """Give the cost of a rollout."""
+        """Return the cost of a rollout."""
         error = jnp.sum((trajectory.qpos[-1, 2:] - self.target) ** 2) / jnp.sum(self.target**2)
         effort = self.control_weight * jnp.mean(trajectory.ctrl**2)
         distance = jax.vmap(self.distance)(trajectory.qpos)
@@ -57,12 +57,12 @@ class DentCost(eqx.Module):
         return error + effort + self.proximity_weight * jnp.mean(far**2)
 
     def distance(self, qpos: Float[Array, " nq"]) -> Float[Array, ""]:
-        """Give the distance of the pin from the nearest pillar, negative inside (m)."""
+        """Return the distance of the pin from the nearest pillar, negative inside (m)."""
         offset = self.centre + jnp.stack([jnp.broadcast_to(qpos[0], self.target.shape), qpos[1] - qpos[2:]], axis=1)
         return jnp.min(jnp.linalg.norm(offset, axis=1)) - self.reach
 
 
-class RollingPin(SceneTask):
+class RollingPin(ActionTask):
     """The pin and its bed; see `rolling_pin`. Every remedy gives another task, of the same controls."""
 
     @property
@@ -71,21 +71,16 @@ class RollingPin(SceneTask):
         return self.cost.target  # pyright: ignore[reportFunctionMemberAccess]
 
     def with_proximity(self, weight: Float[ArrayLike, ""]) -> "RollingPin":
-        """Give the task whose cost draws the pin to the bed."""
+        """Return the task whose cost draws the pin to the bed."""
         return eqx.tree_at(lambda task: task.cost.proximity_weight, self, jnp.asarray(weight, float))
 
     def enlarged(self, extra: Float[ArrayLike, ""]) -> "RollingPin":
-        """Give the task with a pin of a radius larger by so much (m); it is no heavier."""
-        model, pin = self.scene.model, self.scene.mj_model.geom("pin").id
-        size = model.geom_size.at[pin, 0].add(extra)
-        return eqx.tree_at(lambda task: task.scene.model, self, model.replace(geom_size=size))
-
-    def objective(self, stddev: float | Float[Array, ""]) -> ActionNoise:
-        """Give the cost under noise on the controls, as a function of them, flattened."""
-        return open_loop(self, stddev)
+        """Return the task with a pin of a radius larger by so much (m); it is no heavier."""
+        size = self.scene.model.geom_size.at[self.scene.mj_model.geom("pin").id, 0].add(extra)
+        return dataclasses.replace(self, scene=self.scene.with_model(geom_size=size))
 
     def true_cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
-        """Give the cost of flattened controls, without noise."""
+        """Return the cost of flattened controls, without noise."""
         return self.run(params.reshape(self.horizon, self.num_controls)).cost
 
 
@@ -116,4 +111,5 @@ def rolling_pin(*, horizon: int = 120, control_weight: float = 1e-3) -> RollingP
         centre=jnp.asarray((at_rest[pin] - at_rest[caps])[:, [0, 2]]),
         reach=jnp.asarray(model.geom_size[pin, 0] + model.geom_size[caps[0], 0]),
     )
-    return RollingPin(scene, initial_state(scene), cost, horizon)  # pyright: ignore[reportCallIssue]
+    start = jnp.zeros((horizon, scene.model.nu))
+    return RollingPin(scene, initial_state(scene), cost, horizon, start_params=start)  # pyright: ignore[reportCallIssue]

@@ -222,7 +222,7 @@ def test_half_way_between_two_values_of_softness_lies_the_mean_of_its_kind():
 
 
 def test_a_schedule_ends_at_its_end_and_stays_there():
-    schedule = jax.jit(lambda step: Softness(1e2, 1.0).schedule(Softness(1e4, 1.0), 4)(step).stiffness)
+    schedule = jax.jit(lambda step: Softness.between(Softness(1e2, 1.0), Softness(1e4, 1.0), step / 4).stiffness)
     np.testing.assert_allclose([schedule(step) for step in (0, 1, 4, 9)], [1e2, 10**2.5, 1e4, 1e4], rtol=1e-12)
 
 

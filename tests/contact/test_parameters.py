@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.contact.warnings import largest_stable_step
 from mjxgrad.scene import load_scene
-from mjxgrad.scene.contact_check import largest_stable_step
 
 # Every ball touches the floor: mixing, a share of solmix, none at all, priority of either side,
 # the direct format, both formats together, and an explicit pair.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from experiments.cube_toss.throw import cube_toss
 from mjxgrad.dynamics import check_gradient, step
 
 # Impacts of everything that can begin, each on a body of its own and without gravity. All move at 1 m/s or 1 rad/s towards a stop
@@ -238,7 +239,7 @@ def test_a_grazing_contact_leaves_the_discrete_derivative():
 @pytest.mark.slow
 def test_an_edge_that_rolls_unloaded_does_not_blow_up():
     """A thrown cube ends on an edge that hops by less than a micrometre, hundreds of times: each hop an event."""
-    task = mg.tasks.cube_toss("default", timestep=2.5e-4)
+    task = cube_toss("default", timestep=2.5e-4)
 
     def sideways(speed, gradient):
         trajectory = mg.rollout(task.scene, task.start(speed), horizon=4000, gradient=gradient)

@@ -11,8 +11,8 @@ from experiments.cube_toss.measure import substepped_step
 from experiments.cube_toss.outcome import Course, Outcome, Point
 from experiments.cube_toss.report import findings, verdict
 from experiments.cube_toss.settings import Settings
+from experiments.cube_toss.throw import cube_toss
 from mjxgrad._rollout import data_of
-from mjxgrad.tasks.cube_toss import cube_toss
 from tests.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
 
 REFERENCE = np.array([0.5, 0.5, 0.5])

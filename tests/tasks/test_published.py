@@ -8,21 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.optimisation import published as settings
 from mjxgrad import estimators
 from mjxgrad.tasks import published
-from mjxgrad.tasks.published.friction import friction_task
-from mjxgrad.tasks.published.lqr import lqr_task
-from mjxgrad.tasks.published.motion_planning import CENTRES, RADII, motion_planning_task
-from mjxgrad.tasks.published.push import push_task
-from mjxgrad.tasks.published.tennis import tennis_task
+from mjxgrad.tasks.published import CENTRES, RADII
 
-NAMES = tuple(published.TASKS)
+NAMES = tuple(settings.TASKS)
 LEVEL_PAD = [0.0, 0.0, 0.0]
 
 
 @functools.cache
 def setting(name):
-    return published.TASKS[name]()
+    return settings.TASKS[name]()
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "tennis"])
@@ -87,7 +84,7 @@ def test_friction_separates_the_estimators_as_published():
 
 def test_bodies_apart_move_freely():
     """The velocity is c^t v and the position x + h v Σ cᵗ."""
-    task, c, n = push_task(10.0, 0.99, 20), 0.99, 20
+    task, c, n = published.push(10.0, 0.99, 20), 0.99, 20
     start = jnp.array([0.0, 1.5, -0.3, 0.2])
     states = task.run(jnp.zeros((n, 1)), start=start).states
     last = task.advance(states[-1], jnp.zeros(1))
@@ -97,26 +94,26 @@ def test_bodies_apart_move_freely():
 
 def test_the_spring_pushes_both_bodies_apart_in_proportion_to_its_compression():
     """50 N/m compressed by 0.2 m gives 10 N: h/m F = 0.5 m/s in one step, and the control 0.1 m/s."""
-    task = push_task(50.0, 1.0, 1)
+    task = published.push(50.0, 1.0, 1)
     moved = task.advance(jnp.array([0.2, 1.0, 0.0, 0.0]), jnp.array([2.0]))
     np.testing.assert_allclose(moved, [0.2 - 0.005 * 0.4, 1 + 0.005 * 0.5, -0.4, 0.5], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("speed", "drag"), [(0.05, 0.09), (0.1, 0.18), (0.3, 0.18), (-5.0, -0.18)])
 def test_friction_is_viscous_up_to_its_limit(speed, drag):
-    moved = friction_task().advance(jnp.array([0.0, 0.05, speed, 0.0]), jnp.zeros(1))
+    moved = published.friction().advance(jnp.array([0.0, 0.05, speed, 0.0]), jnp.zeros(1))
     # h/m = 0.05 m/s per N, on both with opposite signs.
     np.testing.assert_allclose(moved[2:], [speed - 0.05 * drag, 0.05 * drag], rtol=1e-12)
 
 
 def test_bodies_that_do_not_overlap_do_not_rub():
-    moved = friction_task().advance(jnp.array([0.0, 0.11, 3.0, 0.0]), jnp.zeros(1))
+    moved = published.friction().advance(jnp.array([0.0, 0.11, 3.0, 0.0]), jnp.zeros(1))
     np.testing.assert_array_equal(moved[2:], [3.0, 0.0])
 
 
 def test_a_point_stops_before_a_disc():
     """Straight at the first one, at 1 m/s: it stops less than one step of 1 cm before, and stays."""
-    task, towards = motion_planning_task(), np.array(CENTRES[0]) / np.hypot(*CENTRES[0])
+    task, towards = published.motion_planning(), np.array(CENTRES[0]) / np.hypot(*CENTRES[0])
     states = task.run(jnp.broadcast_to(jnp.array(towards), (200, 2))).states
     gaps = np.hypot(*(np.asarray(states) - CENTRES[0]).T) - RADII[0]
     assert 0 <= gaps[-1] < 0.01
@@ -127,7 +124,7 @@ def test_a_point_stops_before_a_disc():
 def test_a_blocked_point_does_not_feel_its_control():
     """The derivative by the control is zero there, which is why first order sticks."""
     beside = jnp.array([-0.2, 0.299])
-    slopes = jax.jacobian(motion_planning_task().advance, argnums=(0, 1))(beside, jnp.array([0.0, 1.0]))
+    slopes = jax.jacobian(published.motion_planning().advance, argnums=(0, 1))(beside, jnp.array([0.0, 1.0]))
     np.testing.assert_array_equal(slopes[0], np.eye(2))
     np.testing.assert_array_equal(slopes[1], np.zeros((2, 2)))
 
@@ -138,25 +135,25 @@ def test_an_elastic_bounce_keeps_the_speed_and_mirrors_the_path(angle):
     along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     position, velocity = 0.3 * along + 0.215 * across, 0.7 * along - 0.5 * across
     state = jnp.array([*position, *velocity, 0.0, 0.0, angle])
-    moved = tennis_task().advance(state, jnp.zeros(3))
+    moved = published.tennis().advance(state, jnp.zeros(3))
     np.testing.assert_allclose(moved[2:4], 0.7 * along + 0.5 * across, rtol=1e-12)
     # 0.025 m further down it would be at 0.19, mirrored at 0.2 that is 0.21.
     np.testing.assert_allclose(moved[:2], (0.3 + 0.05 * 0.7) * along + 0.21 * across, rtol=1e-12)
 
 
 def test_a_ball_beyond_the_pad_s_end_flies_on_and_slows_down():
-    moved = tennis_task().advance(jnp.array([0.96, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
+    moved = published.tennis().advance(jnp.array([0.96, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
     np.testing.assert_allclose(moved, [0.96, 0.19, 0.0, -0.4 * 0.999, 0.01, 0.005, 0.02], rtol=1e-12)
 
 
 def test_a_pad_that_is_hit_keeps_its_pose():
-    moved = tennis_task().advance(jnp.array([0.0, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
+    moved = published.tennis().advance(jnp.array([0.0, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
     np.testing.assert_array_equal(moved[4:], LEVEL_PAD)
 
 
 def test_a_ball_at_rest_on_the_pad_has_finite_derivatives():
     """It has no time to impact; the derivative of the quotient must not leak out of the branch not taken."""
-    slopes = jax.jacobian(tennis_task().advance)(jnp.array([0.1, 0.19, 0.0, 0.0, *LEVEL_PAD]), jnp.zeros(3))
+    slopes = jax.jacobian(published.tennis().advance)(jnp.array([0.1, 0.19, 0.0, 0.0, *LEVEL_PAD]), jnp.zeros(3))
     assert np.isfinite(slopes).all()
 
 
@@ -173,7 +170,7 @@ def test_tennis_starts_at_the_published_cost():
 
 def test_the_regulator_costs_what_its_geometric_series_says():
     """With u = −k x the state is (1 − k)ᵗ x₀, for k = 0 it stays, and the cost is 20 |x₀|²."""
-    task, start = lqr_task(3), jnp.array([1.0, -2.0, 0.5])
+    task, start = published.lqr(3), jnp.array([1.0, -2.0, 0.5])
     for k in (0.0, 0.3):
         shrink = (1 - k) ** 2
         expected = 5.25 * ((1 + 0.1 * k**2) * sum(shrink**t for t in range(10)) + 10 * shrink**10)
@@ -182,7 +179,7 @@ def test_the_regulator_costs_what_its_geometric_series_says():
 
 
 def test_a_random_start_has_the_published_spread():
-    draw = jax.vmap(tennis_task().sample_start)(jax.random.split(jax.random.key(0), 4000))
+    draw = jax.vmap(published.tennis().sample_start)(jax.random.split(jax.random.key(0), 4000))
     drift = draw[:, 2:4] + 0.2 * draw[:, :2]
     spread = np.array([*draw[:, :2].std(axis=0), *drift.std(axis=0), *draw[:, 4:].std(axis=0)])
     np.testing.assert_allclose(spread, [4 / 12**0.5, 0.2, 0.03, 0.03, 0.5, 0.05, 0.05], rtol=4 / (2 * 4000) ** 0.5)
@@ -192,7 +189,7 @@ def test_a_random_start_has_the_published_spread():
 def test_the_stiff_push_differs_in_more_than_stiffness_and_has_no_reference_elsewhere():
     assert setting("push_stiff").objective.task.horizon == 200
     assert setting("push_soft").objective.task.horizon == 400
-    assert published.push(50.0).reference == {}
+    assert settings.push(50.0).reference == {}
 
 
 def test_rates_decrease_where_the_paper_says():

@@ -12,8 +12,7 @@ import pytest
 from mjxgrad._rollout import rollout
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
-from mjxgrad.tasks import friction, motion_planning, push, push_softness, tennis
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks import friction, motion_planning, push, push_softness, scene_path, tennis
 
 TIMESTEP, MASS, RAIL_DAMPING = 0.005, 0.1, 0.04  # s, kg, N s/m: of the push
 COEFFICIENT, GRAVITY = 0.1835, 9.81  # of the friction; m/s²
@@ -33,7 +32,7 @@ def test_random_starts_have_the_shape_of_the_nominal_one(key):
     task = tennis(horizon=3)
     nominal, drawn = task.nominal_start(), task.sample_start(key)
     assert jax.tree.map(jnp.shape, nominal) == jax.tree.map(jnp.shape, drawn)
-    np.testing.assert_allclose(task.policy.observe(drawn), task.start_distribution.published.sample_start(key))
+    np.testing.assert_allclose(task.policy.observe(drawn), task.start_distribution.task.sample_start(key))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._rollout import State, initial_state
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.tasks.files import scene_path
+from mjxgrad.tasks import scene_path
 
 DURATION = 1.0  # s
 PUBLISHED_SPEED = -2.0  # m/s, upwards
@@ -35,16 +35,12 @@ class CubeToss(eqx.Module):
     scene: Scene
 
     def start(self, speed: Float[ArrayLike, ""]) -> State:
-        """Give the state at the throw.
-
-        Args:
-            speed: upwards, in m/s.
-        """
+        """Return the state at a throw upwards at a speed in m/s."""
         qvel = jnp.zeros_like(self.scene.data.qvel).at[1].set(_DRIFT).at[2].set(speed)
         return initial_state(self.scene, qvel=qvel)
 
     def outcome(self, qpos: Float[Array, "*states 7"]) -> Float[Array, "*states"]:
-        """Give how far sideways the cube is, in m."""
+        """Return how far sideways the cube is, in m."""
         return qpos[..., 1]
 
 
@@ -64,10 +60,5 @@ def cube_toss(contact: str = "published", *, timestep: float | None = None) -> C
     if contact not in _CONTACTS:
         raise ValueError(f"contact must be one of {', '.join(map(repr, _CONTACTS))}, got {contact!r}")
     scene = load_scene(scene_path("cube_toss"), timestep=timestep)
-    solref, solimp = _CONTACTS[contact]
-    model = scene.model
-    model = model.replace(
-        pair_solref=jnp.broadcast_to(jnp.array(solref, model.pair_solref.dtype), model.pair_solref.shape),
-        pair_solimp=jnp.broadcast_to(jnp.array(solimp, model.pair_solimp.dtype), model.pair_solimp.shape),
-    )
-    return CubeToss(eqx.tree_at(lambda s: s.model, scene, model))
+    solref, solimp = (jnp.array([row]) for row in _CONTACTS[contact])
+    return CubeToss(scene.with_model(pair_solref=solref, pair_solimp=solimp))

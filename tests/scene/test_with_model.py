@@ -1,0 +1,105 @@
+"""Numbers of a model are replaced by name, and what cannot be is said."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.scene import SceneWarning
+
+H = 0.01
+SLIDER = f"""<mujoco><option timestep="{H}" gravity="0 0 0"/><worldbody><body>
+  <joint name="x" type="slide" axis="1 0 0" damping="1" limited="true" range="-1 2"/><geom size=".1" mass="2"/></body></worldbody>
+  <actuator><motor joint="x" ctrllimited="true" ctrlrange="-1 3"/><motor joint="x"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return mg.load_scene(SLIDER)
+
+
+def test_a_replaced_number_acts_and_is_differentiated(scene):
+    """Implicit damping in one step from 1 m/s: v = 1 / (1 + h c / m), with derivative −(h / m) v² by c."""
+
+    def speed(damping):
+        moved = scene.with_model(dof_damping=damping)
+        return mg.rollout(moved, mg.initial_state(moved, qvel=jnp.ones(1)), horizon=1).qvel[-1, 0]
+
+    value, slope = jax.value_and_grad(speed)(jnp.array([5.0]))
+    expected = 1 / (1 + H * 5 / 2)
+    np.testing.assert_allclose([value, slope[0]], [expected, -(H / 2) * expected**2], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"dof_dampng": np.ones(1)},
+            "must name arrays of numbers of the MJX model, got dof_dampng; did you mean dof_damping",
+        ),
+        ({"geom_type": np.ones(1)}, "must name arrays of numbers of the MJX model, got geom_type"),
+        ({"dof_damping": 5.0}, r"dof_damping must have shape \(1,\) in this scene, got \(\)"),
+    ],
+)
+def test_a_field_that_is_none_or_of_another_shape_is_refused(scene, fields, message):
+    with pytest.raises(ValueError, match=message):
+        scene.with_model(**fields)
+
+
+def test_a_mass_that_constants_do_not_follow_is_said_and_a_damping_is_not(scene):
+    with pytest.warns(SceneWarning, match=r"dof_invweight0.* do not follow the mass"):
+        scene.with_model(body_mass=2 * scene.model.body_mass)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene.with_model(dof_damping=jnp.ones(1))
+
+
+def test_a_damping_of_a_scene_loaded_without_is_said():
+    bare = mg.load_scene(SLIDER.replace('damping="1"', ""))
+    with pytest.warns(SceneWarning, match="integrated explicitly"):
+        bare.with_model(dof_damping=jnp.ones(1))
+
+
+def test_a_control_without_limits_has_infinite_ones(scene):
+    np.testing.assert_array_equal(scene.ctrlrange, [[-1, 3], [-np.inf, np.inf]])
+
+
+def test_a_pose_beyond_a_joint_s_range_is_said(scene):
+    with pytest.warns(SceneWarning, match="x begins at 2.5 m, beyond its range from -1 to 2 m"):
+        mg.initial_state(scene, qpos=np.array([2.5]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mg.initial_state(scene, qpos=np.array([2.0]))
+        jax.jit(lambda qpos: mg.initial_state(scene, qpos=qpos))(jnp.array([2.5]))  # not known while traced
+
+
+SENSED = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body pos="0 0 .09">
+  <joint type="slide" axis="0 0 1"/><geom name="ball" size=".1"/><site name="tip" pos="0 0 .1" size=".2"/></body></worldbody>
+  <sensor><touch name="touch" site="tip"/><framepos name="place" objtype="site" objname="tip"/></sensor></mujoco>"""
+
+
+def test_sensors_and_sites_are_read_by_name_as_in_c():
+    scene = mg.load_scene(SENSED)
+
+    def look(model, data):
+        return mg.sensor(model, data, "touch"), mg.sensor(model, data, "place"), mg.site_position(model, data, "tip")
+
+    touch, place, tip = jax.jit(
+        lambda: mg.rollout(scene, mg.initial_state(scene), horizon=1, observe=look).observations
+    )()
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    assert data.sensor("touch").data[0] > 1
+    np.testing.assert_allclose(touch[0], data.sensor("touch").data, rtol=1e-6)
+    np.testing.assert_allclose(place[0], [0, 0, 0.19], atol=1e-12)
+    np.testing.assert_allclose(tip, place, atol=1e-12)
+    for read, message in (
+        (mg.sensor, "there is no sensor 'nose'; named sensors are 'touch', 'place'"),
+        (mg.site_position, "there is no site 'nose'; named sites are 'tip'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(scene.model, scene.data, "nose")
