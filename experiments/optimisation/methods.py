@@ -12,7 +12,7 @@ from jaxtyping import Array, Key
 import mjxgrad as mg
 from experiments.optimisation.settings import MethodSettings, Settings
 from mjxgrad.diagnostics import Rollouts
-from mjxgrad.diagnostics.budget import affordable
+from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import GradientEstimate, rules
 from mjxgrad.tasks.published import TASKS, Published
 

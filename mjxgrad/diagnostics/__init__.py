@@ -1,8 +1,7 @@
 """How far gradients can be trusted, measured."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
-from mjxgrad.diagnostics.budget import Rollouts, Seconds
-from mjxgrad.diagnostics.comparison import Comparison, compare
+from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along

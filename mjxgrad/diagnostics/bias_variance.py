@@ -14,7 +14,8 @@ from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_int
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
-from mjxgrad.objective import Objective, ParameterNoise
+from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
+from mjxgrad.objective.base import unchanged
 
 
 class BiasVariance(eqx.Module):
@@ -66,7 +67,7 @@ class BiasVariance(eqx.Module):
 
 def bias_variance(
     objective_of_softness: Callable[[PyTree], Objective],
-    params: Float[Array, "..."],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     softness: PyTree | Sequence[PyTree],
@@ -86,7 +87,8 @@ def bias_variance(
 
     Args:
         objective_of_softness: gives the objective at one softness; traceable.
-        params: points to measure at, one per row, in the parameters' units.
+        params: points to measure at, one per row, in the parameters' units; or a pytree whose floating-point arrays have
+            an axis of points first. The result has them as vectors.
         key: consumed here.
         softness: any pytree whose leaves have a leading axis (`Softness.sweep`), or a sequence of pytrees.
         num_samples: differentiated rollouts per softness and point. At least 2.
@@ -109,17 +111,14 @@ def bias_variance(
         arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
     """
     check_baseline(baseline)
-    if jnp.ndim(params) != 2:
-        raise ValueError(
-            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
-        )
+    params, restore = _points(params)
     if num_reference < 4:
         raise ValueError(f"num_reference must be at least 4, got {num_reference}")
-    params = jnp.asarray(params)
     stacked, count = _stacked(softness)
     has_zero_noise = baseline == "zero_noise"
     plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)
-    measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
+    of_softness = lambda one: of_vector(objective_of_softness(one), restore)  # noqa: E731
+    measure = eqx.filter_jit(_Measurement(of_softness, plan, baseline, num_reference))
     rows = []
     for i in range(count):
         measured, samples = jax.block_until_ready(
@@ -157,7 +156,7 @@ class _Measurement(eqx.Module):
         objective = self.objective_of_softness(softness).sized_for(params[0])
         samples_key, reference_key = jax.random.split(key)
         samples = self._samples(objective, params, samples_key)
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), self.plan, self.baseline))(samples)
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), self.plan, self.baseline, unchanged))(samples)
         if isinstance(objective, ParameterNoise) and objective.dim == 1:
             reference = self._line(objective, params, reference_key)
         else:
@@ -172,7 +171,7 @@ class _Measurement(eqx.Module):
         def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
             point, chunk = point_and_chunk
             units = size * chunk + jnp.arange(size)
-            return sample(objective, params[point], jax.random.fold_in(key, point), units, self.plan)
+            return sample(objective, params[point], jax.random.fold_in(key, point), self.plan, units)
 
         samples = jax.lax.map(one_chunk, (points, chunks))
         return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
@@ -274,6 +273,19 @@ def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
     }[baseline]
     gradients = np.where(np.isfinite(costs)[:, None], samples.gradients[is_noisy, 0], np.nan)
     return gradients, (costs - centre)[:, None] * scores
+
+
+def _points(params: PyTree) -> tuple[Float[Array, "points dim"], Callable | None]:
+    """Give the points as rows, and the way from a row to their form; None if they are rows."""
+    if eqx.is_array_like(params):
+        if jnp.ndim(params) != 2:
+            raise ValueError(
+                f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+            )
+        return jnp.asarray(params), None
+    arrays, others = eqx.partition(params, eqx.is_inexact_array)
+    first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], arrays), others)
+    return jax.vmap(lambda one: flattened(one)[0])(arrays), flattened(first)[1]
 
 
 def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:

@@ -55,15 +55,7 @@ class SecantSums(eqx.Module):
 
 
 def secant_sums(samples: Group, slopes: Float[Array, "samples samples"]) -> SecantSums:
-    """Compare all pairs of a group that differ in their noise alone.
-
-    Args:
-        samples: of the group.
-        slopes: their `gram`.
-
-    Returns:
-        The sums; every pair is in them twice.
-    """
+    """Compare all pairs of a group that differ in their noise alone; every pair is in the sums twice."""
     own = jnp.diagonal(slopes)
     difference = samples.costs[:, None] - samples.costs[None, :]
     # The derivatives of both along the way from k to j.

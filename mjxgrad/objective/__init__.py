@@ -1,9 +1,8 @@
 """What an estimator sees: a value under noise, the score of that noise, and both by the noisy quantity."""
 
 from mjxgrad.objective.actions import ActionNoise, ClosedLoop, OpenLoop, closed_loop, open_loop
-from mjxgrad.objective.base import Differentiated, Objective
-from mjxgrad.objective.derivative import value_and_gradient
-from mjxgrad.objective.parameters import ParameterNoise, parameter_noise
+from mjxgrad.objective.base import Differentiated, Objective, value_and_gradient
+from mjxgrad.objective.parameters import ParameterNoise, as_vector, flattened, of_vector, parameter_noise
 
 __all__ = [
     "ActionNoise",
@@ -12,7 +11,10 @@ __all__ = [
     "Objective",
     "OpenLoop",
     "ParameterNoise",
+    "as_vector",
     "closed_loop",
+    "flattened",
+    "of_vector",
     "open_loop",
     "parameter_noise",
     "value_and_gradient",

@@ -12,9 +12,15 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.objective.base import Differentiated, Objective, as_scalar, unchanged
-from mjxgrad.objective.derivative import value_and_gradient
-from mjxgrad.objective.gaussian import gaussian, positive
+from mjxgrad.objective.base import (
+    Differentiated,
+    Objective,
+    as_scalar,
+    gaussian,
+    positive,
+    unchanged,
+    value_and_gradient,
+)
 from mjxgrad.task import Outcome, Task, as_pytree
 
 
@@ -119,7 +125,8 @@ class ActionNoise(Objective):
             outcome = self.outcome(params, shaped if start is None else (shaped, start))
             return outcome.cost, outcome.states
 
-        cost, states, gradient = value_and_gradient(cost_and_states, jnp.ravel(actions).astype(params.dtype))
+        flat = jnp.ravel(actions).astype(params.dtype)
+        (cost, states), gradient = value_and_gradient(cost_and_states, flat, has_aux=True)
         stddev = jnp.ravel(jnp.broadcast_to(self.stddev, self.noise_shape)).astype(params.dtype)
         score, pull_back = self._noise_score(params, noise), self.pull_back_at(params, states)
         return Differentiated(cost, gradient, score, stddev, pull_back)

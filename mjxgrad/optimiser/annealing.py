@@ -45,15 +45,9 @@ class Schedule(Annealing):
 
 
 class PlateauState(eqx.Module):
-    """What `Plateau` keeps.
+    """What `Plateau` keeps: the scale; of the present block the steps, their costs and squared standard errors summed up.
 
-    Attributes:
-        scale: the present one.
-        count: steps in the present block.
-        total: sum of their costs.
-        total_square: sum of their squared standard errors.
-        previous: mean cost of the block before; infinite if that had another scale.
-        previous_square: its squared standard error.
+    `previous` is the mean cost of the block before, infinite if that had another scale, and the last its squared error.
     """
 
     scale: Float[Array, ""]
@@ -136,17 +130,7 @@ class Plateau(Annealing):
 
 
 def as_annealing(annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None) -> Annealing | None:
-    """Wrap a schedule.
-
-    Args:
-        annealing: as given to `optimise`.
-
-    Returns:
-        One of the kinds of `Annealing`, or None.
-
-    Raises:
-        ValueError: if it is neither an annealing nor callable.
-    """
+    """Wrap a schedule, refusing what is neither an annealing nor callable."""
     if annealing is None or isinstance(annealing, Annealing):
         return annealing
     if not callable(annealing):

@@ -1,4 +1,4 @@
-"""When there is nothing left to gain."""
+"""Whether a run has converged."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,11 +50,7 @@ class Convergence(eqx.Module):
 class Recent(eqx.Module):
     """What convergence is judged by: the last two windows of steps, the oldest first, NaN where there is none yet.
 
-    Attributes:
-        costs: mean cost under noise.
-        squares: squared norm of the gradient.
-        errors: squared norm of its standard error.
-        scale: of the annealing.
+    Squares are those of the norm of the gradient, errors of its standard error.
     """
 
     costs: Float[Array, " both"]
@@ -85,15 +81,7 @@ class Recent(eqx.Module):
 
 
 def has_converged(convergence: Convergence | None, recent: Recent) -> Bool[Array, ""]:
-    """Judge the last steps.
-
-    Args:
-        convergence: what to judge by; None never stops.
-        recent: those steps.
-
-    Returns:
-        Whether to stop. While the windows are not full, comparisons with NaN say no.
-    """
+    """Say whether to stop; while the windows are not full, comparisons with NaN say no."""
     result = jnp.zeros((), bool)
     if convergence is None:
         return result
