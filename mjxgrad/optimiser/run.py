@@ -344,10 +344,10 @@ def _segment(
         at, is_running, is_left = carry.params, carry.stopped == Stopped.running, index < options.num_steps
         # Apart, for over many seeds the end is the same for all, whereas some may have stopped.
         if_running = functools.partial(jax.lax.cond, is_running)
+        # `cond` asks for a hash, which a method of traced arrays has none of.
+        advance = functools.partial(if_running, functools.partial(method.advance), idle)
         own_key = jax.random.fold_in(key, index)
-        params, state, record = jax.lax.cond(
-            is_left, functools.partial(if_running, method.advance, idle), idle, at, carry.state, own_key, index
-        )
+        params, state, record = jax.lax.cond(is_left, advance, idle, at, carry.state, own_key, index)
         measured = functools.partial(if_running, lambda x: jnp.asarray(evaluate(x), x.dtype), lambda _: nan)
         is_due = is_left & (index % options.evaluate_every == 0)
         noise_free = jax.lax.cond(is_due, measured, lambda _: nan, at)
