@@ -49,13 +49,11 @@ class Population(Method):
     has_present: bool = eqx.field(static=True, default=False)
 
     def init(self, params: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """Return the width of the search."""
         return self.stddev.astype(params.dtype)
 
     def advance(
         self, params: Float[Array, " dim"], state: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
     ) -> tuple[Float[Array, " dim"], Float[Array, " dim"], Record]:
-        """Take one step; it is not taken if too few candidates were finite."""
         search_key, rollout_key = jax.random.split(key)
         objective = self.objective.sized_for(params)
         directions = jax.random.normal(search_key, (self.num_samples, params.size), params.dtype)
@@ -163,15 +161,14 @@ def mppi(
         temperature: $\lambda$; low follows the best candidate, high averages over all.
         is_relative: whether the temperature is in units of the standard deviation of the step's costs, so that the
             cost's unit has no effect; otherwise in units of the cost.
-        stddev: $\sigma$, in the parameters' units; one number, or one per parameter. None takes the objective's noise,
-            if that is on the parameters.
+        stddev: $\sigma$, as in `cross_entropy`.
         **options: see `RunOptions`.
 
     Returns:
-        As `optimise`; what belongs to gradients is NaN.
+        As `cross_entropy`.
 
     Raises:
-        ValueError: if a number is out of range or does not fit, or as in `optimise`.
+        ValueError: as `cross_entropy`.
 
     References:
         Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based
@@ -215,15 +212,14 @@ def predictive_sampling(
         key: as in `optimise`.
         num_samples: candidates, and so rollouts, per step; the first is the present point.
         num_steps: at most.
-        stddev: width of the search, in the parameters' units; one number, or one per parameter. None takes the
-            objective's noise, if that is on the parameters.
+        stddev: width of the search, as in `cross_entropy`.
         **options: see `RunOptions`.
 
     Returns:
-        As `optimise`; what belongs to gradients is NaN.
+        As `cross_entropy`.
 
     Raises:
-        ValueError: if a number is out of range or does not fit, or as in `optimise`.
+        ValueError: as `cross_entropy`.
 
     References:
         Howell, Gileadi, Tunyasuvunakool, Zakka, Erez, Tassa. Predictive sampling: real-time behaviour synthesis with

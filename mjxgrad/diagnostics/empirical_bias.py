@@ -67,25 +67,11 @@ class EmpiricalBias(eqx.Module):
     confidence: float = eqx.field(static=True)
 
     def miss_probability(self, num_samples: ArrayLike) -> Float[np.ndarray, "*shape"]:
-        r"""Give the chance $(1 - \beta)^N$ that N samples all lie in E, so that none of them shows the jump.
-
-        Args:
-            num_samples: N.
-
-        Returns:
-            The chance.
-        """
+        r"""Give the chance $(1 - \beta)^N$ that N samples all lie in E, so that none of them shows the jump."""
         return _all_inside(self.probability, num_samples)
 
     def miss_probability_interval(self, num_samples: ArrayLike) -> Float[np.ndarray, "2 *shape"]:
-        """Give the interval of `miss_probability`, which is that of β carried over.
-
-        Args:
-            num_samples: N.
-
-        Returns:
-            Lower and upper ends.
-        """
+        """Give the interval of `miss_probability`, which is that of β carried over."""
         low, high = self.probability_interval
         return np.stack([_all_inside(high, num_samples), _all_inside(low, num_samples)])
 

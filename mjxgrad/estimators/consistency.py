@@ -33,11 +33,8 @@ _ROUNDING = 32.0
 class SecantSums(eqx.Module):
     """Sums over pairs of samples, to be added over groups.
 
-    Attributes:
-        residual: squared residuals over squared distances, in standard deviations of the noise.
-        difference: squared differences of costs over squared distances.
-        missed: half the squared residuals.
-        pairs: how many.
+    Of squared residuals, and differences of costs, over squared distances in standard deviations of the noise; of half the
+    squared residuals, missed; and the number of pairs.
     """
 
     residual: Float[Array, ""]

@@ -56,7 +56,7 @@ class GradientEstimate(eqx.Module):
         num_rollouts: rollouts spent, a zero-noise baseline included.
         num_gradient_rollouts: of those, the ones that were differentiated.
         diagnosis: an item of `Diagnosis`.
-        alpha: weight of the first-order part; one number, or one per block of coordinates.
+        alpha: weight of the first-order part; one number; of `per_step` one per step and action.
         reason: an item of `Reason` for each `alpha`; `Reason.nothing_felt` with any estimator.
         bias_bound: an upper bound on the norm of the bias of `value`, as far as the rule that chose `alpha` knows one:
             zero for what is unbiased, NaN where nothing is known.
@@ -113,18 +113,8 @@ def assemble(
 ) -> GradientEstimate:
     """Put an estimate together, refusing to give a number where there is none.
 
-    Args:
-        value: the mean.
-        squared_error: its squared standard error.
-        costs: moments of the cost over independent units (samples, or pairs of them).
-        plan: what was asked for, and spent.
-        count: units that were finite.
-        num_felt: units whose noise made a difference, or that cannot tell.
-        restore: from the vector to the form of the parameters.
-        has_baseline: whether a baseline that had to be finite was so.
-        alpha: weight of the first-order part.
-        reason: why.
-        bias_bound: on the norm of the bias; NaN where nothing is known.
+    Moments and counts are over independent units: samples, or pairs of them. `count` are those that were finite, `num_felt`
+    those whose noise made a difference, or that cannot tell. `restore` goes from a vector to the form of the parameters.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

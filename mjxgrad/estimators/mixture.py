@@ -28,7 +28,6 @@ def alpha_order(
     num_samples: int,
     rule: Rule | None = None,
     control_variate: bool = True,
-    blocks: np.ndarray | None = None,
     chunk_size: int | None = None,
 ) -> GradientEstimate:
     r"""Mix a first-order and an unbiased estimate of the gradient of a smoothed objective.
@@ -45,8 +44,6 @@ def alpha_order(
         num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
         rule: chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
         control_variate: whether $g^0$ uses derivatives; without, it is zeroth order with the leave-one-out baseline.
-        blocks: number of the block of each coordinate, from 0; $\alpha$ is then chosen for each block. None is one
-            block, `np.arange(dim)` one for each coordinate.
         chunk_size: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
             within groups of at most 64 of a chunk.
 
@@ -54,7 +51,7 @@ def alpha_order(
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
 
     Raises:
-        ValueError: if `num_samples`, `chunk_size` or `blocks` do not fit, or the objective does not know its noise.
+        ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
 
     References:
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
@@ -62,14 +59,12 @@ def alpha_order(
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
-    blocks, num_blocks = _checked_blocks(blocks, vector.size)
     (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
-    weights = weigh(rule or Consistent(), parts, plan, blocks, num_blocks)
-    alpha, bias_bound = weights.alpha[blocks], jnp.sqrt((weights.bias_bound**2).sum())
-    if num_blocks == 1:
-        weights = jax.tree.map(lambda leaf: leaf[0], weights)
-    facts = {"alpha": weights.alpha, "reason": weights.reason, "bias_bound": bias_bound}
-    return _assembled(parts, plan, restore, alpha, **facts)
+    weights = jax.tree.map(
+        lambda leaf: leaf[0], weigh(rule or Consistent(), parts, plan, np.zeros(vector.size, int), 1)
+    )
+    facts = {"alpha": weights.alpha, "reason": weights.reason, "bias_bound": weights.bias_bound}
+    return _assembled(parts, plan, restore, jnp.full_like(vector, weights.alpha), **facts)
 
 
 def control_variate(
@@ -92,11 +87,10 @@ def control_variate(
 
     Args:
         objective: differentiated once per sample by its noise, under `jax.vmap`.
-        params: the point $\theta$, a vector or a pytree as in `first_order`.
+        params: as in `alpha_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
-        chunk_size: rollouts at a time, at least 4; memory grows with it. Samples leave each other out within groups of
-            at most 64 of a chunk.
+        num_samples: as in `alpha_order`.
+        chunk_size: as in `alpha_order`.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -127,11 +121,10 @@ def per_step(
     long rollout may explode while those near it are exact, so that one weight for all would waste the latter.
 
     Args:
-        objective: differentiated once per sample by its noise, under `jax.vmap`. With noise on the parameters the steps
-            are the parameters.
-        params: the point $\theta$, a vector or a pytree as in `first_order`.
+        objective: as in `alpha_order`. With noise on the parameters the steps are the parameters.
+        params: as in `alpha_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
+        num_samples: as in `alpha_order`.
         rule: chooses each $\alpha_{t,a}$. None is `Consistent()`, whose first question is one for all steps;
             `InverseVariance()` is the published IVW-H.
         control_variate: whether the unbiased terms use derivatives.
@@ -185,12 +178,8 @@ class Parts(Summary):
     """Moments of both parts over all samples; of pairs of them where starts are random.
 
     Attributes:
-        first: of the derivatives.
-        unbiased: of the unbiased terms.
-        difference: of the terms less the derivatives.
-        costs: of the costs.
+        difference: of the unbiased terms less the derivatives.
         scaled: of the derivatives by noise, in its standard deviations.
-        secants: how far the derivatives explain the costs.
         linear_variance: of the costs that the mean derivative explains, summed over samples.
         beta: sum of the shares that were taken off.
         num_costs: samples in these sums.
@@ -279,16 +268,9 @@ def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
 def parts_and_terms(
     samples: Samples, chunk: Group, *, control_variate: bool, take: Callable[[ByNoise], Array]
 ) -> tuple[Parts, ByNoise, Bool[Array, " units"]]:
-    """Summarise a chunk.
+    """Give the summary of a chunk, the unbiased terms by noise, and which units have both cost and baseline.
 
-    Args:
-        samples: of the chunk.
-        chunk: the same as one group.
-        control_variate: whether the unbiased part uses derivatives.
-        take: where the moments are wanted: the pull-back for parameters, the identity for noise.
-
-    Returns:
-        The summary, the unbiased terms by noise, and which units have both cost and baseline.
+    Moments are wanted where `take` goes: it is the pull-back for parameters, the identity for noise.
     """
     groups = chunk.split()
 
@@ -325,15 +307,7 @@ def parts_and_terms(
 def weigh(rule: Rule, parts: Parts, plan: Plan, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Weights:
     """Apply a rule to each block, where it has derivatives to judge that say something.
 
-    Args:
-        rule: for one block.
-        parts: the summary.
-        plan: of what is in it.
-        blocks: number of the block of each coordinate.
-        num_blocks: how many there are.
-
-    Returns:
-        The weights, with an axis of blocks.
+    `blocks` has the number of the block of each coordinate; the weights have an axis of blocks.
     """
     is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
 
@@ -353,18 +327,3 @@ def _assembled(
     value, squared_error = parts.mixture(weights)
     count, num_felt = parts.unbiased.count, parts.num_felt
     return assemble(value, squared_error, parts.costs, plan, count=count, num_felt=num_felt, restore=restore, **facts)
-
-
-def _checked_blocks(blocks: np.ndarray | None, dim: int) -> tuple[Int[np.ndarray, " dim"], int]:
-    """Give the block of each coordinate, and how many blocks there are."""
-    if blocks is None:
-        return np.zeros(dim, int), 1
-    if isinstance(blocks, jax.core.Tracer):
-        raise ValueError("blocks must be known when compiling, got a traced array; fix it by functools.partial")
-    blocks = np.asarray(blocks)
-    if blocks.shape != (dim,):
-        raise ValueError(f"blocks must have one number for each of the {dim} coordinates, got shape {blocks.shape}")
-    num_blocks = int(blocks.max()) + 1
-    if not np.issubdtype(blocks.dtype, np.integer) or set(np.unique(blocks)) != set(range(num_blocks)):
-        raise ValueError("blocks must be integers from 0 without gaps; np.arange(dim) is one block for each coordinate")
-    return blocks, num_blocks

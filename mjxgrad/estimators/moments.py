@@ -29,14 +29,8 @@ class Summary(eqx.Module):
 class Moments(Summary):
     """Count, mean, and sum of squared deviations.
 
-    The mean is kept as a sample and an offset from it: rounded to one number in float32, that of costs of 1e6 would be
-    off by 0.03, which a small spread notices.
-
-    Attributes:
-        count: number of samples.
-        origin: one of the samples.
-        offset: of the mean from the origin.
-        squares: sum of squared deviations from the mean.
+    The mean is kept as a sample, the origin, and an offset from it: rounded to one number in float32, that of costs of 1e6
+    would be off by 0.03, which a small spread notices.
     """
 
     count: Int[Array, ""]
@@ -63,7 +57,6 @@ class Moments(Summary):
         return (self.origin - centre) + self.offset
 
     def merge(self, other: "Moments") -> "Moments":
-        """Give the summary of both sets of samples."""
         count = self.count + other.count
         origin = jnp.where(self.count > 0, self.origin, other.origin)
         theirs = other.above(origin)
@@ -83,16 +76,11 @@ class Moments(Summary):
 
 
 class Total(Summary):
-    """A sum over all samples.
-
-    Attributes:
-        value: the sum; any pytree of arrays.
-    """
+    """A sum over all samples: any pytree of arrays."""
 
     value: PyTree
 
     def merge(self, other: "Total") -> "Total":
-        """Give the summary of both sets of samples."""
         return Total(jax.tree.map(jnp.add, self.value, other.value))
 
 
@@ -140,7 +128,6 @@ class ScoreMoments(Summary):
         return self._moved(self.costs.above(centre))
 
     def merge(self, other: "ScoreMoments") -> "ScoreMoments":
-        """Give the summary of both sets of samples."""
         costs = self.costs.merge(other.costs)
         mine = self._moved(self.costs.above(costs.origin) - costs.offset)
         theirs = other._moved(other.costs.above(costs.origin) - costs.offset)

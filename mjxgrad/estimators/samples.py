@@ -17,8 +17,8 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.moments import Summary
-from mjxgrad.objective import Differentiated, Objective, value_and_gradient
-from mjxgrad.objective.base import unchanged
+from mjxgrad.objective import Differentiated, Objective
+from mjxgrad.objective.base import unchanged, value_and_gradient
 
 Baseline = Literal["leave_one_out", "zero_noise", "none"]
 
@@ -248,19 +248,8 @@ def stream(
 class Group(eqx.Module):
     """Samples by noise that are compared with each other; where starts are random, samples 2i and 2i + 1 begin alike.
 
-    What is not finite is zero here, and the masks say so.
-
-    Attributes:
-        costs: about `centre`.
-        derivatives: of the cost by each component of the noise.
-        noise: in its own units.
-        scores: noise over variance.
-        has_cost: whether the sample is one of the plan and its cost is finite.
-        has_derivative: whether its derivative is finite, too.
-        stddev: of the noise.
-        centre: mean cost, which was taken off.
-        rounding: size of the costs before it was.
-        per_unit: 2 where pairs share a start, else 1.
+    What is not finite, or none of the plan, is zero here, and the masks say so. Costs are about `centre`, their mean;
+    `rounding` is the size that they had. `per_unit` is 2 where pairs share a start, else 1.
     """
 
     costs: Float[Array, "*groups samples"]

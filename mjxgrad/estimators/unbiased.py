@@ -20,12 +20,9 @@ from mjxgrad.estimators.samples import Group
 
 
 class UnbiasedTerms(eqx.Module):
-    r"""One term per sample, whose mean is the estimate.
+    r"""One term per sample, before the pull-back, whose mean is the estimate; the share $\beta$ of each.
 
-    Attributes:
-        by_noise: before the pull-back.
-        beta: share of the linear part that was taken off; zero is zeroth order.
-        linear_variance: variance of the linear part $a\cdot w$ over the samples.
+    The variance is that of the linear part $a\cdot w$ over the samples.
     """
 
     by_noise: Float[Array, "samples m"]

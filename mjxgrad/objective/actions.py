@@ -44,7 +44,6 @@ class ActionNoise(Objective):
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Give (horizon, nu)."""
         return (self.task.horizon, self.task.num_controls)
 
     def sample_noise(self, key: PRNGKeyArray) -> PyTree:
@@ -55,32 +54,25 @@ class ActionNoise(Objective):
         return gaussian(action_key, self.stddev, self.noise_shape), self.task.sample_start(start_key)
 
     def mirror(self, noise: PyTree) -> PyTree:
-        """Mirror the action noise and keep the start: both rollouts of a pair begin at the same place."""
+        # The start stays: both rollouts of a pair begin at the same place.
         actions, start = self.split(noise)
         return -actions if start is None else (-actions, start)
 
     def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
-        """Draw other action noise and keep the start."""
         _, start = self.split(noise)
         actions = gaussian(key, self.stddev, self.noise_shape)
         return actions if start is None else (actions, start)
 
     def silence(self, noise: PyTree) -> PyTree:
-        """Give no action noise, and keep the start."""
         actions, start = self.split(noise)
         return jnp.zeros_like(actions) if start is None else (jnp.zeros_like(actions), start)
 
     @property
     def has_circumstances(self) -> bool:
-        """Say whether starts are random."""
         return self._start_shape() is not None
 
     def zero_noise(self) -> PyTree:
-        """Give no action noise, and the nominal start.
-
-        Raises:
-            ValueError: if the task's nominal start is not built as its random ones.
-        """
+        """Give no action noise, and the nominal start; it must be built as the random ones."""
         actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
         if drawn is None:
             return actions
@@ -97,11 +89,9 @@ class ActionNoise(Objective):
         return noise if isinstance(noise, tuple) else (noise, None)
 
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
-        """Give the cost under the noisy actions."""
         return self.outcome(params, noise).cost
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ActionNoise":
-        """Give the same objective with other noise on the actions; see `Objective.with_stddev`."""
         return dataclasses.replace(self, stddev=_action_stddev(self.task, stddev))
 
     def _start_shape(self) -> PyTree:
@@ -114,9 +104,8 @@ class ActionNoise(Objective):
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
         """Differentiate by the action noise through the whole loop, in one reverse pass.
 
-        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on
-        the cost through the actions alone, so pulling it back at the visited states gives the whole gradient by the
-        parameters.
+        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on the
+        cost through the actions alone, so pulling it back at the visited states gives the whole gradient by them.
         """
         actions, start = self.split(noise)
 
@@ -148,17 +137,14 @@ class OpenLoop(ActionNoise):
         return params.reshape(self.noise_shape)
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out the noisy controls."""
         actions, start = self.split(noise)
         return _checked(self.task.run(self.unravel(params), noise=actions.astype(params.dtype), start=start))
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
-        """Give w/σ², flattened."""
         return self._noise_score(params, noise)
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        """Give the identity: the parameters are the controls."""
-        return Partial(unchanged)
+        return Partial(unchanged)  # the parameters are the controls
 
 
 class ClosedLoop(ActionNoise):
@@ -175,7 +161,6 @@ class ClosedLoop(ActionNoise):
         return ravel_pytree(policy_params)[0]
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out the noisy policy."""
         actions, start = self.split(noise)
         return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
 
@@ -186,12 +171,10 @@ class ClosedLoop(ActionNoise):
     def value_and_score(
         self, params: Float[Array, " dim"], noise: PyTree
     ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
-        """Give both from one rollout."""
         outcome = self.outcome(params, noise)
         return outcome.cost, self.pull_back_at(params, outcome.states)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        """Give the transpose of the derivative of the policy's actions by its parameters, at given states."""
         # Given the state, the action is Gaussian about the policy; the chance of the next state
         # given state and action does not depend on the parameters. So the states are data here.
         states = jax.lax.stop_gradient(states)

@@ -101,11 +101,7 @@ class Objective(eqx.Module):
 
     @property
     def noise_shape(self) -> tuple[int, ...]:
-        """Give the shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu).
-
-        Raises:
-            ValueError: if it is the parameters', whose number is not known.
-        """
+        """Give the shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu)."""
         if self.dim is None:
             raise ValueError("dim is not known: call objective.sized_for(params) first")
         return (self.dim,)
@@ -121,14 +117,10 @@ class Objective(eqx.Module):
         return Differentiated(cost, gradient, score, jnp.full_like(gradient, jnp.nan), Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "Objective":
-        """Give the same objective with other noise; traceable, for schedules and sweeps.
-
-        Args:
-            stddev: in the units and of the shape that the objective was made with.
+        """Give the same objective with other noise, in the same units and shape; traceable, for schedules and sweeps.
 
         Raises:
-            ValueError: if the objective's noise has no standard deviation, or `stddev` is not positive or of the wrong
-                shape.
+            ValueError: if the noise has no standard deviation, or `stddev` is not positive or of the wrong shape.
         """
         raise ValueError(
             f"{type(self).__name__} must have a stddev to change, got one without; override with_stddev in it"
@@ -156,7 +148,7 @@ class Objective(eqx.Module):
 
 
 def unchanged(vector: Float[Array, " dim"]) -> Float[Array, " dim"]:
-    """Give it back: the pull-back where the noise is on the parameters."""
+    """Return the vector: the pull-back where the noise is on the parameters."""
     return vector
 
 
@@ -170,20 +162,9 @@ def as_scalar(value: Array, name: str) -> Float[Array, ""]:
 def value_and_gradient(
     function: Callable[[Float[Array, " dim"]], Any], point: Float[Array, " dim"], *, has_aux: bool = False
 ) -> tuple[Any, Float[Array, " dim"]]:
-    """Differentiate a scalar function, as `jax.value_and_grad` does, in the mode that is cheaper.
+    """Differentiate a scalar function of a vector, as `jax.value_and_grad` does, in the mode that is cheaper.
 
     Forward mode for up to three dimensions, reverse mode beyond and for what has no forward mode (`jax.custom_vjp`).
-
-    Args:
-        function: from a vector to a scalar, with `has_aux` to a pair of one and anything else.
-        point: where.
-        has_aux: whether it is a pair.
-
-    Returns:
-        What the function gives, and the gradient.
-
-    Raises:
-        ValueError: if it does not give a scalar.
     """
     if point.size <= MOST_FORWARD_DIMENSIONS:
         along = functools.partial(jax.jvp, function, (point,), has_aux=has_aux)

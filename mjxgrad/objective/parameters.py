@@ -31,27 +31,22 @@ class ParameterNoise(Objective):
     dim: int | None = eqx.field(static=True)
 
     def sample_noise(self, key: PRNGKeyArray) -> Float[Array, " dim"]:
-        """Draw noise for the parameters."""
         if self.dim is None:
             raise ValueError("dim is not known: pass dim=... to parameter_noise")
         return gaussian(key, self.stddev, (self.dim,))
 
     def value(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, ""]:
-        """Evaluate the function at the noisy parameters."""
         return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
 
     def score(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """Give w/σ²."""
         return (noise / self.stddev**2).astype(params.dtype)
 
     def differentiate(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Differentiated:
-        """Differentiate by the noisy parameters: the pull-back is the identity."""
         cost, gradient = value_and_gradient(self.function, params + noise.astype(params.dtype))
         stddev = jnp.broadcast_to(self.stddev, params.shape).astype(params.dtype)
         return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ParameterNoise":
-        """Give the same function under other noise; see `Objective.with_stddev`."""
         stddev, dim = _fitting(stddev, self.dim)
         return dataclasses.replace(self, stddev=stddev, dim=dim)
 
@@ -88,21 +83,13 @@ class Restored(eqx.Module):
     restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
 
     def __call__(self, vector: Float[Array, " dim"]) -> Any:
-        """Call the function."""
         return self.function(self.restore(vector))
 
 
 def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return parameters as a vector.
+    """Return the floating-point arrays of a pytree as a vector, and the way back; an array as it is, with None.
 
-    Args:
-        params: a pytree whose floating-point arrays are the parameters, such as a dict or an equinox module; or an array.
-
-    Returns:
-        The vector, and the way back, also for one vector per seed; an array as it is, with None.
-
-    Raises:
-        ValueError: if there are no floating-point arrays.
+    The way back also takes one vector per seed.
     """
     if eqx.is_array_like(params):
         return jnp.asarray(params), None
@@ -132,18 +119,10 @@ def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] 
 def as_vector(
     objective: Objective, params: PyTree
 ) -> tuple[Objective, Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
-    """Return what an estimator works on.
+    """Return what an estimator works on: an objective of a vector, sized for it, and the vector.
 
-    Args:
-        objective: of the parameters as they are.
-        params: a vector, or a pytree as in `flattened`.
-
-    Returns:
-        The objective of the vector, sized for it; the vector; and the way from a gradient by it to the form of the
-        parameters, with None in place of what is no floating-point array.
-
-    Raises:
-        ValueError: if there are no floating-point arrays, or they do not fit the objective.
+    The third is the way from a gradient to the form of the parameters, with None in place of what is no floating-point
+    array.
     """
     vector, restore = flattened(params)
     objective = of_vector(objective, restore).sized_for(vector)

@@ -20,8 +20,8 @@ class Stopped(eqx.Enumeration):
     converged = "the gradient or the cost met its tolerance"
     not_finite = "too many estimates in a row were not finite"
     nothing_felt = (
-        "for steps in a row all samples cost the same and no derivative differed from zero: nothing that the parameters "
-        "change reaches the cost"
+        "in several steps in a row all samples cost the same and no derivative differed from zero: nothing that the "
+        "parameters change reaches the cost"
     )
     max_rollouts = "another step would have exceeded the budget of rollouts"
     max_seconds = "the budget of seconds was spent"
@@ -56,7 +56,7 @@ class Record(eqx.Module):
     def of_estimate(
         cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
     ) -> "Record":
-        """Summarise a step along an estimated gradient."""
+        """Summarise a step along an estimate; of blocks the mean α, and the reason of the least."""
         dtype = estimate.value.dtype
         alpha = jnp.ravel(estimate.alpha)
         reason = jax.tree.map(

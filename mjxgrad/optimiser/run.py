@@ -69,11 +69,6 @@ class RunOptions(eqx.Module):
     checkpoint_every: int = 1
 
     def __check_init__(self):
-        """Refuse settings without meaning.
-
-        Raises:
-            ValueError: if a number is out of range, or the folder of the checkpoint does not exist.
-        """
         for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every", "segment", "max_rollouts"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -101,17 +96,8 @@ class RunOptions(eqx.Module):
 class Carry(eqx.Module):
     """One run between two steps.
 
-    Attributes:
-        params: the point.
-        state: of the method.
-        best: the best point so far.
-        recent: by which convergence is judged.
-        num_steps: steps done, those not taken included.
-        num_skipped: of those, the ones not taken.
-        num_in_a_row: of those, the last ones without one taken between.
-        num_still: the last steps in a row that felt nothing.
-        num_rollouts: spent.
-        stopped: whether and why.
+    Of the steps done, `num_steps`, some were not taken, the last `num_in_a_row` of them in a row; the last `num_still` felt
+    nothing.
     """
 
     params: Float[Array, " dim"]
@@ -294,18 +280,18 @@ def _loop(
 
 
 class _Program:
-    """A segment of steps, compiled once, when it is first run; and what tracing and compiling it took."""
+    """A segment of steps, compiled when it is first run; and what tracing and compiling it took."""
 
     def __init__(self, lowered: Any, seconds: float):
         self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
 
     def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
         """Run one segment more."""
+        began = time.perf_counter()
         if self.compiled is None:
-            began = time.perf_counter()
             self.compiled = self.lowered.compile()
             self.compile_seconds += time.perf_counter() - began
-        began = time.perf_counter()
+            began = time.perf_counter()
         start = jnp.asarray(saved.seconds.size, jnp.int32)
         carry, trace = jax.block_until_ready(self.compiled(arrays, key, saved.carry, start))
         seconds = time.perf_counter() - began
@@ -318,11 +304,10 @@ class _Program:
 
 def _start(static: PyTree, arrays: PyTree, params: Float[Array, " dim"]) -> Carry:
     method, options = eqx.combine(arrays, static)
-    zero, nan = jnp.zeros((), jnp.int32), jnp.full((), jnp.nan, params.dtype)
-    best = Best(params, nan, nan + jnp.inf, nan)
-    recent = Recent.empty(options.convergence, params.dtype)
-    stopped = jax.tree.map(jnp.asarray, Stopped.running)
-    return Carry(params, method.init(params), best, recent, zero, zero, zero, zero, zero, stopped)
+    nan = jnp.full((), jnp.nan, params.dtype)
+    best, recent = Best(params, nan, nan + jnp.inf, nan), Recent.empty(options.convergence, params.dtype)
+    counts = [jnp.zeros((), jnp.int32)] * 5
+    return Carry(params, method.init(params), best, recent, *counts, jax.tree.map(jnp.asarray, Stopped.running))
 
 
 def _segment(
@@ -401,11 +386,8 @@ def _fingerprint(
 ) -> dict[str, Any]:
     """Say what a resumed run must have in common with this one: the program itself, and all that it is given."""
     return {
-        "num_steps": options.num_steps,
+        **{name: getattr(options, name) for name in ("num_steps", "evaluate_every", "patience", "max_rollouts")},
         "segment": options.segment_size,
-        "evaluate_every": options.evaluate_every,
-        "patience": options.patience,
-        "max_rollouts": options.max_rollouts,
         "convergence": repr(options.convergence),
         "shape": list(params.shape),
         "dtype": str(params.dtype),

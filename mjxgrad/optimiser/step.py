@@ -69,11 +69,6 @@ class TrustRegion(eqx.Module):
     step_scale: Float[Array, "..."] | float | None = None
 
     def __check_init__(self):
-        """Refuse a radius without meaning.
-
-        Raises:
-            ValueError: if it is not positive.
-        """
         if not self.radius > 0:
             raise ValueError(f"radius must be positive, got {self.radius}")
 
@@ -129,11 +124,6 @@ class GradientStep(Method):
         trust_region: TrustRegion | None,
         clip_norm: float | None,
     ):
-        """Refuse what does not fit together.
-
-        Raises:
-            ValueError: if `objective` and `annealing` do not belong together, or `clip_norm` is not positive.
-        """
         if annealing is None:
             as_objective(objective)
         elif isinstance(objective, Objective):
@@ -151,14 +141,12 @@ class GradientStep(Method):
         self.annealing, self.trust_region = as_annealing(annealing), trust_region
 
     def init(self, params: Float[Array, " dim"]) -> StepState:
-        """Return the states of the optimiser and of the annealing before the first step."""
         annealing = None if self.annealing is None else self.annealing.init(params.dtype)
         return StepState(jax.tree.map(jnp.asarray, self.optimiser.init(params)), annealing)
 
     def advance(
         self, params: Float[Array, " dim"], state: StepState, key: PRNGKeyArray, step: Int[Array, ""]
     ) -> tuple[Float[Array, " dim"], StepState, Record]:
-        """Take one step along the estimate."""
         scale, objective = self.annealed(self.objective, params, state, step)
         estimate = self.estimator(objective, params, key)
         change, state, is_taken = self.change(params, state, objective, estimate, estimate.value)
@@ -213,7 +201,7 @@ class EstimatedGradientState(eqx.Module):
         step: number of updates so far; the noise of each comes from it.
         num_skipped: of those, the ones that were not finite and so were zero.
         scale: of the annealing at the last update.
-        estimate: the last one; all NaN before the first.
+        estimate: the last one, of the vector; all NaN before the first.
         inner: states of the optimiser and of the annealing.
     """
 

@@ -32,11 +32,6 @@ class Convergence(eqx.Module):
     cost: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse settings without meaning.
-
-        Raises:
-            ValueError: if one is out of its range, or nothing is to be looked at.
-        """
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.gradient is None and self.cost is None:

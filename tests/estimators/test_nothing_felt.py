@@ -18,7 +18,6 @@ ESTIMATORS = {
     "zero_noise": functools.partial(estimators.zeroth_order, baseline="zero_noise"),
     "pairs": functools.partial(estimators.zeroth_order, antithetic=True),
     "alpha_order": estimators.alpha_order,
-    "blocks": functools.partial(estimators.alpha_order, blocks=np.arange(2)),
     "per_step": estimators.per_step,
     "control_variate": estimators.control_variate,
     "least_squares": estimators.least_squares,
