@@ -31,8 +31,7 @@ def first_order(
             arrays are the parameters; the estimate then has its form.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
-            rounding.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -70,16 +69,13 @@ def zeroth_order(
         objective: its `value` is called once under `jax.vmap`.
         params: the point $\theta$, as in `first_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with
-            antithetic pairs.
+        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with antithetic pairs.
         baseline: "leave_one_out", the mean cost of the other samples (of the other pairs);
             "zero_noise", the cost without noise, one more rollout, or where starts are random one
             more for each sample (for each pair), from the same start; or "none".
-        antithetic: use every noise together with its mirror image. The standard error is then
-            taken over pairs. Where the score is odd in the noise (parameter noise, open loop)
-            all baselines cancel within a pair.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
-            rounding.
+        antithetic: use every noise together with its mirror image. The standard error is then taken over pairs. Where
+            the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -89,10 +85,9 @@ def zeroth_order(
             unknown, or `params` is not a vector of the objective's dimension.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy
-        Gradients? ICML 2022, arXiv:2202.00817, definition 2.3 (there with the zero-noise
-        baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE samples, get a baseline for free!
-        ICLR 2019 workshop, equation 8 (leave-one-out).
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+        arXiv:2202.00817, definition 2.3 (there with the zero-noise baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE
+        samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline)
     objective, vector, restore = as_vector(objective, params)
@@ -204,9 +199,8 @@ def both_results(
 def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     r"""Mean of $g_i = u_i - b_i \bar s_i$, $b_i$ the mean cost of the other units.
 
-    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs
-    $u = p$ and this is $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of
-    cost and score.
+    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs $u = p$ and this is
+    $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of cost and score.
 
     The $g_i$ share the mean, so their spread over $n$ is not quite the variance $V$ of their
     mean. With $\mathbb{E}[s] = 0$ and $c = \mathbb{E}[\bar f \bar s]$,
@@ -214,9 +208,8 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     $$V = \frac{\mathrm{Var}\,u}{n} + \frac{\mathrm{Var}\bar f\,\mathrm{Var}\bar s + c^2}{n(n-1)},
       \qquad \mathbb{E}[\text{spread}/n] = V - \frac{c^2}{(n-1)^2}.$$
 
-    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and
-    $\mathbb{E}[k^2] = c^2 + V_k$; together they give an estimate of $V$ that is unbiased for
-    every $n \ge 2$, and never negative without pairs.
+    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and $\mathbb{E}[k^2] = c^2 +
+    V_k$; together they give an estimate of $V$ that is unbiased for every $n \ge 2$, and never negative without pairs.
     """
     first, second, count = moments.first, moments.second, moments.costs.count
     others = as_real(jnp.maximum(count - 1, 1), first)

@@ -132,8 +132,7 @@ def per_step(
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number for each
-        step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not
-        bounded.
+        step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not bounded.
 
     Raises:
         ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.

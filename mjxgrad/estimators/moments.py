@@ -1,8 +1,7 @@
 r"""Moments of samples that arrive in chunks, merged without cancellation.
 
-Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept
-about the mean of what was seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose
-their variance in float32.
+Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept about the mean of what was
+seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
 
 References:
     Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample
@@ -87,11 +86,10 @@ class Total(Summary):
 class ScoreMoments(Summary):
     r"""Joint moments of costs and scores from which the baseline can be chosen at the end.
 
-    A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a
-    centre $c$, its features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and
-    $\bar s$, where bars are means within the unit. Moving the centre acts on them linearly,
-    $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so their sums and sums of products
-    about any centre follow from those about another: about the mean they merge without
+    A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a centre $c$, its
+    features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and $\bar s$, where bars are means
+    within the unit. Moving the centre acts on them linearly, $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so
+    their sums and sums of products about any centre follow from those about another: about the mean they merge without
     cancellation, about zero or about the noise-free cost they give the other baselines.
 
     Attributes:

@@ -1,8 +1,7 @@
 r"""How to weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
-A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in
-`alpha_order(..., rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to
-*fail* everywhere.
+A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in `alpha_order(...,
+rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to *fail* everywhere.
 """
 
 from collections.abc import Callable

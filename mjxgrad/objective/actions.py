@@ -190,15 +190,13 @@ def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
 
     Args:
         task: what is controlled, and what it costs.
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
-            (horizon, nu).
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
 
     Returns:
         The objective, with `dim` = horizon * nu.
 
     Raises:
-        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
-            controls.
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
     """
     stddev = _action_stddev(task, stddev)
     return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
@@ -220,18 +218,15 @@ def closed_loop(
     Args:
         task: what is controlled, and what it costs.
         policy: takes its parameters and a state, gives controls of shape (nu,).
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
-            (horizon, nu).
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
         params: an example of the policy's parameters; only its structure and shapes count.
             Without it the policy is handed the flat vector itself.
 
     Returns:
-        The objective; `objective.ravel` and `objective.unravel` go between the policy's
-        parameters and the flat vector.
+        The objective; `objective.ravel` and `objective.unravel` go between the policy's parameters and the flat vector.
 
     Raises:
-        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
-            controls.
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
 
     References:
         Williams. Simple statistical gradient-following algorithms for connectionist

@@ -51,10 +51,9 @@ class Differentiated(eqx.Module):
 class Objective(eqx.Module):
     """A cost under noise, as estimators see it.
 
-    A subclass gives `dim`, `sample_noise`, `value` and `score`. It overrides `value_and_score`
-    if both come from one rollout, `mirror` and `zero_noise` if its noise is not symmetric
-    about zero, and `differentiate`, `noise_shape` and `with_stddev` if its noise is Gaussian
-    or not on the parameters.
+    A subclass gives `dim`, `sample_noise`, `value` and `score`. It overrides `value_and_score` if both come from one
+    rollout, `mirror` and `zero_noise` if its noise is not symmetric about zero, and `differentiate`, `noise_shape` and
+    `with_stddev` if its noise is Gaussian or not on the parameters.
     """
 
     dim: eqx.AbstractVar[int | None]
