@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from mjxgrad import baselines
-from mjxgrad.baselines.population import without_action_noise
+from mjxgrad.baselines import without_action_noise
 from tests.estimators import textbook
 
 CENTRE = jnp.array([1.0, -2.0])
@@ -147,7 +147,13 @@ def test_candidates_have_starts_of_their_own_and_no_noise_on_actions(key):
 
 def test_a_method_is_resumed(tmp_path, key):
     method = functools.partial(METHODS["cross_entropy"], objective, START, key, num_steps=20)
-    method(checkpoint=tmp_path / "run.npz", callback=lambda progress: progress.step >= 10)
+
+    def kill(step, _):
+        if step >= 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method(checkpoint=tmp_path / "run.npz", log=kill)
     resumed = method(checkpoint=tmp_path / "run.npz")
     straight = method()
     np.testing.assert_array_equal(resumed.params, straight.params)

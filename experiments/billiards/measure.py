@@ -50,11 +50,13 @@ def _run(
         evaluate=task.cost,
         evaluate_every=every,
     )
-    steps = np.arange(0, settings.num_steps, every)
+    # Where nothing is felt the descent stops early.
+    done = int(result.num_steps)
+    steps = np.arange(0, done, every)
     forces = np.asarray(result.best_params).reshape(-1, 2)
     return Run(
         method=method,
-        steps=np.append(steps, settings.num_steps),
+        steps=np.append(steps, done),
         cost=np.append(np.asarray(result.history.noise_free_cost)[steps], result.final_cost),
         final_cost=float(result.best_cost),
         hard_cost=hard.cost(forces),

@@ -39,9 +39,10 @@ _SENTENCES = {
     "uncertain": ("too uncertain for first order", "#9db4d0"),
     "inconsistent": ("derivatives contradict costs", "#0b5c8f"),
     "not_finite": ("derivatives not finite", "#22262e"),
+    "nothing_felt": ("nothing reaches the cost", "#6b2737"),
     "fixed": ("given", "#c9ced6"),
 }
-_DARK = ("inconsistent", "not_finite")
+_DARK = ("inconsistent", "not_finite", "nothing_felt")
 
 
 def drawings(outcome: Outcome) -> Drawings:

@@ -74,7 +74,15 @@ def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     was_done = ~np.isnan(history.alpha)
     found = {
         name: np.asarray(history.reason == getattr(Reason, name)) & was_done
-        for name in ("fixed", "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite")
+        for name in (
+            "fixed",
+            "inverse_variance",
+            "bias_limit",
+            "uncertain",
+            "inconsistent",
+            "not_finite",
+            "nothing_felt",
+        )
     }
     return {name: where for name, where in found.items() if where.any()}
 

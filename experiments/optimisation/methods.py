@@ -13,7 +13,7 @@ import mjxgrad as mg
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from mjxgrad.diagnostics import Rollouts
-from mjxgrad.diagnostics.budget import affordable
+from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import GradientEstimate, rules
 
 Run = Callable[..., mg.Optimisation]

@@ -150,6 +150,7 @@ def _choice(outcome: Outcome) -> str | None:
         "bias_limit": "found a bias and limited it",
         "inconsistent": "found that derivatives contradict the costs, and left them out",
         "not_finite": "had too few finite derivatives",
+        "nothing_felt": "felt nothing",
     }
     parts = [f"{words.get(name, name)} in {where.sum() / total:.1%}" for name, where in run.reasons.items()]
     return f"α-order {', '.join(parts)} of its steps; its mean α is {np.nanmean(run.alpha):.3g}."

@@ -1,5 +1,6 @@
 """From settings to numbers."""
 
+import functools
 import time
 
 import equinox as eqx
@@ -14,9 +15,9 @@ from experiments.policy_gradient.outcome import GRADIENTS, Cell, Course, Estimat
 from experiments.policy_gradient.problems import Descent, Problem, problem
 from experiments.policy_gradient.settings import Settings
 from experiments.workspace import Workspace
-from mjxgrad.estimators.mixture import stream_parts, weigh
+from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.rules import Consistent
-from mjxgrad.estimators.samples import plan_by_noise
+from mjxgrad.estimators.samples import plan_by_noise, stream
 
 
 class Estimated(eqx.Module):
@@ -63,8 +64,9 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
         What each estimator makes of them.
     """
     objective = objective.sized_for(params)
-    parts = stream_parts(objective, params, key, plan_by_noise(objective, num_samples, None), control_variate=True)
-    weights = weigh(Consistent(), parts, np.zeros(params.size, int), 1)
+    plan = plan_by_noise(objective, num_samples, None)
+    (parts,) = stream(objective, params, key, plan, functools.partial(both_parts, control_variate=True))
+    weights = weigh(Consistent(), parts, plan, np.zeros(params.size, int), 1)
     reason = weights.reason._value[0]  # pyright: ignore[reportAttributeAccessIssue]
     return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha[0], reason, parts.costs.mean)
 

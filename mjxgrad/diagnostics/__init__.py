@@ -1,8 +1,7 @@
 """How far gradients can be trusted, measured."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
-from mjxgrad.diagnostics.budget import Rollouts, Seconds
-from mjxgrad.diagnostics.comparison import Comparison, compare
+from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
@@ -17,8 +16,6 @@ from mjxgrad.diagnostics.statistics import (
     bias_interval,
     binomial_bound,
     binomial_interval,
-    bootstrap_variance_interval,
-    chi_square_variance_interval,
     mean_interval,
     root_mean_square_interval,
     variance_interval,
@@ -46,11 +43,9 @@ __all__ = [
     "bias_variance",
     "binomial_bound",
     "binomial_interval",
-    "bootstrap_variance_interval",
     "check_omissions",
     "check_soundness",
     "check_stability",
-    "chi_square_variance_interval",
     "compare",
     "compare_to_slope",
     "crossover",

@@ -1,7 +1,7 @@
 """Bias and variance of both kinds of gradient, against contact softness."""
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,7 +14,8 @@ from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_int
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
-from mjxgrad.objective import Objective, ParameterNoise
+from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
+from mjxgrad.objective.base import unchanged
 
 
 class BiasVariance(eqx.Module):
@@ -66,7 +67,7 @@ class BiasVariance(eqx.Module):
 
 def bias_variance(
     objective_of_softness: Callable[[PyTree], Objective],
-    params: Float[Array, "..."],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     softness: PyTree | Sequence[PyTree],
@@ -86,7 +87,8 @@ def bias_variance(
 
     Args:
         objective_of_softness: gives the objective at one softness; traceable.
-        params: points to measure at, one per row, in the parameters' units.
+        params: points to measure at, one per row, in the parameters' units; or a pytree whose floating-point arrays have
+            an axis of points first. The result has them as vectors.
         key: consumed here.
         softness: any pytree whose leaves have a leading axis (`Softness.sweep`), or a sequence of pytrees.
         num_samples: differentiated rollouts per softness and point. At least 2.
@@ -109,144 +111,102 @@ def bias_variance(
         arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
     """
     check_baseline(baseline)
-    if jnp.ndim(params) != 2:
-        raise ValueError(
-            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
-        )
+    params, restore = _points(params)
     if num_reference < 4:
         raise ValueError(f"num_reference must be at least 4, got {num_reference}")
-    params = jnp.asarray(params)
     stacked, count = _stacked(softness)
     has_zero_noise = baseline == "zero_noise"
     plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)
-    measure = eqx.filter_jit(_Measurement(objective_of_softness, plan, baseline, num_reference))
+
+    @jax.jit
+    def measure(
+        softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
+    ) -> tuple[dict[str, Any], Samples]:
+        objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
+        samples_key, reference_key = jax.random.split(key)
+        samples = _sampled(objective, params, samples_key, plan)
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
+        is_line = isinstance(objective, ParameterNoise) and objective.dim == 1
+        find = _by_landscape if is_line else _by_long_run
+        reference = find(objective, params, reference_key, num_reference, max(2, chunk_size or DEFAULT_CHUNK_SIZE))
+        return {"first": first, "zeroth": zeroth, **reference}, samples
+
     rows = []
     for i in range(count):
-        measured, samples = jax.block_until_ready(
-            measure(jax.tree.map(lambda leaf, i=i: leaf[i], stacked), params, key)
-        )
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
+        measured, samples = jax.block_until_ready(measure(one, params, key))
         rows.append((measured, _variance_intervals(samples, baseline, confidence, num_resamples)))
         if progress is not None:
             progress(i + 1, count)
-    measured = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
-    return _table(stacked, params, measured, np.stack([row[1] for row in rows], axis=2), confidence)
-
-
-class _Cell(eqx.Module):
-    """One softness, all points."""
-
-    first: GradientEstimate
-    zeroth: GradientEstimate
-    cost: Float[Array, " points"]
-    reference: Float[Array, "points dim"]
-    reference_error: Float[Array, "points dim"]
-    landscape: Landscape | None
-
-
-class _Measurement(eqx.Module):
-    """What is compiled."""
-
-    objective_of_softness: Callable[[PyTree], Objective] = eqx.field(static=True)
-    plan: Plan = eqx.field(static=True)
-    baseline: str = eqx.field(static=True)
-    num_reference: int = eqx.field(static=True)
-
-    def __call__(
-        self, softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
-    ) -> tuple[_Cell, Samples]:
-        objective = self.objective_of_softness(softness).sized_for(params[0])
-        samples_key, reference_key = jax.random.split(key)
-        samples = self._samples(objective, params, samples_key)
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), self.plan, self.baseline))(samples)
-        if isinstance(objective, ParameterNoise) and objective.dim == 1:
-            reference = self._line(objective, params, reference_key)
-        else:
-            reference = self._long_run(objective, params, reference_key)
-        return _Cell(first, zeroth, *reference), samples
-
-    def _samples(self, objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray) -> Samples:
-        """Roll out for both estimates, all points through one compiled body."""
-        num_chunks, size = self.plan.chunks()
-        points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
-
-        def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
-            point, chunk = point_and_chunk
-            units = size * chunk + jnp.arange(size)
-            return sample(objective, params[point], jax.random.fold_in(key, point), units, self.plan)
-
-        samples = jax.lax.map(one_chunk, (points, chunks))
-        return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
-
-    def _line(self, objective: ParameterNoise, params: Float[Array, "points dim"], key: PRNGKeyArray) -> tuple:
-        """Take the reference from one landscape."""
-        stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
-        low, high = params.min() - REACH * stddev, params.max() + REACH * stddev
-        points, cell = cell_points(key, low, high, self.num_reference)
-        everywhere = jnp.concatenate([points, params[:, 0]])
-        # One body for the landscape and for the points themselves: compiling it takes longer than running it.
-        costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, self._chunk_size())
-        landscape = Landscape(points, costs[: self.num_reference], cell)
-        cost = costs[self.num_reference :]
-        gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
-        return cost, gradient[:, None], error[:, None], landscape
-
-    def _long_run(self, objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray) -> tuple:
-        """Take the reference from many more samples, in pairs, of the estimate that is unbiased."""
-        num_samples = 2 * (self.num_reference // 2)
-
-        def one_point(index_and_point: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-            index, point = index_and_point
-            estimate = zeroth_order(
-                objective,
-                point,
-                jax.random.fold_in(key, index),
-                num_samples=num_samples,
-                antithetic=True,
-                chunk_size=self._chunk_size(),
-            )
-            return objective.value(point, objective.zero_noise()), estimate.value, estimate.standard_error
-
-        cost, gradient, error = jax.lax.map(one_point, (jnp.arange(len(params)), params))
-        return cost, gradient, error, None
-
-    def _chunk_size(self) -> int:
-        return max(2, self.plan.chunk_size or DEFAULT_CHUNK_SIZE)
-
-
-def _table(
-    softness: PyTree,
-    params: Float[Array, "points dim"],
-    measured: _Cell,
-    variance_intervals: Float[np.ndarray, "2 2 softness points"],
-    confidence: float,
-) -> BiasVariance:
-    first, zeroth, is_line = measured.first, measured.zeroth, measured.landscape is not None
-    bias = first.value - measured.reference
+    found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
+    variances = np.stack([row[1] for row in rows], axis=2)
+    first, zeroth, reference, error = (found[name] for name in ("first", "zeroth", "reference", "reference_error"))
     # Independent: the reference has rollouts of its own.
-    bias_error = jnp.hypot(first.standard_error, measured.reference_error)
+    bias, bias_error = first.value - reference, jnp.hypot(first.standard_error, error)
     count_first, count_zeroth = first.num_finite[..., None], zeroth.num_finite[..., None]
-    # The reference averages over so many cells, or samples, that its t is a normal distribution.
-    many = np.array(10**6)
     return BiasVariance(
-        softness=softness,
+        **found,
+        softness=stacked,
         params=params,
-        first=first,
-        zeroth=zeroth,
-        cost=measured.cost,
-        reference=measured.reference,
-        reference_error=measured.reference_error,
         bias=bias,
         bias_error=bias_error,
         first_interval=mean_interval(first.value, first.standard_error, count_first, confidence),
         zeroth_interval=mean_interval(zeroth.value, zeroth.standard_error, count_zeroth, confidence),
-        reference_interval=mean_interval(measured.reference, measured.reference_error, many, confidence),
+        # The reference averages over so many cells, or samples, that its t is a normal distribution.
+        reference_interval=mean_interval(reference, error, 10**6, confidence),
         bias_interval=mean_interval(bias, bias_error, count_first, confidence),
-        first_variance_interval=variance_intervals[0],
-        zeroth_variance_interval=variance_intervals[1],
-        landscape=measured.landscape,
-        reference_method="landscape" if is_line else "zeroth_order",
+        first_variance_interval=variances[0],
+        zeroth_variance_interval=variances[1],
+        reference_method="zeroth_order" if found["landscape"] is None else "landscape",
         confidence=confidence,
     )
+
+
+def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, plan: Plan) -> Samples:
+    """Roll out for both estimates, all points through one compiled body."""
+    num_chunks, size = plan.chunks()
+    points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
+
+    def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
+        point, chunk = point_and_chunk
+        return sample(objective, params[point], jax.random.fold_in(key, point), plan, size * chunk + jnp.arange(size))
+
+    samples = jax.lax.map(one_chunk, (points, chunks))
+    return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
+
+
+def _by_landscape(
+    objective: ParameterNoise,
+    params: Float[Array, "points dim"],
+    key: PRNGKeyArray,
+    num_reference: int,
+    chunk_size: int,
+) -> dict[str, Any]:
+    """Take the cost and the reference from one landscape."""
+    stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
+    low, high = params.min() - REACH * stddev, params.max() + REACH * stddev
+    points, cell = cell_points(key, low, high, num_reference)
+    everywhere = jnp.concatenate([points, params[:, 0]])
+    # One body for the landscape and for the points themselves: compiling it takes longer than running it.
+    costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, chunk_size)
+    landscape, cost = Landscape(points, costs[:num_reference], cell), costs[num_reference:]
+    gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
+    return {"cost": cost, "reference": gradient[:, None], "reference_error": error[:, None], "landscape": landscape}
+
+
+def _by_long_run(
+    objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, num_reference: int, chunk_size: int
+) -> dict[str, Any]:
+    """Take the reference from many more samples, in pairs, of the estimate that is unbiased."""
+    settings = {"num_samples": 2 * (num_reference // 2), "antithetic": True, "chunk_size": chunk_size}
+
+    def one_point(index_and_point: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        index, point = index_and_point
+        estimate = zeroth_order(objective, point, jax.random.fold_in(key, index), **settings)
+        return objective.value(point, objective.zero_noise()), estimate.value, estimate.standard_error
+
+    cost, gradient, error = jax.lax.map(one_point, (jnp.arange(len(params)), params))
+    return {"cost": cost, "reference": gradient, "reference_error": error, "landscape": None}
 
 
 def _variance_intervals(
@@ -274,6 +234,19 @@ def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
     }[baseline]
     gradients = np.where(np.isfinite(costs)[:, None], samples.gradients[is_noisy, 0], np.nan)
     return gradients, (costs - centre)[:, None] * scores
+
+
+def _points(params: PyTree) -> tuple[Float[Array, "points dim"], Callable | None]:
+    """Give the points as rows, and the way from a row to their form; None if they are rows."""
+    if eqx.is_array_like(params):
+        if jnp.ndim(params) != 2:
+            raise ValueError(
+                f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+            )
+        return jnp.asarray(params), None
+    arrays, others = eqx.partition(params, eqx.is_inexact_array)
+    first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], arrays), others)
+    return jax.vmap(lambda one: flattened(one)[0])(arrays), flattened(first)[1]
 
 
 def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:

@@ -1,28 +1,83 @@
 """Estimators side by side, at equal rollouts or at equal time."""
 
+import dataclasses
+import functools
+import math
+import statistics
+import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad.diagnostics.budget import Affordable, Estimator, Rollouts, Seconds, affordable
 from mjxgrad.diagnostics.reference import map_in_chunks
-from mjxgrad.diagnostics.statistics import (
-    VarianceInterval,
-    bias_interval,
-    checked,
-    root_mean_square_interval,
-    variance_interval,
-)
+from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval, variance_interval
 from mjxgrad.estimators.estimate import GradientEstimate
-from mjxgrad.objective import Objective
+from mjxgrad.objective import Objective, as_vector, flattened
 
 # Rollouts at a time over all repetitions that run together: enough to fill a CPU's vector units.
 _ROLLOUTS_AT_A_TIME = 4096
+# Numbers of samples that an estimator refuses (odd ones, say) lie between ones that it takes.
+_NEIGHBOURS = 3
+# Time grows nearly linearly, so a line through two measurements hits at the second or third try.
+_CORRECTIONS = 4
+_FEWEST_TIMED = 4
+
+# Called as (objective, params, key, *, num_samples), which is what every function of mjxgrad.estimators is; settings are
+# bound by functools.partial.
+Estimator = Callable[..., GradientEstimate]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollouts:
+    """A budget of rollouts per estimate, those that the estimate itself reports.
+
+    Attributes:
+        count: at most; at least 2.
+    """
+
+    count: int
+
+    def __post_init__(self):
+        if self.count < 2:
+            raise ValueError(f"count must be at least 2 rollouts, got {self.count}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Seconds:
+    """A budget of wall time per estimate, compiled and warm.
+
+    Attributes:
+        seconds: at most, as the median of the runs.
+        num_runs: timed runs per number of samples that is tried.
+        max_samples: where the search ends, however cheap samples are.
+    """
+
+    seconds: float
+    num_runs: int = 7
+    max_samples: int = 1_000_000
+
+    def __post_init__(self):
+        if not 0 < self.seconds < math.inf:
+            raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
+        if self.num_runs < 1:
+            raise ValueError(f"num_runs must be at least 1, got {self.num_runs}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Affordable:
+    """What a budget buys.
+
+    Attributes:
+        num_samples: to ask an estimator for.
+        seconds: median time of one such estimate, NaN if it was not measured.
+    """
+
+    num_samples: int
+    seconds: float
 
 
 class Comparison(eqx.Module):
@@ -86,11 +141,11 @@ class Comparison(eqx.Module):
 def compare(
     estimators: Mapping[str, Estimator],
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     budget: Rollouts | Seconds,
-    reference: tuple[ArrayLike, ArrayLike] | ArrayLike,
+    reference: tuple[PyTree, PyTree] | PyTree,
     num_repeats: int = 200,
     confidence: float = 0.95,
     progress: Callable[[int, int], None] | None = None,
@@ -105,11 +160,11 @@ def compare(
         estimators: by name; each is called as `mjxgrad.estimators.zeroth_order` is. Settings are bound by
             `functools.partial`.
         objective: to estimate the gradient of.
-        params: where.
+        params: where: a vector, or a pytree whose floating-point arrays the comparison then has as one vector.
         key: consumed here.
         budget: `Rollouts(count)` or `Seconds(seconds)` for one estimate.
-        reference: the true gradient, and its standard error; or the gradient alone if it is exact (a closed form). The
-            error is taken as known well: it comes from many more samples than an estimate has.
+        reference: the true gradient, in the form of `params`, and its standard error; or the gradient alone if it is
+            exact (a closed form). The error is taken as known well: it comes from many more samples than an estimate has.
         num_repeats: estimates of each. At least 2.
         confidence: of the intervals.
         progress: called after every estimator with how many are done and how many there are.
@@ -132,8 +187,7 @@ def compare(
         raise ValueError("estimators must have at least one entry, got none")
     if num_repeats < 2:
         raise ValueError(f"num_repeats must be at least 2, got {num_repeats}")
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, params, _ = as_vector(objective, params)
     truth, error = _reference(reference, params.shape)
     timing_key, repeats_key = jax.random.split(key)
     rows = []
@@ -201,7 +255,7 @@ def _row(
         reference_variance=(error**2).sum(),
         cross_variance=(4 * (bias * error) ** 2 + 2 * error**4).sum(),
     )
-    spread_interval: VarianceInterval = variance_interval(values, confidence)
+    spread_interval = variance_interval(values, confidence)
     return {
         "num_samples": bought.num_samples,
         "num_rollouts": estimates.num_rollouts.flat[0],
@@ -222,10 +276,10 @@ def _row(
 
 
 def _reference(
-    reference: tuple[ArrayLike, ArrayLike] | ArrayLike, shape: tuple[int, ...]
+    reference: tuple[PyTree, PyTree] | PyTree, shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
-    value, error = reference if isinstance(reference, tuple) else (reference, 0.0)
-    value, error = np.asarray(value, float), np.asarray(error, float)
+    both = reference if isinstance(reference, tuple) else (reference, 0.0)
+    value, error = (np.asarray(flattened(one)[0], float) for one in both)
     # One number is enough for one parameter.
     value = value.reshape(shape) if value.shape == () and shape == (1,) else value
     if value.shape != shape or error.shape not in ((), shape):
@@ -237,3 +291,92 @@ def _reference(
     if not np.isfinite(value).all() or not (error >= 0).all():
         raise ValueError(f"reference must be finite with errors of at least 0, got {value} ± {error}")
     return value, error
+
+
+def affordable(
+    estimator: Estimator,
+    objective: Objective,
+    params: Float[Array, " dim"],
+    key: PRNGKeyArray,
+    budget: Rollouts | Seconds,
+) -> Affordable:
+    """Find the largest number of samples within a budget: of rollouts by tracing alone, of seconds by running.
+
+    Raises:
+        ValueError: if the budget buys no estimate, or the estimator refuses every number of samples.
+    """
+    run = functools.partial(_estimate, estimator, objective, params, key)
+    if isinstance(budget, Rollouts):
+        return Affordable(_within_rollouts(run, budget.count), math.nan)
+    return _within_seconds(run, budget)
+
+
+def _within_rollouts(run: Callable[..., Any], count: int) -> int:
+    def reported(num_samples: int) -> int:
+        # All but the count is dead code, which is dropped before anything is compiled.
+        return int(run(num_samples, lambda estimate: estimate.num_rollouts))
+
+    num_samples, rollouts = _accepted(reported, count)
+    while rollouts > count:
+        # In proportion, for an estimator may roll out several times per sample.
+        fewer = min(num_samples - 1, num_samples * count // rollouts)
+        num_samples, rollouts = _accepted(reported, fewer, f"budget of {count} rollouts buys no estimate; ")
+    return num_samples
+
+
+def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
+    def timed(num_samples: int) -> float:
+        runs = []
+        for _ in range(1 + budget.num_runs):
+            start = time.perf_counter()
+            jax.block_until_ready(run(num_samples, lambda estimate: estimate))
+            runs.append(time.perf_counter() - start)
+        # The first run compiled.
+        return statistics.median(runs[1:])
+
+    low, low_time = _accepted(timed, _FEWEST_TIMED)
+    if low_time > budget.seconds:
+        raise ValueError(
+            f"budget of {budget.seconds:g} s buys no estimate: {low} samples take {low_time:.3g} s; give more seconds"
+        )
+    high, high_time = low, low_time
+    while high_time <= budget.seconds and high < budget.max_samples:
+        low, low_time = high, high_time
+        high, high_time = _accepted(timed, min(8 * high, budget.max_samples))
+    if high_time <= budget.seconds:
+        return Affordable(high, high_time)
+    for _ in range(_CORRECTIONS):
+        slope = max((high_time - low_time) / (high - low), 1e-12)
+        guess = int(low + (budget.seconds - low_time) / slope)
+        guess = min(max(guess, low + 1), high - 1)
+        if guess - low <= low // 50:  # nearer than a clock can tell
+            break
+        tried, seconds = _accepted(timed, guess)
+        if seconds <= budget.seconds:
+            low, low_time = max((low, low_time), (tried, seconds))
+        else:
+            high, high_time = tried, seconds
+    return Affordable(low, low_time)
+
+
+@eqx.filter_jit
+def _estimate(
+    estimator: Estimator,
+    objective: Objective,
+    params: Array,
+    key: PRNGKeyArray,
+    num_samples: int,
+    pick: Callable[[GradientEstimate], Any],
+) -> Any:
+    return pick(estimator(objective, params, key, num_samples=num_samples))
+
+
+def _accepted(measure: Callable[[int], Any], num_samples: int, context: str = "") -> tuple[int, Any]:
+    """Measure at a number of samples, or at the next smaller one that the estimator takes."""
+    refusal = ValueError(f"num_samples must be positive, got {num_samples}")
+    for candidate in range(num_samples, max(num_samples - _NEIGHBOURS, 0), -1):
+        try:
+            return candidate, measure(candidate)
+        except ValueError as error:
+            refusal = error
+    raise ValueError(f"{context}{refusal}") from refusal

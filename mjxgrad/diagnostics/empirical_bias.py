@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from scipy import stats
 
 from mjxgrad.diagnostics.statistics import binomial_bound, binomial_interval, checked
-from mjxgrad.objective import Objective
+from mjxgrad.objective import Objective, as_vector
 
 # Cutting a normal sample at its mean explains 2/π of its variance, an exponential one at the best place 0.65, a uniform
 # one 3/4. More than that takes two groups, or a tail that carries the mean.
@@ -67,25 +67,11 @@ class EmpiricalBias(eqx.Module):
     confidence: float = eqx.field(static=True)
 
     def miss_probability(self, num_samples: ArrayLike) -> Float[np.ndarray, "*shape"]:
-        r"""Give the chance $(1 - \beta)^N$ that N samples all lie in E, so that none of them shows the jump.
-
-        Args:
-            num_samples: N.
-
-        Returns:
-            The chance.
-        """
+        r"""Give the chance $(1 - \beta)^N$ that N samples all lie in E, so that none of them shows the jump."""
         return _all_inside(self.probability, num_samples)
 
     def miss_probability_interval(self, num_samples: ArrayLike) -> Float[np.ndarray, "2 *shape"]:
-        """Give the interval of `miss_probability`, which is that of β carried over.
-
-        Args:
-            num_samples: N.
-
-        Returns:
-            Lower and upper ends.
-        """
+        """Give the interval of `miss_probability`, which is that of β carried over."""
         low, high = self.probability_interval
         return np.stack([_all_inside(high, num_samples), _all_inside(low, num_samples)])
 
@@ -163,13 +149,13 @@ def empirical_bias(
 
 
 def first_order_samples(
-    objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, *, num_samples: int
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int
 ) -> Float[Array, "samples dim"]:
     """Give single samples of the first-order gradient; memory grows with their number.
 
     Args:
         objective: differentiated once per sample, under `jax.vmap`.
-        params: the point.
+        params: the point, a vector or a pytree whose floating-point arrays are taken as one.
         key: consumed here.
         num_samples: how many.
 
@@ -181,11 +167,10 @@ def first_order_samples(
     """
     if num_samples < 1:
         raise ValueError(f"num_samples must be at least 1, got {num_samples}")
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, vector, _ = as_vector(objective, params)
 
     def one(key: PRNGKeyArray) -> Float[Array, " dim"]:
-        cost, gradient = jax.value_and_grad(objective.value)(params, objective.sample_noise(key))
+        cost, gradient = jax.value_and_grad(objective.value)(vector, objective.sample_noise(key))
         # The derivative of a diverged rollout may be a number all the same.
         return jnp.where(jnp.isfinite(cost), gradient, jnp.nan)
 

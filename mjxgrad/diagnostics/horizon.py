@@ -32,23 +32,12 @@ class Growth(eqx.Module):
     log_stretches: Float[Array, "*batch horizon n"]
 
     def exponents(self, times: Float[Array, " horizon"]) -> Float[Array, "*batch horizon n"]:
-        """Give the finite-time Lyapunov exponents, in 1/s.
-
-        Args:
-            times: after each factor, in s.
-        """
+        """Give the finite-time Lyapunov exponents, in 1/s, from the times after each factor, in s."""
         return self.log_stretches / times[:, None]
 
 
 def growth(jacobians: Float[Array, "*batch horizon n n"]) -> Growth:
-    """Multiply Jacobians in order, without overflow whatever their number.
-
-    Args:
-        jacobians: of consecutive steps, the first one first.
-
-    Returns:
-        The growth after each of them.
-    """
+    """Multiply Jacobians of consecutive steps, the first one first, without overflow whatever their number."""
     if jacobians.ndim > 3:
         return jax.vmap(growth)(jacobians)
     identity = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype)

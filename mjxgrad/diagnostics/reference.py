@@ -49,23 +49,7 @@ class Landscape(eqx.Module):
             weight is not finite.
         """
         offset = (self.points - params) / stddev
-        return self._integral(offset / stddev, offset, stddev, centre)
-
-    def smoothed_cost(
-        self, params: Float[Array, ""], stddev: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Give the smoothed cost with its standard error; arguments and errors as in `smoothed_gradient`."""
-        offset = (self.points - params) / stddev
-        return self._integral(jnp.ones_like(offset), offset, stddev, jnp.zeros_like(params))
-
-    def _integral(
-        self,
-        factor: Float[Array, " cells"],
-        offset: Float[Array, " cells"],
-        stddev: Float[Array, ""],
-        centre: Float[Array, ""],
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        weight = factor * jax.scipy.stats.norm.pdf(offset) / stddev
+        weight = offset / stddev * jax.scipy.stats.norm.pdf(offset) / stddev
         # Outside the reach a cost may be anything, also not finite.
         terms = jnp.where(jnp.abs(offset) <= REACH, (self.costs - centre) * weight, 0) * self.cell
         # Neighbouring cells differ by the variance within them and by their means, so this is on the safe side. Two
@@ -77,33 +61,15 @@ class Landscape(eqx.Module):
 def cell_points(
     key: PRNGKeyArray, low: Float[Array, ""], high: Float[Array, ""], num_cells: int
 ) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
-    """Draw one point in each of the equal cells of a line.
-
-    Args:
-        key: consumed here.
-        low: where the first cell begins.
-        high: where the last cell ends.
-        num_cells: how many.
-
-    Returns:
-        The points, ascending, and the length of a cell.
-    """
+    """Draw one point in each of the equal cells of a line, ascending, and give the length of a cell."""
     cell = (high - low) / num_cells
     return low + cell * (jnp.arange(num_cells) + jax.random.uniform(key, (num_cells,), cell.dtype)), cell
 
 
 def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree:
-    """Apply a function to each of many points, some at a time.
+    """Apply a function under `jax.vmap` to points with a leading axis, some at a time.
 
     `jax.lax.map` with a batch size would compile the function a second time for what remains over.
-
-    Args:
-        function: called under `jax.vmap`.
-        points: with a leading axis.
-        chunk_size: points at a time, at most.
-
-    Returns:
-        The results, with a leading axis.
     """
     count = jax.tree.leaves(points)[0].shape[0]
     num_chunks = -(-count // chunk_size)

@@ -1,16 +1,14 @@
 """Intervals for means, biases, variances, errors and probabilities; on the host, in NumPy."""
 
-from collections.abc import Iterator
-from typing import Literal, get_args
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import stats
 
 Interval = Float[np.ndarray, "2 *shape"]
-Method = Literal["chi_square", "bootstrap"]
 
 # Counts of 50 resamples of 1e5 samples are 40 MB.
 _RESAMPLES_AT_A_TIME = 50
@@ -36,10 +34,7 @@ def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, 
     Raises:
         ValueError: if `confidence` is not between 0 and 1.
     """
-    mean, standard_error = np.asarray(mean, float), np.asarray(standard_error, float)
-    freedom = np.maximum(np.asarray(count, float) - 1, 1)
-    half = stats.t.ppf(0.5 + checked(confidence) / 2, freedom) * standard_error
-    return np.stack([mean - half, mean + half])
+    return bias_interval(mean, standard_error, count, 0.0, confidence=confidence)
 
 
 def bias_interval(
@@ -177,19 +172,7 @@ def _binomial_test(count: int, total: int, alternative: str = "two-sided"):
 
 
 def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Give the chi-square interval of a variance, exact for normal samples and wrong for heavy tails.
-
-    Args:
-        variance: of the samples, with N − 1.
-        count: number of samples, at least 2.
-        confidence: chance to cover the truth.
-
-    Returns:
-        Lower and upper ends.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1.
-    """
+    """Give the chi-square interval of a variance (with N − 1), exact for normal samples and wrong for heavy tails."""
     freedom = np.asarray(count, float) - 1
     tail = (1 - checked(confidence)) / 2
     sum_of_squares = np.asarray(variance, float) * freedom
@@ -201,23 +184,11 @@ def bootstrap_variance_interval(
     confidence: float = 0.95,
     *,
     num_resamples: int = 1000,
-    seed: int = 0,
 ) -> Float[np.ndarray, " 2"]:
     """Give the percentile bootstrap interval of a total variance, the trace of the covariance.
 
-    It assumes no distribution. A tail that the samples have not met it cannot know: then it is too low.
-
-    Args:
-        samples: independent; those that are not finite are left out.
-        confidence: chance to cover the truth.
-        num_resamples: how often the samples are drawn anew.
-        seed: of the draws; the same seed and number of samples give the same draws.
-
-    Returns:
-        Lower and upper end, NaN for fewer than two finite samples.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1, or `num_resamples` is below 1.
+    It assumes no distribution. A tail that the samples have not met it cannot know: then it is too low. Samples that are
+    not finite are left out; fewer than two give NaN. The same number of samples has the same draws.
 
     References:
         Efron, Tibshirani. An Introduction to the Bootstrap. Chapman & Hall 1993, section 13.3.
@@ -232,19 +203,13 @@ def bootstrap_variance_interval(
         return np.full(2, np.nan)
     centred = samples - samples.mean(axis=0)
     squares = (centred**2).sum(axis=1)
-    variances = []
-    for times in _resampling_counts(count, num_resamples, seed):
+    rng, variances = np.random.default_rng(0), []
+    for done in range(0, num_resamples, _RESAMPLES_AT_A_TIME):
+        # How often each sample is drawn in each resample.
+        times = rng.multinomial(count, np.full(count, 1 / count), min(_RESAMPLES_AT_A_TIME, num_resamples - done))
         shift = times @ centred / count
         variances.append((times @ squares - count * (shift**2).sum(axis=1)) / (count - 1))
     return np.quantile(np.concatenate(variances), [tail, 1 - tail])
-
-
-def _resampling_counts(count: int, num_resamples: int, seed: int) -> Iterator[Int[np.ndarray, "resamples samples"]]:
-    """Give how often each sample is drawn in each resample."""
-    rng = np.random.default_rng(seed)
-    sizes = [min(_RESAMPLES_AT_A_TIME, num_resamples - i) for i in range(0, num_resamples, _RESAMPLES_AT_A_TIME)]
-    for size in sizes:
-        yield rng.multinomial(count, np.full(count, 1 / count), size)
 
 
 class VarianceInterval(eqx.Module):
@@ -258,52 +223,46 @@ class VarianceInterval(eqx.Module):
 
     value: float
     ends: Float[np.ndarray, " 2"]
-    method: Method = eqx.field(static=True)
+    method: Literal["chi_square", "bootstrap"] = eqx.field(static=True)
 
 
 def variance_interval(
     samples: Float[np.ndarray, "samples dim"],
     confidence: float = 0.95,
     *,
-    method: Method | None = None,
     num_resamples: int = 1000,
-    seed: int = 0,
 ) -> VarianceInterval:
     """Give the interval of a total variance by the method that the samples deserve, and say which.
 
     Chi-square is exact for normal samples of one coordinate (with several the degrees of freedom follow from the
-    eigenvalues of the covariance) and wrong for any others; the bootstrap assumes no distribution but needs samples.
+    eigenvalues of the covariance) and wrong for any others; the bootstrap assumes no distribution but needs samples. It
+    is taken where there are at least 20 and a test of their kurtosis refuses the normal distribution in some coordinate
+    (5 % over all of them).
 
     Args:
         samples: independent; those that are not finite are left out.
         confidence: chance to cover the truth.
-        method: None takes the bootstrap where there are at least 20 samples and a test of their kurtosis refuses the
-            normal distribution in some coordinate (5 % over all of them), else chi-square.
         num_resamples: of the bootstrap.
-        seed: of the bootstrap.
 
     Returns:
         The variance, its interval and the method; NaN for fewer than two finite samples.
 
     Raises:
-        ValueError: if `confidence` is not between 0 and 1, or `method` is none of the choices.
+        ValueError: if `confidence` is not between 0 and 1.
     """
     checked(confidence)
-    if method not in (None, *get_args(Method)):
-        raise ValueError(f"method must be one of {', '.join(map(repr, get_args(Method)))} or None, got {method!r}")
     samples = np.asarray(samples, float)
     samples = samples[np.isfinite(samples).all(axis=1)]
     if len(samples) < 2:
-        return VarianceInterval(np.nan, np.full(2, np.nan), method or "chi_square")
-    method = method or ("bootstrap" if _has_other_tails(samples) else "chi_square")
+        return VarianceInterval(np.nan, np.full(2, np.nan), "chi_square")
     covariance = np.atleast_2d(np.cov(samples, rowvar=False))
     total = float(np.trace(covariance))
-    if method == "bootstrap":
-        ends = bootstrap_variance_interval(samples, confidence, num_resamples=num_resamples, seed=seed)
-        return VarianceInterval(total, ends, method)
+    if _has_other_tails(samples):
+        ends = bootstrap_variance_interval(samples, confidence, num_resamples=num_resamples)
+        return VarianceInterval(total, ends, "bootstrap")
     squares = (covariance**2).sum()
     freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
-    return VarianceInterval(total, chi_square_variance_interval(total, freedom + 1, confidence), method)
+    return VarianceInterval(total, chi_square_variance_interval(total, freedom + 1, confidence), "chi_square")
 
 
 def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
@@ -315,17 +274,7 @@ def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
 
 
 def checked(confidence: float) -> float:
-    """Give the confidence back, refusing what is no chance.
-
-    Args:
-        confidence: of an interval.
-
-    Returns:
-        The same.
-
-    Raises:
-        ValueError: if it is not between 0 and 1.
-    """
+    """Give the confidence of an interval back, refusing what is no chance."""
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
     return confidence

@@ -33,11 +33,8 @@ _ROUNDING = 32.0
 class SecantSums(eqx.Module):
     """Sums over pairs of samples, to be added over groups.
 
-    Attributes:
-        residual: squared residuals over squared distances, in standard deviations of the noise.
-        difference: squared differences of costs over squared distances.
-        missed: half the squared residuals.
-        pairs: how many.
+    Of squared residuals, and differences of costs, over squared distances in standard deviations of the noise; of half the
+    squared residuals, missed; and the number of pairs.
     """
 
     residual: Float[Array, ""]
@@ -55,15 +52,7 @@ class SecantSums(eqx.Module):
 
 
 def secant_sums(samples: Group, slopes: Float[Array, "samples samples"]) -> SecantSums:
-    """Compare all pairs of a group that differ in their noise alone.
-
-    Args:
-        samples: of the group.
-        slopes: their `gram`.
-
-    Returns:
-        The sums; every pair is in them twice.
-    """
+    """Compare all pairs of a group that differ in their noise alone; every pair is in the sums twice."""
     own = jnp.diagonal(slopes)
     difference = samples.costs[:, None] - samples.costs[None, :]
     # The derivatives of both along the way from k to j.

@@ -1,9 +1,13 @@
 """What every estimator returns."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
@@ -27,6 +31,10 @@ class Reason(eqx.Enumeration):
     uncertain = "the zeroth-order part is too noisy to bound the bias, so it stands alone"
     inconsistent = "values and derivatives of the samples contradict each other, so the zeroth-order part stands alone"
     not_finite = "too few derivatives were finite, so the zeroth-order part stands alone"
+    nothing_felt = (
+        "all samples cost the same and no derivative differs from zero, so nothing that the parameters change reaches "
+        "the cost"
+    )
 
 
 class GradientEstimate(eqx.Module):
@@ -37,7 +45,8 @@ class GradientEstimate(eqx.Module):
     antithetic pairs make samples dependent; both are accounted for in it.
 
     Attributes:
-        value: the estimate, NaN if fewer than two independent samples were finite.
+        value: the estimate, NaN if fewer than two independent samples were finite. It and the next two have the form of
+            the parameters, with None in place of what is no floating-point array.
         standard_error: of each coordinate of `value`.
         covariance_diagonal: variance of each coordinate, per rollout.
         objective_mean: mean cost under noise, an estimate of $F(\theta)$.
@@ -47,15 +56,15 @@ class GradientEstimate(eqx.Module):
         num_rollouts: rollouts spent, a zero-noise baseline included.
         num_gradient_rollouts: of those, the ones that were differentiated.
         diagnosis: an item of `Diagnosis`.
-        alpha: weight of the first-order part; one number, or one per block of coordinates.
-        reason: an item of `Reason` for each `alpha`.
+        alpha: weight of the first-order part; one number; of `per_step` one per step and action.
+        reason: an item of `Reason` for each `alpha`; `Reason.nothing_felt` with any estimator.
         bias_bound: an upper bound on the norm of the bias of `value`, as far as the rule that chose `alpha` knows one:
             zero for what is unbiased, NaN where nothing is known.
     """
 
-    value: Float[Array, " dim"]
-    standard_error: Float[Array, " dim"]
-    covariance_diagonal: Float[Array, " dim"]
+    value: PyTree[Float[Array, "..."]]
+    standard_error: PyTree[Float[Array, "..."]]
+    covariance_diagonal: PyTree[Float[Array, "..."]]
     objective_mean: Float[Array, ""]
     objective_standard_error: Float[Array, ""]
     num_samples: Int[Array, ""]
@@ -70,12 +79,22 @@ class GradientEstimate(eqx.Module):
     @property
     def variance(self) -> Float[Array, "*batch"]:
         """Trace of the covariance, per rollout."""
-        return self.covariance_diagonal.sum(axis=-1)
+        first = jnp.ndim(self.num_samples)  # what stands before is of `jax.vmap`
+        return sum(leaf.sum(axis=tuple(range(first, leaf.ndim))) for leaf in jax.tree.leaves(self.covariance_diagonal))
 
     @property
     def finite_fraction(self) -> Float[Array, "*batch"]:
         """Share of the samples that were finite."""
         return self.num_finite / self.num_samples
+
+
+def is_nothing_felt(plan: Plan, costs: Moments, num_felt: Int[Array, ""]) -> Bool[Array, ""]:
+    """Say whether the noise of no unit made a difference, to a derivative or from one cost to another.
+
+    Noise that is zero is no evidence. Where starts are random, costs are compared within units that share one; without
+    such a unit they differ by their starts, and it cannot be said.
+    """
+    return (num_felt == 0) & ((costs.squares == 0) | plan.shares_start | plan.with_silence)
 
 
 def assemble(
@@ -85,38 +104,31 @@ def assemble(
     plan: Plan,
     *,
     count: Int[Array, ""],
+    num_felt: Int[Array, ""],
+    restore: Callable[[Float[Array, " dim"]], PyTree],
     has_baseline: Bool[Array, ""] | bool = True,
     alpha: ArrayLike = 0.0,
-    reason: Reason = Reason.fixed,
+    reason: Any = Reason.fixed,
     bias_bound: ArrayLike = 0.0,
 ) -> GradientEstimate:
     """Put an estimate together, refusing to give a number where there is none.
 
-    Args:
-        value: the mean.
-        squared_error: its squared standard error.
-        costs: moments of the cost over independent units.
-        plan: what was asked for, and spent.
-        count: independent units (samples, or pairs of them) that were finite.
-        has_baseline: whether a baseline that had to be finite was so.
-        alpha: weight of the first-order part.
-        reason: why.
-        bias_bound: on the norm of the bias; NaN where nothing is known.
-
-    Returns:
-        The estimate, all NaN where there is none.
+    Moments and counts are over independent units: samples, or pairs of them. `count` are those that were finite, `num_felt`
+    those whose noise made a difference, or that cannot tell. `restore` goes from a vector to the form of the parameters.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline
     diagnosis = Diagnosis.where(num_finite == plan.num_samples, Diagnosis.fine, Diagnosis.some_not_finite)
     diagnosis = Diagnosis.where(count >= 2, diagnosis, Diagnosis.too_few_finite)
     diagnosis = Diagnosis.where(has_baseline, diagnosis, Diagnosis.baseline_not_finite)
+    alpha = jnp.asarray(alpha, value.dtype)
+    is_nothing = jnp.broadcast_to(exists & is_nothing_felt(plan, costs, num_felt), alpha.shape)
     value = jnp.where(exists, value, jnp.nan)
     squared_error = jnp.where(exists, jnp.maximum(squared_error, 0), jnp.nan)
     return GradientEstimate(
-        value=value,
-        standard_error=jnp.sqrt(squared_error),
-        covariance_diagonal=squared_error * num_finite.astype(squared_error.dtype),
+        value=restore(value),
+        standard_error=restore(jnp.sqrt(squared_error)),
+        covariance_diagonal=restore(squared_error * num_finite.astype(squared_error.dtype)),
         objective_mean=jnp.where(costs.count > 0, costs.mean, jnp.nan),
         objective_standard_error=jnp.sqrt(costs.squared_error()),
         num_samples=jnp.asarray(plan.num_samples),
@@ -124,7 +136,7 @@ def assemble(
         num_rollouts=jnp.asarray(plan.num_rollouts),
         num_gradient_rollouts=jnp.asarray(plan.num_rollouts if plan.with_gradient else 0),
         diagnosis=diagnosis,
-        alpha=jnp.asarray(alpha, value.dtype),
-        reason=reason,
+        alpha=alpha,
+        reason=Reason.where(is_nothing, Reason.nothing_felt, reason),
         bias_bound=jnp.asarray(bias_bound, value.dtype),
     )

@@ -1,19 +1,20 @@
 """First order, the mean of the derivatives of samples; zeroth order, the covariance of cost and score; both at once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, Total, as_real
-from mjxgrad.estimators.samples import Plan, Samples, check_baseline, stream
-from mjxgrad.objective import Objective
+from mjxgrad.estimators.samples import Plan, Samples, plan_for_baseline, stream
+from mjxgrad.objective import Objective, as_vector
 
 
 def first_order(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -26,11 +27,11 @@ def first_order(
 
     Args:
         objective: differentiated once per sample, under `jax.vmap`.
-        params: the point $\theta$.
+        params: the point $\theta$: a vector, or a pytree such as a dict or an equinox module, whose floating-point
+            arrays are the parameters; the estimate then has its form.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
-            rounding.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -44,14 +45,13 @@ def first_order(
         Gradients? ICML 2022, arXiv:2202.00817, definition 2.2.
     """
     plan = Plan(num_samples, chunk_size, with_gradient=True)
-    params = jnp.asarray(params)
-    summary = stream(objective.sized_for(params), params, key, plan, first_order_summary)
-    return first_order_result(summary, plan)
+    objective, vector, restore = as_vector(objective, params)
+    return first_order_result(stream(objective, vector, key, plan, first_order_summary), plan, restore)
 
 
 def zeroth_order(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -67,18 +67,15 @@ def zeroth_order(
 
     Args:
         objective: its `value` is called once under `jax.vmap`.
-        params: the point $\theta$.
+        params: the point $\theta$, as in `first_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with
-            antithetic pairs.
+        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with antithetic pairs.
         baseline: "leave_one_out", the mean cost of the other samples (of the other pairs);
             "zero_noise", the cost without noise, one more rollout, or where starts are random one
             more for each sample (for each pair), from the same start; or "none".
-        antithetic: use every noise together with its mirror image. The standard error is then
-            taken over pairs. Where the score is odd in the noise (parameter noise, open loop)
-            all baselines cancel within a pair.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by
-            rounding.
+        antithetic: use every noise together with its mirror image. The standard error is then taken over pairs. Where
+            the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
+        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -88,27 +85,18 @@ def zeroth_order(
             unknown, or `params` is not a vector of the objective's dimension.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy
-        Gradients? ICML 2022, arXiv:2202.00817, definition 2.3 (there with the zero-noise
-        baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE samples, get a baseline for free!
-        ICLR 2019 workshop, equation 8 (leave-one-out).
+        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
+        arXiv:2202.00817, definition 2.3 (there with the zero-noise baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE
+        samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
-    check_baseline(baseline)
-    plan = Plan(
-        num_samples,
-        chunk_size,
-        antithetic,
-        with_score=True,
-        **noise_free_rollouts(objective, baseline),
-    )
-    params = jnp.asarray(params)
-    summary = stream(objective.sized_for(params), params, key, plan, zeroth_order_summary)
-    return zeroth_order_result(summary, plan, baseline)
+    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline)
+    objective, vector, restore = as_vector(objective, params)
+    return zeroth_order_result(stream(objective, vector, key, plan, zeroth_order_summary), plan, baseline, restore)
 
 
 def first_and_zeroth_order(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -123,7 +111,7 @@ def first_and_zeroth_order(
 
     Args:
         objective: differentiated once per sample, under `jax.vmap`.
-        params: the point.
+        params: as in `first_order`.
         key: consumed here; do not use it again.
         num_samples: as in `zeroth_order`.
         baseline: as in `zeroth_order`.
@@ -137,70 +125,62 @@ def first_and_zeroth_order(
     Raises:
         ValueError: as in `zeroth_order`.
     """
-    check_baseline(baseline)
-    plan = Plan(
-        num_samples,
-        chunk_size,
-        antithetic,
-        with_gradient=True,
-        with_score=True,
-        **noise_free_rollouts(objective, baseline),
-    )
-    params = jnp.asarray(params)
-    kept = stream(objective.sized_for(params), params, key, plan, both_summary)
-    return both_results(kept, plan, baseline)
+    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
+    objective, vector, restore = as_vector(objective, params)
+    return both_results(stream(objective, vector, key, plan, both_summary), plan, baseline, restore)
 
 
-def first_order_summary(samples: Samples) -> tuple[Moments, Moments]:
+def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Total]:
     """Keep of samples what the estimate needs: moments of gradients and of costs."""
     mask = samples.first_order_mask()
     gradients = Moments.of(samples.gradients.mean(axis=1), mask)
-    return gradients, Moments.of(samples.costs.mean(axis=1), mask)
+    return gradients, Moments.of(samples.costs.mean(axis=1), mask), Total(samples.num_felt())
 
 
-def first_order_result(summary: tuple[Any, ...], plan: Plan) -> GradientEstimate:
+def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) -> GradientEstimate:
     """Turn what `first_order_summary` kept into the estimate."""
-    gradients, costs = summary
+    gradients, costs, felt = summary
     return assemble(
         gradients.mean,
         gradients.squared_error(),
         costs,
         plan,
         count=gradients.count,
+        num_felt=felt.value,
+        restore=restore,
         alpha=1.0,
         bias_bound=jnp.nan,
     )
 
 
-def noise_free_rollouts(objective: Objective, baseline: str) -> dict[str, bool]:
-    """Say which rollouts without noise a plan needs for a baseline."""
-    is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
-    return {"with_zero_noise": is_needed and not has_own, "with_silence": is_needed and has_own}
-
-
-def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Total, Moments]:
-    """Keep of samples what the estimate needs: joint moments, the cost without noise, and moments of the cost."""
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Total]:
+    """Keep of samples what the estimate needs: joint moments, moments of the cost, and the cost without noise."""
     mask = samples.zeroth_order_mask()
     moments = ScoreMoments.of(samples.costs - samples.silent_costs[:, None], samples.scores, mask)
-    return moments, Total(samples.noise_free_cost()), Moments.of(samples.costs.mean(axis=1), mask)
+    sums = Total((samples.noise_free_cost(), samples.num_felt()))
+    return moments, Moments.of(samples.costs.mean(axis=1), mask), sums
 
 
-def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str) -> GradientEstimate:
+def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:
     """Turn what `zeroth_order_summary` kept into the estimate."""
-    moments, noise_free, costs = summary
+    moments, costs, sums = summary
+    noise_free_cost, num_felt = sums.value
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
     else:
         # Costs are already above those from their own starts, if there are any.
-        centre = noise_free.value if plan.with_zero_noise else jnp.zeros_like(noise_free.value)
-        value, squared_error = _fixed_baseline(moments, centre)
+        centre = noise_free_cost if plan.with_zero_noise else jnp.zeros_like(noise_free_cost)
+        first, second = moments.about(centre)
+        value, squared_error = _mean_and_squared_error(first[0], second[0, 0], moments.costs.count)
     return assemble(
         value,
         squared_error,
         costs,
         plan,
         count=moments.costs.count,
-        has_baseline=jnp.isfinite(noise_free.value),
+        num_felt=num_felt,
+        restore=restore,
+        has_baseline=jnp.isfinite(noise_free_cost),
     )
 
 
@@ -209,25 +189,18 @@ def both_summary(samples: Samples) -> tuple:
     return *first_order_summary(samples), *zeroth_order_summary(samples)
 
 
-def both_results(kept: tuple, plan: Plan, baseline: str) -> tuple[GradientEstimate, GradientEstimate]:
+def both_results(
+    kept: tuple, plan: Plan, baseline: str, restore: Callable
+) -> tuple[GradientEstimate, GradientEstimate]:
     """Turn what was kept into both estimates."""
-    return first_order_result(kept[:2], plan), zeroth_order_result(kept[2:], plan, baseline)
-
-
-def _fixed_baseline(
-    moments: ScoreMoments, centre: Float[Array, ""]
-) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    first, second = moments.about(centre)
-    count = moments.costs.count
-    return _mean_and_squared_error(first[0], second[0, 0], count)
+    return first_order_result(kept[:3], plan, restore), zeroth_order_result(kept[3:], plan, baseline, restore)
 
 
 def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     r"""Mean of $g_i = u_i - b_i \bar s_i$, $b_i$ the mean cost of the other units.
 
-    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs
-    $u = p$ and this is $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of
-    cost and score.
+    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs $u = p$ and this is
+    $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of cost and score.
 
     The $g_i$ share the mean, so their spread over $n$ is not quite the variance $V$ of their
     mean. With $\mathbb{E}[s] = 0$ and $c = \mathbb{E}[\bar f \bar s]$,
@@ -235,9 +208,8 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     $$V = \frac{\mathrm{Var}\,u}{n} + \frac{\mathrm{Var}\bar f\,\mathrm{Var}\bar s + c^2}{n(n-1)},
       \qquad \mathbb{E}[\text{spread}/n] = V - \frac{c^2}{(n-1)^2}.$$
 
-    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and
-    $\mathbb{E}[k^2] = c^2 + V_k$; together they give an estimate of $V$ that is unbiased for
-    every $n \ge 2$, and never negative without pairs.
+    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and $\mathbb{E}[k^2] = c^2 +
+    V_k$; together they give an estimate of $V$ that is unbiased for every $n \ge 2$, and never negative without pairs.
     """
     first, second, count = moments.first, moments.second, moments.costs.count
     others = as_real(jnp.maximum(count - 1, 1), first)

@@ -2,18 +2,17 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan, sample
-from mjxgrad.objective import Objective, ParameterNoise
-from mjxgrad.objective.actions import OpenLoop
+from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, as_vector
 
 
 def least_squares(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -30,7 +29,7 @@ def least_squares(
 
     Args:
         objective: with Gaussian noise on the parameters, or open loop from a fixed start.
-        params: the point $\theta$.
+        params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. More than dim + 1.
         chunk_size: rollouts at a time. Noise and costs of all samples are kept: memory grows with num_samples * dim.
@@ -46,28 +45,27 @@ def least_squares(
         Contact Models. IEEE T-RO 2023, arXiv:2206.10787, section III (fits to samples). MacKinnon, White. Some
         heteroskedasticity-consistent covariance matrix estimators. Journal of Econometrics 29, 1985 (HC3).
     """
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, vector, restore = as_vector(objective, params)
     if not isinstance(objective, ParameterNoise | OpenLoop) or objective.has_circumstances:
         raise ValueError(
             "objective must have its noise on the parameters and nothing else at random, got "
             f"{type(objective).__name__}{' with random starts' if objective.has_circumstances else ''}; "
             "use zeroth_order or control_variate"
         )
-    if num_samples <= params.size + 1:
+    if num_samples <= vector.size + 1:
         raise ValueError(
-            f"num_samples must be more than dim + 1 = {params.size + 1}, got {num_samples}; "
+            f"num_samples must be more than dim + 1 = {vector.size + 1}, got {num_samples}; "
             "zeroth_order needs no more than 2"
         )
     plan = Plan(num_samples, chunk_size, with_score=True)
     num_chunks, size = plan.chunks()
     units = jnp.arange(num_chunks * size).reshape(num_chunks, size)
-    samples = jax.lax.map(lambda some: sample(objective, params, key, some, plan), units)
+    samples = jax.lax.map(lambda some: sample(objective, vector, key, plan, some), units)
     samples = jax.tree.map(lambda leaf: leaf.reshape(num_chunks * size, *leaf.shape[2:]), samples)
     mask = samples.zeroth_order_mask()
     costs = Moments.of(samples.costs[:, 0], mask)
     # Scores in place of noise: of comparable size for all coordinates, and the units follow from their scale.
-    stddev = jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape)).astype(params.dtype)
+    stddev = jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape)).astype(vector.dtype)
     noise = jnp.where(mask[:, None], samples.scores[:, 0] * stddev, 0)
     slope, squared_error = _fit(noise, jnp.where(mask, samples.costs[:, 0] - costs.mean, 0), mask)
     return assemble(
@@ -76,7 +74,9 @@ def least_squares(
         costs,
         plan,
         # A fit that leaves no residual degree of freedom is no estimate.
-        count=jnp.where(costs.count > params.size + 1, costs.count, 0),
+        count=jnp.where(costs.count > vector.size + 1, costs.count, 0),
+        num_felt=samples.num_felt(),
+        restore=restore,
     )
 
 

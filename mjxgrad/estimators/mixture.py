@@ -1,33 +1,33 @@
 """Mixtures of a first-order and an unbiased estimate from the same rollouts, and all that is needed to weigh them."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
-from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble
+from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
 from mjxgrad.estimators.moments import Moments, Summary, Total, as_real
 from mjxgrad.estimators.rules import Consistent, Evidence, Rule, Weights
-from mjxgrad.estimators.samples import Group, Plan, SamplesByNoise, accumulate, plan_by_noise, sample_by_noise
+from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
 from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
-from mjxgrad.objective import Objective
+from mjxgrad.objective import Objective, as_vector
 
 ByNoise = Float[Array, "samples m"]
 
 
 def alpha_order(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
     rule: Rule | None = None,
     control_variate: bool = True,
-    blocks: np.ndarray | None = None,
     chunk_size: int | None = None,
 ) -> GradientEstimate:
     r"""Mix a first-order and an unbiased estimate of the gradient of a smoothed objective.
@@ -39,13 +39,11 @@ def alpha_order(
 
     Args:
         objective: differentiated once per sample by its noise, under `jax.vmap`.
-        params: the point $\theta$.
+        params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
         rule: chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
         control_variate: whether $g^0$ uses derivatives; without, it is zeroth order with the leave-one-out baseline.
-        blocks: number of the block of each coordinate, from 0; $\alpha$ is then chosen for each block. None is one
-            block, `np.arange(dim)` one for each coordinate.
         chunk_size: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
             within groups of at most 64 of a chunk.
 
@@ -53,27 +51,25 @@ def alpha_order(
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
 
     Raises:
-        ValueError: if `num_samples`, `chunk_size` or `blocks` do not fit, or the objective does not know its noise.
+        ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
 
     References:
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
         arXiv:2202.00817, section 4 (the mixture).
     """
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
-    blocks, num_blocks = _checked_blocks(blocks, params.size)
-    parts = stream_parts(objective, params, key, plan, control_variate=control_variate)
-    weights = weigh(rule or Consistent(), parts, blocks, num_blocks)
-    alpha, bias_bound = weights.alpha[blocks], jnp.sqrt((weights.bias_bound**2).sum())
-    if num_blocks == 1:
-        weights = jax.tree.map(lambda leaf: leaf[0], weights)
-    return assemble_mixture(parts, plan, alpha, alpha=weights.alpha, reason=weights.reason, bias_bound=bias_bound)
+    (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
+    weights = jax.tree.map(
+        lambda leaf: leaf[0], weigh(rule or Consistent(), parts, plan, np.zeros(vector.size, int), 1)
+    )
+    facts = {"alpha": weights.alpha, "reason": weights.reason, "bias_bound": weights.bias_bound}
+    return _assembled(parts, plan, restore, jnp.full_like(vector, weights.alpha), **facts)
 
 
 def control_variate(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -91,11 +87,10 @@ def control_variate(
 
     Args:
         objective: differentiated once per sample by its noise, under `jax.vmap`.
-        params: the point $\theta$.
+        params: as in `alpha_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
-        chunk_size: rollouts at a time, at least 4; memory grows with it. Samples leave each other out within groups of
-            at most 64 of a chunk.
+        num_samples: as in `alpha_order`.
+        chunk_size: as in `alpha_order`.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -103,16 +98,15 @@ def control_variate(
     Raises:
         ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
     """
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
-    parts = stream_parts(objective, params, key, plan, control_variate=True)
-    return assemble_mixture(parts, plan, jnp.zeros_like(params))
+    (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=True))
+    return _assembled(parts, plan, restore, jnp.zeros_like(vector))
 
 
 def per_step(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -127,11 +121,10 @@ def per_step(
     long rollout may explode while those near it are exact, so that one weight for all would waste the latter.
 
     Args:
-        objective: differentiated once per sample by its noise, under `jax.vmap`. With noise on the parameters the steps
-            are the parameters.
-        params: the point $\theta$.
+        objective: as in `alpha_order`. With noise on the parameters the steps are the parameters.
+        params: as in `alpha_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
+        num_samples: as in `alpha_order`.
         rule: chooses each $\alpha_{t,a}$. None is `Consistent()`, whose first question is one for all steps;
             `InverseVariance()` is the published IVW-H.
         control_variate: whether the unbiased terms use derivatives.
@@ -139,8 +132,7 @@ def per_step(
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number for each
-        step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not
-        bounded.
+        step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not bounded.
 
     Raises:
         ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
@@ -148,32 +140,33 @@ def per_step(
     References:
         Onoda et al., arXiv:2604.18161 (IVW-H).
     """
-    params = jnp.asarray(params)
-    objective = objective.sized_for(params)
+    objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
     num_actions = int(np.prod(objective.noise_shape))
 
-    def one_chunk(units: Array) -> tuple[Summary, ...]:
-        samples = sample_by_noise(objective, params, key, units, plan)
+    def mixed_chunk(samples: Samples) -> tuple[Summary, ...]:
+        chunk = Group.of(samples)
         parts, terms_by_noise, has_cost = parts_and_terms(
-            samples, control_variate=control_variate, take=lambda by_noise: by_noise
+            samples, chunk, control_variate=control_variate, take=lambda by_noise: by_noise
         )
-        weights = weigh(rule or Consistent(), parts, np.arange(num_actions), num_actions)
+        weights = weigh(rule or Consistent(), parts, plan, np.arange(num_actions), num_actions)
         alpha = weights.alpha
-        group = samples.group
-        mixed = alpha * group.derivatives + jnp.where(group.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
-        values = Moments.of(samples.by_unit(samples.pull_back(mixed)), has_cost)
+        mixed = alpha * chunk.derivatives + jnp.where(chunk.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
+        values = Moments.of(chunk.by_unit(chunk.pull_back(samples, mixed)), has_cost)
         reasons = jax.nn.one_hot(jax.tree.leaves(weights.reason)[0], len(Reason), axis=0)
-        return values, parts.costs, Total((parts.num_costs * alpha, parts.num_costs * reasons, parts.num_costs))
+        weighed = (parts.num_costs * alpha, parts.num_costs * reasons, parts.num_costs)
+        return values, parts.costs, Total((*weighed, parts.num_felt))
 
-    values, costs, sums = accumulate(plan, one_chunk)
-    alpha, reasons, count = sums.value
+    values, costs, sums = stream(objective, vector, key, plan, mixed_chunk)
+    alpha, reasons, count, num_felt = sums.value
     return assemble(
         values.mean,
         values.squared_error(),
         costs,
         plan,
         count=values.count,
+        num_felt=num_felt,
+        restore=restore,
         alpha=alpha / jnp.maximum(count, 1),
         reason=jax.tree.map(lambda _: reasons.argmax(axis=0), Reason.fixed),
         bias_bound=jnp.where((alpha > 0).any(), jnp.nan, 0),
@@ -184,16 +177,13 @@ class Parts(Summary):
     """Moments of both parts over all samples; of pairs of them where starts are random.
 
     Attributes:
-        first: of the derivatives.
-        unbiased: of the unbiased terms.
-        difference: of the terms less the derivatives.
-        costs: of the costs.
+        difference: of the unbiased terms less the derivatives.
         scaled: of the derivatives by noise, in its standard deviations.
-        secants: how far the derivatives explain the costs.
         linear_variance: of the costs that the mean derivative explains, summed over samples.
         beta: sum of the shares that were taken off.
         num_costs: samples in these sums.
         num_groups: groups of samples that share their baselines.
+        num_felt: units whose noise made a difference.
     """
 
     first: Moments
@@ -206,6 +196,7 @@ class Parts(Summary):
     beta: Float[Array, ""]
     num_costs: Float[Array, ""]
     num_groups: Float[Array, ""]
+    num_felt: Int[Array, ""]
 
     def merge(self, other: "Parts") -> "Parts":
         """Give the summary of both sets of samples."""
@@ -216,15 +207,7 @@ class Parts(Summary):
         return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
 
     def evidence(self, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Evidence:
-        """Give what a rule may look at, block by block.
-
-        Args:
-            blocks: number of the block of each coordinate.
-            num_blocks: how many there are.
-
-        Returns:
-            The evidence, with an axis of blocks.
-        """
+        """Give what a rule may look at, with an axis of blocks; `blocks` has the number of that of each coordinate."""
 
         def by_block(values: Float[Array, " dim"]) -> Float[Array, " blocks"]:
             return jax.ops.segment_sum(values, blocks, num_segments=num_blocks)
@@ -251,14 +234,7 @@ class Parts(Summary):
         )
 
     def mixture(self, alpha: Float[Array, " dim"]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Give the weighted mean and its squared standard error, coordinate by coordinate.
-
-        Args:
-            alpha: weight of the first-order part.
-
-        Returns:
-            Both; where no derivative was finite, those of the unbiased part.
-        """
+        """Give the weighted mean and its squared standard error; where no derivative was finite, the unbiased part's."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)
         value = alpha * first + (1 - alpha) * self.unbiased.mean
@@ -281,128 +257,72 @@ class Parts(Summary):
         return spread + (remaining**2 - spread) / (num_groups * others**2 + 1)
 
 
+def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
+    """Summarise a chunk for both parts by the parameters."""
+    chunk = Group.of(samples)
+    take = functools.partial(chunk.pull_back, samples)
+    return (parts_and_terms(samples, chunk, control_variate=control_variate, take=take)[0],)
+
+
 def parts_and_terms(
-    samples: SamplesByNoise, *, control_variate: bool, take: Callable[[ByNoise], Array]
+    samples: Samples, chunk: Group, *, control_variate: bool, take: Callable[[ByNoise], Array]
 ) -> tuple[Parts, ByNoise, Bool[Array, " units"]]:
-    """Summarise a chunk.
+    """Give the summary of a chunk, the unbiased terms by noise, and which units have both cost and baseline.
 
-    Args:
-        samples: of the chunk.
-        control_variate: whether the unbiased part uses derivatives.
-        take: where the moments are wanted: `samples.pull_back` for parameters, the identity for noise.
-
-    Returns:
-        The summary, the unbiased terms by noise, and which units have both cost and baseline.
+    Moments are wanted where `take` goes: it is the pull-back for parameters, the identity for noise.
     """
-    groups = samples.groups()
+    groups = chunk.split()
 
     def compare(group: Group) -> tuple[UnbiasedTerms, SecantSums]:
         slopes = gram(group)
         return unbiased_terms(group, slopes, with_derivatives=control_variate), secant_sums(group, slopes)
 
     terms, secants = jax.vmap(compare)(groups)
-    whole, count = samples.group, len(samples.group.costs)
+    count = len(chunk.costs)
     terms_by_noise = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[:count]
     # A cost without another to compare it with has no baseline.
     num_costs = groups.has_cost.sum(axis=1)
     is_compared = (groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count]
-    has_cost = samples.complete(is_compared)
-    has_both = has_cost & samples.complete(whole.has_derivative)
-    unbiased, first = samples.by_unit(take(terms_by_noise)), samples.by_unit(take(whole.derivatives))
-    real_counts = as_real(num_costs, whole.costs)
+    has_cost = chunk.complete(is_compared)
+    has_both = has_cost & chunk.complete(chunk.has_derivative)
+    unbiased, first = chunk.by_unit(take(terms_by_noise)), chunk.by_unit(take(chunk.derivatives))
+    real_counts = as_real(num_costs, chunk.costs)
     summary = Parts(
         first=Moments.of(first, has_both),
         unbiased=Moments.of(unbiased, has_cost),
         difference=Moments.of(unbiased - first, has_both),
-        costs=Moments.of(samples.by_unit(whole.costs) + samples.mean_cost, has_cost),
-        scaled=Moments.of(whole.derivatives * whole.stddev, whole.has_derivative),
+        costs=Moments.of(chunk.by_unit(chunk.costs) + chunk.centre, has_cost),
+        scaled=Moments.of(chunk.derivatives * chunk.stddev, chunk.has_derivative),
         secants=jax.tree.map(lambda sums: sums.sum(axis=0), secants),
         linear_variance=(real_counts * terms.linear_variance).sum(),
         beta=(groups.has_cost * terms.beta).sum(),
         num_costs=real_counts.sum(),
-        num_groups=as_real((num_costs >= 2).sum(), whole.costs),
+        num_groups=as_real((num_costs >= 2).sum(), chunk.costs),
+        num_felt=samples.num_felt(),
     )
     return summary, terms_by_noise, has_cost
 
 
-def stream_parts(
-    objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, plan: Plan, *, control_variate: bool
-) -> Parts:
-    """Roll out a plan for both parts.
+def weigh(rule: Rule, parts: Parts, plan: Plan, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Weights:
+    """Apply a rule to each block, where it has derivatives to judge that say something.
 
-    Args:
-        objective: see `control_variate`.
-        params: the point.
-        key: consumed here.
-        plan: what is asked for.
-        control_variate: whether the unbiased part uses derivatives.
-
-    Returns:
-        The merged summary.
+    `blocks` has the number of the block of each coordinate; the weights have an axis of blocks.
     """
-
-    def one_chunk(units: Array) -> tuple[Parts]:
-        samples = sample_by_noise(objective, params, key, units, plan)
-        return (parts_and_terms(samples, control_variate=control_variate, take=samples.pull_back)[0],)
-
-    return accumulate(plan, one_chunk)[0]
-
-
-def assemble_mixture(parts: Parts, plan: Plan, weights: Float[Array, " dim"], **facts: Any) -> GradientEstimate:
-    """Turn both parts into one estimate.
-
-    Args:
-        parts: the summary.
-        plan: what was asked for.
-        weights: of the first-order part, by coordinate.
-        **facts: what to say about α; see `assemble`.
-
-    Returns:
-        The estimate.
-    """
-    value, squared_error = parts.mixture(weights)
-    return assemble(
-        value,
-        squared_error,
-        parts.costs,
-        plan,
-        count=parts.unbiased.count,
-        **facts,
-    )
-
-
-def weigh(rule: Rule, parts: Parts, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Weights:
-    """Apply a rule to each block, where it has derivatives to judge.
-
-    Args:
-        rule: for one block.
-        parts: the summary.
-        blocks: number of the block of each coordinate.
-        num_blocks: how many there are.
-
-    Returns:
-        The weights, with an axis of blocks.
-    """
+    is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
 
     def one_block(evidence: Evidence) -> Weights:
         weights, has_first = rule(evidence), evidence.count >= 2
-        alpha = jnp.where(has_first, weights.alpha, 0)
+        alpha = jnp.where(has_first & ~is_nothing, weights.alpha, 0)
         reason = Reason.where(has_first, weights.reason, Reason.not_finite)
         return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))
 
     return jax.vmap(one_block)(parts.evidence(blocks, num_blocks))
 
 
-def _checked_blocks(blocks: np.ndarray | None, dim: int) -> tuple[Int[np.ndarray, " dim"], int]:
-    """Give the block of each coordinate, and how many blocks there are."""
-    if blocks is None:
-        return np.zeros(dim, int), 1
-    if isinstance(blocks, jax.core.Tracer):
-        raise ValueError("blocks must be known when compiling, got a traced array; fix it by functools.partial")
-    blocks = np.asarray(blocks)
-    if blocks.shape != (dim,):
-        raise ValueError(f"blocks must have one number for each of the {dim} coordinates, got shape {blocks.shape}")
-    num_blocks = int(blocks.max()) + 1
-    if not np.issubdtype(blocks.dtype, np.integer) or set(np.unique(blocks)) != set(range(num_blocks)):
-        raise ValueError("blocks must be integers from 0 without gaps; np.arange(dim) is one block for each coordinate")
-    return blocks, num_blocks
+def _assembled(
+    parts: Parts, plan: Plan, restore: Callable, weights: Float[Array, " dim"], **facts: Any
+) -> GradientEstimate:
+    """Turn both parts into one estimate; the facts are what `assemble` says about α."""
+    value, squared_error = parts.mixture(weights)
+    count, num_felt = parts.unbiased.count, parts.num_felt
+    return assemble(value, squared_error, parts.costs, plan, count=count, num_felt=num_felt, restore=restore, **facts)

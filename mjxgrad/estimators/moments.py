@@ -1,8 +1,7 @@
 r"""Moments of samples that arrive in chunks, merged without cancellation.
 
-Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept
-about the mean of what was seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose
-their variance in float32.
+Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept about the mean of what was
+seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
 
 References:
     Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample
@@ -29,14 +28,8 @@ class Summary(eqx.Module):
 class Moments(Summary):
     """Count, mean, and sum of squared deviations.
 
-    The mean is kept as a sample and an offset from it: rounded to one number in float32, that of costs of 1e6 would be
-    off by 0.03, which a small spread notices.
-
-    Attributes:
-        count: number of samples.
-        origin: one of the samples.
-        offset: of the mean from the origin.
-        squares: sum of squared deviations from the mean.
+    The mean is kept as a sample, the origin, and an offset from it: rounded to one number in float32, that of costs of 1e6
+    would be off by 0.03, which a small spread notices.
     """
 
     count: Int[Array, ""]
@@ -63,7 +56,6 @@ class Moments(Summary):
         return (self.origin - centre) + self.offset
 
     def merge(self, other: "Moments") -> "Moments":
-        """Give the summary of both sets of samples."""
         count = self.count + other.count
         origin = jnp.where(self.count > 0, self.origin, other.origin)
         theirs = other.above(origin)
@@ -83,27 +75,21 @@ class Moments(Summary):
 
 
 class Total(Summary):
-    """A sum over all samples.
-
-    Attributes:
-        value: the sum; any pytree of arrays.
-    """
+    """A sum over all samples: any pytree of arrays."""
 
     value: PyTree
 
     def merge(self, other: "Total") -> "Total":
-        """Give the summary of both sets of samples."""
         return Total(jax.tree.map(jnp.add, self.value, other.value))
 
 
 class ScoreMoments(Summary):
     r"""Joint moments of costs and scores from which the baseline can be chosen at the end.
 
-    A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a
-    centre $c$, its features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and
-    $\bar s$, where bars are means within the unit. Moving the centre acts on them linearly,
-    $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so their sums and sums of products
-    about any centre follow from those about another: about the mean they merge without
+    A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a centre $c$, its
+    features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and $\bar s$, where bars are means
+    within the unit. Moving the centre acts on them linearly, $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so
+    their sums and sums of products about any centre follow from those about another: about the mean they merge without
     cancellation, about zero or about the noise-free cost they give the other baselines.
 
     Attributes:
@@ -140,7 +126,6 @@ class ScoreMoments(Summary):
         return self._moved(self.costs.above(centre))
 
     def merge(self, other: "ScoreMoments") -> "ScoreMoments":
-        """Give the summary of both sets of samples."""
         costs = self.costs.merge(other.costs)
         mine = self._moved(self.costs.above(costs.origin) - costs.offset)
         theirs = other._moved(other.costs.above(costs.origin) - costs.offset)

@@ -4,19 +4,19 @@ from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, as_real
 from mjxgrad.estimators.samples import Plan
-from mjxgrad.objective import ActionNoise, Objective
+from mjxgrad.objective import ActionNoise, Objective, as_vector
 
 ReinforceBaseline = Literal["leave_one_out", "none"]
 
 
 def reinforce(
     objective: Objective,
-    params: Float[Array, " dim"],
+    params: PyTree,
     key: PRNGKeyArray,
     *,
     num_samples: int,
@@ -39,7 +39,7 @@ def reinforce(
 
     Args:
         objective: from `open_loop` or `closed_loop`, on a task that gives `step_costs`.
-        params: the point $\theta$.
+        params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here.
         num_samples: rollouts to spend. At least 2.
         baseline: "leave_one_out" or "none".
@@ -58,12 +58,12 @@ def reinforce(
         learning with function approximation. NIPS 1999, theorem 1 (cost to go). Kool, van Hoof, Welling. Buy 4
         REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
-    params = jnp.asarray(params)
-    objective = _checked(objective.sized_for(params), baseline)
+    objective, vector, restore = as_vector(objective, params)
+    objective = _checked(objective, baseline)
     plan = Plan(num_samples, with_score=True)
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_samples))
     noises = jax.vmap(objective.sample_noise)(keys)
-    outcomes = jax.vmap(lambda noise: objective.outcome(params, noise))(noises)
+    outcomes = jax.vmap(lambda noise: objective.outcome(vector, noise))(noises)
     if outcomes.step_costs is None:
         raise ValueError(
             f"reinforce must be given a task with step_costs, got {type(objective.task).__name__}, which knows only "
@@ -78,8 +78,8 @@ def reinforce(
         mean = jnp.where(is_used[:, None], to_go, 0).sum(axis=0) / jnp.maximum(count, 1)
         to_go = (to_go - mean) * (as_real(count, to_go) / as_real(jnp.maximum(count - 1, 1), to_go))
     weighted = actions / objective.stddev**2 * to_go[:, :, None]
-    samples = jax.vmap(lambda states, weights: objective.pull_back_at(params, states)(jnp.ravel(weights)))(
-        outcomes.states, jnp.where(is_used[:, None, None], weighted, 0).astype(params.dtype)
+    samples = jax.vmap(lambda states, weights: objective.pull_back_at(vector, states)(jnp.ravel(weights)))(
+        outcomes.states, jnp.where(is_used[:, None, None], weighted, 0).astype(vector.dtype)
     )
     is_used &= jnp.isfinite(samples).all(axis=1)
     gradients = Moments.of(samples, is_used)
@@ -89,6 +89,9 @@ def reinforce(
         Moments.of(outcomes.cost, is_used),
         plan,
         count=gradients.count,
+        # Noise that is zero has no score, so what is used was moved by it.
+        num_felt=(~is_used).sum(),
+        restore=restore,
     )
 
 

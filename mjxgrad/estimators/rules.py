@@ -1,8 +1,7 @@
 r"""How to weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
-A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in
-`alpha_order(..., rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to
-*fail* everywhere.
+A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in `alpha_order(...,
+rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to *fail* everywhere.
 """
 
 from collections.abc import Callable
@@ -91,7 +90,6 @@ class FixedAlpha(eqx.Module):
     alpha: ArrayLike
 
     def __call__(self, evidence: Evidence) -> Weights:
-        """Apply the rule."""
         alpha = jnp.asarray(self.alpha, evidence.first_norm.dtype)
         return Weights(alpha, Reason.fixed, jnp.where(alpha > 0, jnp.nan, 0))
 
@@ -100,7 +98,6 @@ class InverseVariance(eqx.Module):
     r"""$\alpha = V^0/(V^0 + V^1)$, which has the least variance if both parts are independent, and no eye for bias."""
 
     def __call__(self, evidence: Evidence) -> Weights:
-        """Apply the rule."""
         alpha = evidence.least_variance()
         return Weights(alpha, Reason.inverse_variance, jnp.where(alpha > 0, jnp.nan, 0))
 
@@ -113,14 +110,12 @@ class BiasConstrained(eqx.Module):
     \varepsilon$; else $\alpha = (\gamma - \varepsilon)/B$.
 
     Attributes:
-        gamma: the bias that is allowed: a norm, or with `is_relative` a share of the gradient's norm (that of the
-            unbiased part, with what its noise adds to it taken off).
+        gamma: the bias that is allowed, a norm.
         bound: $L$, a bound on the norm of one zeroth-order term, for Bernstein's inequality as in the paper. None takes
             an empirical bound that needs none: Student's quantile times the standard error of the whole vector. For a
             mean near a normal distribution that is on the safe side whatever the covariance is, since among Gaussian
             quadratic forms of equal mean the one of a single coordinate has the heaviest tail.
         failure_probability: $\delta$, at most 0.2 for the empirical bound.
-        is_relative: whether `gamma` is a share.
 
     References:
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
@@ -131,19 +126,14 @@ class BiasConstrained(eqx.Module):
     gamma: ArrayLike
     bound: ArrayLike | None = None
     failure_probability: float = eqx.field(static=True, default=0.05)
-    is_relative: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         _check_failure_probability(self.failure_probability, 1.0 if self.bound is not None else _MOST_FAILURES)
 
     def __call__(self, evidence: Evidence) -> Weights:
-        """Apply the rule."""
         error = self.zeroth_error(evidence)
-        gamma = jnp.asarray(self.gamma, error.dtype)
-        if self.is_relative:
-            noise = evidence.zeroth_variance / evidence.real_count
-            gamma = gamma * jnp.sqrt(jnp.maximum(evidence.zeroth_norm**2 - noise, 0))
-        room, best, found = gamma - error, evidence.least_variance(), evidence.difference_norm
+        room = jnp.asarray(self.gamma, error.dtype) - error
+        best, found = evidence.least_variance(), evidence.difference_norm
         allowed = jnp.maximum(room, 0) / jnp.where(found > 0, found, 1)
         is_free = best * found <= room
         alpha = jnp.where(room < 0, 0, jnp.where(is_free, best, allowed))
@@ -180,7 +170,6 @@ class Concavity(eqx.Module):
     tolerance: float = 0.0
 
     def __call__(self, evidence: Evidence) -> Weights:
-        """Apply the rule."""
         needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
         is_smooth = evidence.scaled_first_variance + self.tolerance >= needed
         alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
@@ -217,7 +206,6 @@ class Consistent(eqx.Module):
         _check_failure_probability(self.failure_probability, _MOST_FAILURES)
 
     def __call__(self, evidence: Evidence) -> Weights:
-        """Apply the rule."""
         error = confidence_radius(evidence.difference_variance, evidence.count, self.failure_probability)
         excess = jnp.maximum(evidence.difference_norm**2 - error**2, 0)
         rest = evidence.first_variance + evidence.real_count * excess
@@ -238,15 +226,9 @@ _LONGEST_TABLE = 1000
 def confidence_radius(
     variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
 ) -> Float[Array, ""]:
-    """Give what the norm of a mean's error exceeds with at most some chance; see `BiasConstrained.bound`.
+    """Give what the norm of a mean's error exceeds with at most some chance, up to 0.2; see `BiasConstrained.bound`.
 
-    Args:
-        variance: trace of the covariance of one sample.
-        count: samples, at least 2; fewer give infinity.
-        failure_probability: at most 0.2.
-
-    Returns:
-        The radius, in the units of the mean.
+    The variance is the trace of the covariance of one sample; fewer than two samples give infinity.
     """
     # JAX has no quantile of Student's t; a table on the host has, and beyond it is constant to three digits.
     freedom = np.arange(1, _LONGEST_TABLE)

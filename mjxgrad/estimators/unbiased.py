@@ -20,12 +20,9 @@ from mjxgrad.estimators.samples import Group
 
 
 class UnbiasedTerms(eqx.Module):
-    r"""One term per sample, whose mean is the estimate.
+    r"""One term per sample, before the pull-back, whose mean is the estimate; the share $\beta$ of each.
 
-    Attributes:
-        by_noise: before the pull-back.
-        beta: share of the linear part that was taken off; zero is zeroth order.
-        linear_variance: variance of the linear part $a\cdot w$ over the samples.
+    The variance is that of the linear part $a\cdot w$ over the samples.
     """
 
     by_noise: Float[Array, "samples m"]
@@ -39,15 +36,9 @@ def gram(samples: Group) -> Float[Array, "samples samples"]:
 
 
 def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, with_derivatives: bool) -> UnbiasedTerms:
-    """Give the terms of a group.
+    """Give the terms of a group, without derivatives those of the zeroth-order estimate.
 
-    Args:
-        samples: of the group.
-        slopes: their `gram`.
-        with_derivatives: whether they are used; without, the terms are those of the zeroth-order estimate.
-
-    Returns:
-        The terms; those of samples without a cost are zero or meaningless, and masked by their pull-back.
+    Those of samples without a cost are zero or meaningless, and masked by their pull-back.
     """
     costs, has_cost = samples.costs, samples.has_cost.astype(samples.costs.dtype)
     has_slope = samples.has_derivative.astype(costs.dtype)

@@ -2,8 +2,7 @@
 
 from mjxgrad.objective.actions import ActionNoise, ClosedLoop, OpenLoop, closed_loop, open_loop
 from mjxgrad.objective.base import Differentiated, Objective
-from mjxgrad.objective.derivative import value_and_gradient
-from mjxgrad.objective.parameters import ParameterNoise, parameter_noise
+from mjxgrad.objective.parameters import ParameterNoise, as_vector, flattened, of_vector, parameter_noise
 
 __all__ = [
     "ActionNoise",
@@ -12,8 +11,10 @@ __all__ = [
     "Objective",
     "OpenLoop",
     "ParameterNoise",
+    "as_vector",
     "closed_loop",
+    "flattened",
+    "of_vector",
     "open_loop",
     "parameter_noise",
-    "value_and_gradient",
 ]

@@ -12,9 +12,15 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.objective.base import Differentiated, Objective, as_scalar, unchanged
-from mjxgrad.objective.derivative import value_and_gradient
-from mjxgrad.objective.gaussian import gaussian, positive
+from mjxgrad.objective.base import (
+    Differentiated,
+    Objective,
+    as_scalar,
+    gaussian,
+    positive,
+    unchanged,
+    value_and_gradient,
+)
 from mjxgrad.task import Outcome, Task, as_pytree
 
 
@@ -38,7 +44,6 @@ class ActionNoise(Objective):
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Give (horizon, nu)."""
         return (self.task.horizon, self.task.num_controls)
 
     def sample_noise(self, key: PRNGKeyArray) -> PyTree:
@@ -49,32 +54,25 @@ class ActionNoise(Objective):
         return gaussian(action_key, self.stddev, self.noise_shape), self.task.sample_start(start_key)
 
     def mirror(self, noise: PyTree) -> PyTree:
-        """Mirror the action noise and keep the start: both rollouts of a pair begin at the same place."""
+        # The start stays: both rollouts of a pair begin at the same place.
         actions, start = self.split(noise)
         return -actions if start is None else (-actions, start)
 
     def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
-        """Draw other action noise and keep the start."""
         _, start = self.split(noise)
         actions = gaussian(key, self.stddev, self.noise_shape)
         return actions if start is None else (actions, start)
 
     def silence(self, noise: PyTree) -> PyTree:
-        """Give no action noise, and keep the start."""
         actions, start = self.split(noise)
         return jnp.zeros_like(actions) if start is None else (jnp.zeros_like(actions), start)
 
     @property
     def has_circumstances(self) -> bool:
-        """Say whether starts are random."""
         return self._start_shape() is not None
 
     def zero_noise(self) -> PyTree:
-        """Give no action noise, and the nominal start.
-
-        Raises:
-            ValueError: if the task's nominal start is not built as its random ones.
-        """
+        """Give no action noise, and the nominal start; it must be built as the random ones."""
         actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
         if drawn is None:
             return actions
@@ -91,11 +89,9 @@ class ActionNoise(Objective):
         return noise if isinstance(noise, tuple) else (noise, None)
 
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
-        """Give the cost under the noisy actions."""
         return self.outcome(params, noise).cost
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ActionNoise":
-        """Give the same objective with other noise on the actions; see `Objective.with_stddev`."""
         return dataclasses.replace(self, stddev=_action_stddev(self.task, stddev))
 
     def _start_shape(self) -> PyTree:
@@ -108,9 +104,8 @@ class ActionNoise(Objective):
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
         """Differentiate by the action noise through the whole loop, in one reverse pass.
 
-        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on
-        the cost through the actions alone, so pulling it back at the visited states gives the whole gradient by the
-        parameters.
+        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on the
+        cost through the actions alone, so pulling it back at the visited states gives the whole gradient by them.
         """
         actions, start = self.split(noise)
 
@@ -119,7 +114,8 @@ class ActionNoise(Objective):
             outcome = self.outcome(params, shaped if start is None else (shaped, start))
             return outcome.cost, outcome.states
 
-        cost, states, gradient = value_and_gradient(cost_and_states, jnp.ravel(actions).astype(params.dtype))
+        flat = jnp.ravel(actions).astype(params.dtype)
+        (cost, states), gradient = value_and_gradient(cost_and_states, flat, has_aux=True)
         stddev = jnp.ravel(jnp.broadcast_to(self.stddev, self.noise_shape)).astype(params.dtype)
         score, pull_back = self._noise_score(params, noise), self.pull_back_at(params, states)
         return Differentiated(cost, gradient, score, stddev, pull_back)
@@ -141,17 +137,14 @@ class OpenLoop(ActionNoise):
         return params.reshape(self.noise_shape)
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out the noisy controls."""
         actions, start = self.split(noise)
         return _checked(self.task.run(self.unravel(params), noise=actions.astype(params.dtype), start=start))
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
-        """Give w/σ², flattened."""
         return self._noise_score(params, noise)
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        """Give the identity: the parameters are the controls."""
-        return Partial(unchanged)
+        return Partial(unchanged)  # the parameters are the controls
 
 
 class ClosedLoop(ActionNoise):
@@ -168,7 +161,6 @@ class ClosedLoop(ActionNoise):
         return ravel_pytree(policy_params)[0]
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out the noisy policy."""
         actions, start = self.split(noise)
         return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
 
@@ -179,12 +171,10 @@ class ClosedLoop(ActionNoise):
     def value_and_score(
         self, params: Float[Array, " dim"], noise: PyTree
     ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
-        """Give both from one rollout."""
         outcome = self.outcome(params, noise)
         return outcome.cost, self.pull_back_at(params, outcome.states)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        """Give the transpose of the derivative of the policy's actions by its parameters, at given states."""
         # Given the state, the action is Gaussian about the policy; the chance of the next state
         # given state and action does not depend on the parameters. So the states are data here.
         states = jax.lax.stop_gradient(states)
@@ -200,15 +190,13 @@ def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
 
     Args:
         task: what is controlled, and what it costs.
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
-            (horizon, nu).
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
 
     Returns:
         The objective, with `dim` = horizon * nu.
 
     Raises:
-        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
-            controls.
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
     """
     stddev = _action_stddev(task, stddev)
     return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
@@ -230,18 +218,15 @@ def closed_loop(
     Args:
         task: what is controlled, and what it costs.
         policy: takes its parameters and a state, gives controls of shape (nu,).
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to
-            (horizon, nu).
+        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
         params: an example of the policy's parameters; only its structure and shapes count.
             Without it the policy is handed the flat vector itself.
 
     Returns:
-        The objective; `objective.ravel` and `objective.unravel` go between the policy's
-        parameters and the flat vector.
+        The objective; `objective.ravel` and `objective.unravel` go between the policy's parameters and the flat vector.
 
     Raises:
-        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no
-            controls.
+        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
 
     References:
         Williams. Simple statistical gradient-following algorithms for connectionist

@@ -1,63 +1,67 @@
-"""Any function of a vector, with noise on the vector."""
+"""Any function of parameters, with noise on them; and parameters that are a pytree, as the vector that estimators see."""
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.objective.base import Differentiated, Objective, as_scalar, unchanged
-from mjxgrad.objective.derivative import value_and_gradient
-from mjxgrad.objective.gaussian import gaussian, positive
+from mjxgrad.objective.base import (
+    Differentiated,
+    Objective,
+    as_scalar,
+    gaussian,
+    positive,
+    unchanged,
+    value_and_gradient,
+)
 from mjxgrad.task import as_pytree
 
 
 class ParameterNoise(Objective):
     r"""$f(\theta + w)$ with $w \sim N(0, \mathrm{stddev}^2)$ on the parameters; see `parameter_noise`."""
 
-    function: Callable[[Float[Array, " dim"]], Float[Array, ""]]
+    function: Callable[[Any], Float[Array, ""]]
     stddev: Float[Array, " *dim"]
     dim: int | None = eqx.field(static=True)
 
     def sample_noise(self, key: PRNGKeyArray) -> Float[Array, " dim"]:
-        """Draw noise for the parameters."""
         if self.dim is None:
             raise ValueError("dim is not known: pass dim=... to parameter_noise")
         return gaussian(key, self.stddev, (self.dim,))
 
     def value(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, ""]:
-        """Evaluate the function at the noisy parameters."""
         return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
 
     def score(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """Give w/σ²."""
         return (noise / self.stddev**2).astype(params.dtype)
 
     def differentiate(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Differentiated:
-        """Differentiate by the parameters, which is by the noise: the pull-back is the identity."""
-        cost, _, gradient = value_and_gradient(lambda at: (self.value(at, noise), None), params)
+        cost, gradient = value_and_gradient(self.function, params + noise.astype(params.dtype))
         stddev = jnp.broadcast_to(self.stddev, params.shape).astype(params.dtype)
         return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ParameterNoise":
-        """Give the same function under other noise; see `Objective.with_stddev`."""
         stddev, dim = _fitting(stddev, self.dim)
         return dataclasses.replace(self, stddev=stddev, dim=dim)
 
 
 def parameter_noise(
-    function: Callable[[Float[Array, " dim"]], Float[Array, ""]],
+    function: Callable[[Any], Float[Array, ""]],
     stddev: float | Float[Array, ""] | Float[Array, " dim"],
     dim: int | None = None,
 ) -> ParameterNoise:
-    r"""Smooth any function of a vector by Gaussian noise on the vector.
+    r"""Smooth any function of parameters by Gaussian noise on them.
 
     $F(\theta) = \mathbb{E}[f(\theta + w)]$, $w \sim N(0, \sigma^2 I)$, with score $w/\sigma^2$.
 
     Args:
-        function: takes a vector, gives a scalar; traceable by JAX.
+        function: takes a vector, or the pytree that the parameters are, and gives a scalar; traceable by JAX.
         stddev: $\sigma > 0$, in the parameters' units; one number, or one per parameter.
         dim: number of parameters. Needed only to draw noise by hand: an estimator takes it from
             the parameters it is given.
@@ -70,6 +74,61 @@ def parameter_noise(
     """
     stddev, dim = _fitting(stddev, dim)
     return ParameterNoise(function=as_pytree(function), stddev=stddev, dim=dim)
+
+
+class Restored(eqx.Module):
+    """A function of a pytree of parameters, as a function of the vector of them."""
+
+    function: Callable[[PyTree], Any]
+    restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
+
+    def __call__(self, vector: Float[Array, " dim"]) -> Any:
+        return self.function(self.restore(vector))
+
+
+def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
+    """Return the floating-point arrays of a pytree as a vector, and the way back; an array as it is, with None.
+
+    The way back also takes one vector per seed.
+    """
+    if eqx.is_array_like(params):
+        return jnp.asarray(params), None
+    arrays, others = eqx.partition(params, eqx.is_inexact_array_like)
+    vector, unravel = ravel_pytree(arrays)
+    if vector.size == 0:
+        raise ValueError(f"params must have floating-point arrays, got none in {params}; write 1.0 in place of 1")
+
+    def restore(vector: Float[Array, "..."]) -> PyTree:
+        return eqx.combine(jax.vmap(unravel)(vector) if vector.ndim == 2 else unravel(vector), others)
+
+    return vector, restore
+
+
+def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] | None) -> Any:
+    """Return an objective, or a function from a scale to one, that takes parameters as `flattened` does.
+
+    Noise on actions leaves it as it is: it takes a vector in any case, and its policy has its own way back.
+    """
+    if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
+        return objective
+    if isinstance(objective, ParameterNoise):
+        return dataclasses.replace(objective, function=Restored(objective.function, restore))
+    return lambda scale: of_vector(objective(scale), restore)
+
+
+def as_vector(
+    objective: Objective, params: PyTree
+) -> tuple[Objective, Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
+    """Return what an estimator works on: an objective of a vector, sized for it, and the vector.
+
+    The third is the way from a gradient to the form of the parameters, with None in place of what is no floating-point
+    array.
+    """
+    vector, restore = flattened(params)
+    objective = of_vector(objective, restore).sized_for(vector)
+    if restore is None:
+        return objective, vector, unchanged
+    return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)
 
 
 def _fitting(stddev: float | Float[Array, "..."], dim: int | None) -> tuple[Float[Array, "*dim"], int | None]:

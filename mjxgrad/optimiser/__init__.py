@@ -1,7 +1,7 @@
 """The loop around an estimator: optimisers, budgets, annealing, runs that can be resumed."""
 
 from mjxgrad.optimiser.annealing import Plateau
-from mjxgrad.optimiser.result import History, Optimisation, Progress, Record, Stopped
+from mjxgrad.optimiser.result import History, Optimisation, Record, Stopped
 from mjxgrad.optimiser.run import RunOptions, optimise, run
 from mjxgrad.optimiser.step import EstimatedGradientState, Method, TrustRegion, estimated_gradient
 from mjxgrad.optimiser.stopping import Convergence
@@ -13,7 +13,6 @@ __all__ = [
     "Method",
     "Optimisation",
     "Plateau",
-    "Progress",
     "Record",
     "RunOptions",
     "Stopped",

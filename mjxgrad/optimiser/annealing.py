@@ -32,28 +32,19 @@ class Schedule(Annealing):
     function: Callable[[ArrayLike], ArrayLike]
 
     def init(self, dtype: jnp.dtype) -> Float[Array, ""]:
-        """Keep nothing but the type of the numbers."""
         return jnp.zeros((), dtype)
 
     def scale(self, state: Float[Array, ""], step: Int[Array, ""]) -> Float[Array, ""]:
-        """Ask the schedule."""
         return jnp.asarray(self.function(step), state.dtype)
 
     def update(self, state: Float[Array, ""], cost: Float[Array, ""], cost_error: Float[Array, ""]) -> Array:
-        """Do nothing."""
         return state
 
 
 class PlateauState(eqx.Module):
-    """What `Plateau` keeps.
+    """What `Plateau` keeps: the scale; of the present block the steps, their costs and squared standard errors summed up.
 
-    Attributes:
-        scale: the present one.
-        count: steps in the present block.
-        total: sum of their costs.
-        total_square: sum of their squared standard errors.
-        previous: mean cost of the block before; infinite if that had another scale.
-        previous_square: its squared standard error.
+    `previous` is the mean cost of the block before, infinite if that had another scale, and the last its squared error.
     """
 
     scale: Float[Array, ""]
@@ -89,11 +80,6 @@ class Plateau(Annealing):
     minimum: float = eqx.field(static=True, default=0.01)
 
     def __check_init__(self):
-        """Refuse settings without meaning.
-
-        Raises:
-            ValueError: if one is out of its range.
-        """
         if not 0 < self.factor < 1:
             raise ValueError(f"factor must be between 0 and 1, got {self.factor}")
         if self.patience < 1:
@@ -104,16 +90,13 @@ class Plateau(Annealing):
             raise ValueError(f"minimum must be above 0 and at most 1, got {self.minimum}")
 
     def init(self, dtype: jnp.dtype) -> PlateauState:
-        """Begin at 1."""
         zero = jnp.zeros((), dtype)
         return PlateauState(jnp.ones((), dtype), jnp.zeros((), jnp.int32), zero, zero, zero + jnp.inf, zero)
 
     def scale(self, state: PlateauState, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Give the present scale."""
         return state.scale
 
     def update(self, state: PlateauState, cost: Float[Array, ""], cost_error: Float[Array, ""]) -> PlateauState:
-        """Add a step to the block, and judge the block if it is full."""
         count = state.count + 1
         total, total_square = state.total + cost, state.total_square + cost_error**2
         mean, square = total / self.patience, total_square / self.patience**2
@@ -136,17 +119,7 @@ class Plateau(Annealing):
 
 
 def as_annealing(annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None) -> Annealing | None:
-    """Wrap a schedule.
-
-    Args:
-        annealing: as given to `optimise`.
-
-    Returns:
-        One of the kinds of `Annealing`, or None.
-
-    Raises:
-        ValueError: if it is neither an annealing nor callable.
-    """
+    """Wrap a schedule, refusing what is neither an annealing nor callable."""
     if annealing is None or isinstance(annealing, Annealing):
         return annealing
     if not callable(annealing):

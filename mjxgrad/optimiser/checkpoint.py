@@ -14,17 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-FORMAT = 1
+FORMAT = 2
 
 
 def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
-    """Write a pytree of arrays so that an interruption leaves the former file as it was.
-
-    Args:
-        path: of the file; its folder must exist.
-        tree: what to keep.
-        fingerprint: what a reader must agree with.
-    """
+    """Write a pytree of arrays so that an interruption leaves the former file as it was."""
     buffer = io.BytesIO()
     leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
     header = json.dumps({"format": FORMAT, **fingerprint}).encode()
@@ -43,15 +37,7 @@ def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
 
 
 def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
-    """Read what `save` wrote.
-
-    Args:
-        path: of the file.
-        like: a pytree of the same structure; only the types of its leaves count, not their shapes.
-        fingerprint: must be the one that was saved.
-
-    Returns:
-        The pytree.
+    """Read what `save` wrote, of the structure and types of `like`, whatever its shapes.
 
     Raises:
         ValueError: if the file is damaged, or its fingerprint is another; the message says in what.

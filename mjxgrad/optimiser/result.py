@@ -19,29 +19,16 @@ class Stopped(eqx.Enumeration):
     finished = "all steps were done"
     converged = "the gradient or the cost met its tolerance"
     not_finite = "too many estimates in a row were not finite"
+    nothing_felt = (
+        "in several steps in a row all samples cost the same and no derivative differed from zero: nothing that the "
+        "parameters change reaches the cost"
+    )
     max_rollouts = "another step would have exceeded the budget of rollouts"
     max_seconds = "the budget of seconds was spent"
-    interrupted = "the callback asked for it"
 
 
 class Record(eqx.Module):
-    """What one step of one run did; NaN where a method has no such thing.
-
-    Attributes:
-        cost: mean cost under noise at the parameters before the step.
-        cost_error: its standard error.
-        gradient_norm: norm of the estimate.
-        gradient_error: norm of its standard error.
-        alpha: weight of the first-order part, the mean over blocks.
-        reason: why, for the block with the least weight.
-        bias_bound: on the norm of the bias of the estimate.
-        scale: of the annealing; 1 without any.
-        step_norm: norm of the change of the parameters.
-        finite_fraction: share of the samples that were finite.
-        num_rollouts: spent.
-        num_gradient_rollouts: of those, the ones differentiated.
-        is_taken: False if the estimate was not finite, so that nothing was changed.
-    """
+    """What one step of one run did, with the fields of `History`; NaN where a method has no such thing."""
 
     cost: Float[Array, ""]
     cost_error: Float[Array, ""]
@@ -59,7 +46,7 @@ class Record(eqx.Module):
 
     @classmethod
     def blank(cls, dtype: jnp.dtype) -> "Record":
-        """Give the record of a step that did not happen."""
+        """Return the record of a step that did not happen."""
         nan, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), jnp.int32)
         # A reason that is an array, as those of steps are.
         reason = jax.tree.map(jnp.asarray, Reason.fixed)
@@ -69,7 +56,7 @@ class Record(eqx.Module):
     def of_estimate(
         cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
     ) -> "Record":
-        """Summarise a step along an estimated gradient."""
+        """Summarise a step along an estimate; of blocks the mean α, and the reason of the least."""
         dtype = estimate.value.dtype
         alpha = jnp.ravel(estimate.alpha)
         reason = jax.tree.map(
@@ -93,14 +80,7 @@ class Record(eqx.Module):
 
 
 class Best(eqx.Module):
-    """The best parameters seen, and by what.
-
-    Attributes:
-        params: of the lowest cost.
-        cost: that cost, NaN before there is one.
-        scale: of the annealing that it was measured under.
-        finite_fraction: of the rollouts that it is the mean of.
-    """
+    """The parameters of the lowest cost, NaN before there is one, and how that was measured."""
 
     params: Float[Array, " dim"]
     cost: Float[Array, ""]
@@ -173,16 +153,7 @@ class History(eqx.Module):
     def of(
         cls, records: Record, noise_free_cost: Float[np.ndarray, "..."], seconds: Float[np.ndarray, " steps"]
     ) -> "History":
-        """Put records of steps together.
-
-        Args:
-            records: stacked, as arrays on the host.
-            noise_free_cost: stacked likewise.
-            seconds: that each step took.
-
-        Returns:
-            The history, its counts and seconds summed up.
-        """
+        """Put stacked records of steps together, counts and seconds summed up."""
         fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
         for name in ("num_rollouts", "num_gradient_rollouts"):
             # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
@@ -227,26 +198,3 @@ class Optimisation(eqx.Module):
     num_gradient_rollouts: Int[np.ndarray, "..."]
     seconds: float
     compile_seconds: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """What a callback is told after every segment; with many seeds its arrays have them on their first axis.
-
-    Attributes:
-        step: steps done by the run that has done the most.
-        num_steps: asked for.
-        params: now, in the form of the start.
-        best_cost: so far; see `Optimisation`.
-        history: so far.
-        seconds: so far, without compilation.
-        num_running: runs that have not stopped.
-    """
-
-    step: int
-    num_steps: int
-    params: PyTree
-    best_cost: Float[Array, "..."]
-    history: History
-    seconds: float
-    num_running: int

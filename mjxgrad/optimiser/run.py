@@ -1,10 +1,10 @@
-"""The loop that every method runs in: segments of steps on the device; budgets, callbacks and checkpoints between them."""
+"""The loop that every method runs in: segments of steps on the device; budgets, logs and checkpoints between them."""
 
 import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,24 +16,21 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad.objective import Objective
+from mjxgrad.estimators import Reason
+from mjxgrad.objective import Objective, flattened, of_vector
+from mjxgrad.objective.parameters import Restored
 from mjxgrad.optimiser import checkpoint
 from mjxgrad.optimiser.annealing import Annealing
-from mjxgrad.optimiser.result import Best, History, Optimisation, Progress, Record, Stopped
-from mjxgrad.optimiser.step import (
-    AnnealedObjective,
-    Estimator,
-    GradientStep,
-    Method,
-    Restored,
-    TrustRegion,
-    flattened,
-    of_vector,
-)
+from mjxgrad.optimiser.result import Best, History, Optimisation, Record, Stopped
+from mjxgrad.optimiser.step import AnnealedObjective, Estimator, GradientStep, Method, TrustRegion
 from mjxgrad.optimiser.stopping import Convergence, Recent, has_converged
 
 # Progress shows in steps of five per cent; each costs one return from the device.
 DEFAULT_NUM_SEGMENTS = 20
+
+# Where nothing was felt and nothing moved, the next step differs by its noise alone. Three draws of it: a jump that one
+# sample in thirty meets goes unseen by three steps of 50 with a chance of 0.6 %.
+STILL_STEPS = 3
 
 
 class RunOptions(eqx.Module):
@@ -44,14 +41,16 @@ class RunOptions(eqx.Module):
         evaluate: cost of a point without noise, or any other measure of it; traceable. It is measurement: the rollouts
             in it are not counted, and nothing but the choice of the best parameters depends on it.
         evaluate_every: steps between two evaluations. The last point is always evaluated.
-        patience: steps in a row whose estimate is not finite before the run gives up.
+        patience: steps in a row whose estimate is not finite, or whose samples feel nothing (`Reason.nothing_felt`), before
+            the run gives up; if such steps do not move the parameters either, three in a row are enough.
         convergence: when to stop early.
         max_rollouts: budget, per run. A step begins if one as dear as the last fits in, so it is kept by methods whose
             steps cost the same, from the second step on: the first is always done.
         max_seconds: budget of wall-clock time for all seeds together, without compilation; looked at after every
             segment.
         segment: steps in one program; a twentieth of all if not given.
-        callback: called after every segment; True stops.
+        log: called after every segment with the steps done and what `History` has of the last one, the mean over the
+            seeds that took it, and `best_cost`: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
         checkpoint: file to save the run in after segments and to resume it from. A resumed run gives, on the same
             device, bit for bit what the uninterrupted one would have given, its seconds apart.
         checkpoint_every: segments between two saves. An interrupted run is saved in any case.
@@ -65,16 +64,11 @@ class RunOptions(eqx.Module):
     max_rollouts: int | None = None
     max_seconds: float | None = None
     segment: int | None = None
-    callback: Callable[[Progress], bool | None] | None = None
+    log: Callable[[int, Mapping[str, float]], None] | None = None
     checkpoint: str | Path | None = None
     checkpoint_every: int = 1
 
     def __check_init__(self):
-        """Refuse settings without meaning.
-
-        Raises:
-            ValueError: if a number is out of range, or the folder of the checkpoint does not exist.
-        """
         for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every", "segment", "max_rollouts"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -102,16 +96,8 @@ class RunOptions(eqx.Module):
 class Carry(eqx.Module):
     """One run between two steps.
 
-    Attributes:
-        params: the point.
-        state: of the method.
-        best: the best point so far.
-        recent: by which convergence is judged.
-        num_steps: steps done, those not taken included.
-        num_skipped: of those, the ones not taken.
-        num_in_a_row: of those, the last ones without one taken between.
-        num_rollouts: spent.
-        stopped: whether and why.
+    Of the steps done, `num_steps`, some were not taken, the last `num_in_a_row` of them in a row; the last `num_still` felt
+    nothing.
     """
 
     params: Float[Array, " dim"]
@@ -121,6 +107,7 @@ class Carry(eqx.Module):
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]
     num_in_a_row: Int[Array, ""]
+    num_still: Int[Array, ""]
     num_rollouts: Int[Array, ""]
     stopped: Stopped
 
@@ -135,6 +122,15 @@ class Saved(NamedTuple):
     def history(self) -> History:
         """Put the history together, as far as any run has come."""
         return History.of(*self.trace, self.seconds)[: int(np.max(self.carry.num_steps))]
+
+    def metrics(self) -> dict[str, float]:
+        """Give the last step, the mean over the seeds that took it; NaN where there is no such thing."""
+        history = self.history()
+        last = {f.name: getattr(history, f.name)[..., -1] for f in dataclasses.fields(History) if f.name != "reason"}
+        finite = {
+            name: x[np.isfinite(x)] for name, x in (last | {"best_cost": np.asarray(self.carry.best.cost)}).items()
+        }
+        return {name: float(x.mean()) if x.size else math.nan for name, x in finite.items()}
 
 
 def optimise(
@@ -163,7 +159,8 @@ def optimise(
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
     A step whose estimate is not finite is not taken: parameters and optimiser stay as they were, the step is counted in
-    `num_skipped`, and the next one draws other noise.
+    `num_skipped`, and the next one draws other noise. Where all samples cost the same and no derivative differs from zero,
+    such as where a policy touches nothing, the run stops after a few steps with `Stopped.nothing_felt`.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` sets the scale, either as a schedule or by itself where the cost no longer improves.
@@ -179,16 +176,15 @@ def optimise(
             annealing=mg.Plateau(factor=0.5, patience=10, minimum=0.01), ...
         )
 
-    With tqdm:
+    With a bar of tqdm:
 
-        with tqdm.tqdm(total=300) as bar:
-            mg.optimise(..., callback=lambda progress: bar.update(progress.step - bar.n) and None)
+        mg.optimise(..., log=lambda step, metrics: (bar.update(step - bar.n), bar.set_postfix(cost=metrics["cost"])))
 
     Args:
         objective: what to minimise, or with `annealing` a function from a scale to it.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
-            dict or an equinox module. The function of `parameter_noise`, `evaluate` and `callback` then take its form,
-            and the result has it. Estimators and trust regions see all its arrays as one vector.
+            dict or an equinox module. The function of `parameter_noise` and `evaluate` then take its form, and the
+            result has it. Estimators and trust regions see all its arrays as one vector.
         key: consumed here; with a leading axis, one per seed.
         estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
             `functools.partial`, or your own.
@@ -198,7 +194,7 @@ def optimise(
         trust_region: how far a step may go.
         clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
         **options: `evaluate`, `evaluate_every`, `patience`, `convergence`, `max_rollouts`, `max_seconds`, `segment`,
-            `callback`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
+            `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
 
     Returns:
         The last and the best parameters, the history, why it stopped and what was spent.
@@ -214,28 +210,12 @@ def optimise(
         return run(rule, vector, key, chosen)
     if chosen.evaluate is not None:
         chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
-    if (callback := chosen.callback) is not None:
-        seen = lambda progress: dataclasses.replace(progress, params=restore(progress.params))  # noqa: E731
-        chosen = dataclasses.replace(chosen, callback=lambda progress: callback(seen(progress)))
     result = run(rule, vector, key, chosen)
     return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
 
 
 def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], options: RunOptions) -> Optimisation:
-    """Run a method, from one start or from many at once.
-
-    Args:
-        method: takes the steps.
-        params: the start, a vector; or one per seed.
-        key: of the run; with a leading axis, one per seed, and all of them run in one program.
-        options: when to stop, and what to do on the way.
-
-    Returns:
-        The result; its leaves have a leading axis if `key` has one.
-
-    Raises:
-        ValueError: if the shapes of `params` and `key` do not fit, or the checkpoint is damaged or of another run.
-    """
+    """Run a method, from one start or from many at once, one per leading entry of `key`, all in one program."""
     params, key = _matched(params, key)
     arrays, static = eqx.partition((method, options), eqx.is_array)
 
@@ -278,42 +258,40 @@ def _loop(
     advance: Callable[[Saved], Saved], saved: Saved, options: RunOptions, fingerprint: dict[str, Any]
 ) -> tuple[Saved, Stopped]:
     """Run segments until every run has stopped, and say why each did."""
-    on_disk, reason = saved.seconds.size, None
+    on_disk, is_late = saved.seconds.size, False
     try:
-        while reason is None and np.any(saved.carry.stopped == Stopped.running):
-            if options.max_seconds is not None and saved.seconds.sum() >= options.max_seconds:
-                reason = Stopped.max_seconds
+        while np.any(saved.carry.stopped == Stopped.running):
+            is_late = options.max_seconds is not None and saved.seconds.sum() >= options.max_seconds
+            if is_late:
                 break
             saved = advance(saved)
             is_due = saved.seconds.size - on_disk >= options.checkpoint_every * options.segment_size
             if options.path is not None and is_due:
                 checkpoint.save(options.path, saved, fingerprint)
                 on_disk = saved.seconds.size
-            if options.callback is not None and options.callback(_progress(saved, options)):
-                reason = Stopped.interrupted
+            if options.log is not None:
+                options.log(int(np.max(saved.carry.num_steps)), saved.metrics())
     finally:
         # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
         if options.path is not None and saved.seconds.size > on_disk:
             checkpoint.save(options.path, saved, fingerprint)
     stopped = saved.carry.stopped
-    if reason is not None:
-        stopped = Stopped.where(stopped == Stopped.running, reason, stopped)
-    return saved, stopped
+    return saved, Stopped.where((stopped == Stopped.running) & is_late, Stopped.max_seconds, stopped)
 
 
 class _Program:
-    """A segment of steps, compiled once, when it is first run; and what tracing and compiling it took."""
+    """A segment of steps, compiled when it is first run; and what tracing and compiling it took."""
 
     def __init__(self, lowered: Any, seconds: float):
         self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
 
     def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
         """Run one segment more."""
+        began = time.perf_counter()
         if self.compiled is None:
-            began = time.perf_counter()
             self.compiled = self.lowered.compile()
             self.compile_seconds += time.perf_counter() - began
-        began = time.perf_counter()
+            began = time.perf_counter()
         start = jnp.asarray(saved.seconds.size, jnp.int32)
         carry, trace = jax.block_until_ready(self.compiled(arrays, key, saved.carry, start))
         seconds = time.perf_counter() - began
@@ -326,11 +304,10 @@ class _Program:
 
 def _start(static: PyTree, arrays: PyTree, params: Float[Array, " dim"]) -> Carry:
     method, options = eqx.combine(arrays, static)
-    zero, nan = jnp.zeros((), jnp.int32), jnp.full((), jnp.nan, params.dtype)
-    best = Best(params, nan, nan + jnp.inf, nan)
-    recent = Recent.empty(options.convergence, params.dtype)
-    stopped = jax.tree.map(jnp.asarray, Stopped.running)
-    return Carry(params, method.init(params), best, recent, zero, zero, zero, zero, stopped)
+    nan = jnp.full((), jnp.nan, params.dtype)
+    best, recent = Best(params, nan, nan + jnp.inf, nan), Recent.empty(options.convergence, params.dtype)
+    counts = [jnp.zeros((), jnp.int32)] * 5
+    return Carry(params, method.init(params), best, recent, *counts, jax.tree.map(jnp.asarray, Stopped.running))
 
 
 def _segment(
@@ -343,63 +320,56 @@ def _segment(
     """
     method, options = eqx.combine(arrays, static)
     nan = jnp.full((), jnp.nan, carry.params.dtype)
-    nothing = Record.blank(carry.params.dtype), nan
-    step = functools.partial(_step, method, options, key)
+    evaluate = options.evaluate or (lambda _: nan)
 
-    def idle(carry: Carry, _: Int[Array, ""]) -> tuple[Carry, Any]:
-        return carry, nothing
+    def idle(params: Float[Array, " dim"], state: PyTree, *_: Any) -> tuple[Float[Array, " dim"], PyTree, Record]:
+        return params, state, Record.blank(params.dtype)
 
-    def body(carry: Carry, index: Int[Array, ""]) -> tuple[Carry, Any]:
+    def step(carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        at, is_running, is_left = carry.params, carry.stopped == Stopped.running, index < options.num_steps
         # Apart, for over many seeds the end is the same for all, whereas some may have stopped.
-        while_running = functools.partial(jax.lax.cond, carry.stopped == Stopped.running, step, idle)
-        return jax.lax.cond(index < options.num_steps, while_running, idle, carry, index)
+        if_running = functools.partial(jax.lax.cond, is_running)
+        # `cond` asks for a hash, which a method of traced arrays has none of.
+        advance = functools.partial(if_running, functools.partial(method.advance), idle)
+        own_key = jax.random.fold_in(key, index)
+        params, state, record = jax.lax.cond(is_left, advance, idle, at, carry.state, own_key, index)
+        measured = functools.partial(if_running, lambda x: jnp.asarray(evaluate(x), x.dtype), lambda _: nan)
+        is_due = is_left & (index % options.evaluate_every == 0)
+        noise_free = jax.lax.cond(is_due, measured, lambda _: nan, at)
+        under_noise = Best(at, record.cost, record.scale, record.finite_fraction)
+        moved = Carry(
+            params=params,
+            state=state,
+            best=carry.best.against(under_noise if options.evaluate is None else Best.measured(at, noise_free)),
+            recent=carry.recent.push(record),
+            num_steps=carry.num_steps + 1,
+            num_skipped=carry.num_skipped + ~record.is_taken,
+            num_in_a_row=jnp.where(record.is_taken, 0, carry.num_in_a_row + 1),
+            num_still=jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0),
+            num_rollouts=carry.num_rollouts + record.num_rollouts,
+            stopped=carry.stopped,
+        )
+        moved = dataclasses.replace(moved, stopped=_stopped(options, moved, record, index))
+        is_stepping = is_left & is_running
+        return jax.tree.map(lambda new, old: jnp.where(is_stepping, new, old), moved, carry), (record, noise_free)
 
-    return jax.lax.scan(body, carry, start + jnp.arange(options.segment_size, dtype=jnp.int32))
+    return jax.lax.scan(step, carry, start + jnp.arange(options.segment_size, dtype=jnp.int32))
 
 
-def _step(
-    method: Method, options: RunOptions, key: PRNGKeyArray, carry: Carry, index: Int[Array, ""]
-) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
-    at = carry.params
-    noise_free = _evaluated(options, at, index)
-    params, state, record = method.advance(at, carry.state, jax.random.fold_in(key, index), index)
-    under_noise = Best(at, record.cost, record.scale, record.finite_fraction)
-    recent = carry.recent.push(record)
-    num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
-    num_rollouts = carry.num_rollouts + record.num_rollouts
-    # The weightiest reason to stop comes last.
+def _stopped(options: RunOptions, carry: Carry, record: Record, index: Int[Array, ""]) -> Stopped:
+    """Say why a run stops after a step, if it does; the weightiest reason comes last."""
     stopped = Stopped.running
     if options.max_rollouts is not None:
         # The next step is taken to cost what this one did.
-        is_spent = num_rollouts + record.num_rollouts > options.max_rollouts
+        is_spent = carry.num_rollouts + record.num_rollouts > options.max_rollouts
         stopped = Stopped.where(is_spent, Stopped.max_rollouts, stopped)
     stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, stopped)
-    stopped = Stopped.where(has_converged(options.convergence, recent), Stopped.converged, stopped)
-    stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
-    moved = Carry(
-        params=params.astype(at.dtype),
-        state=state,
-        best=carry.best.against(under_noise if options.evaluate is None else Best.measured(at, noise_free)),
-        recent=recent,
-        num_steps=carry.num_steps + 1,
-        num_skipped=carry.num_skipped + ~record.is_taken,
-        num_in_a_row=num_in_a_row,
-        num_rollouts=num_rollouts,
-        stopped=stopped,
-    )
-    return moved, (record, noise_free)
-
-
-def _evaluated(options: RunOptions, params: Float[Array, " dim"], index: Int[Array, ""]) -> Float[Array, ""]:
-    nothing, evaluate = jnp.full((), jnp.nan, params.dtype), options.evaluate
-    if evaluate is None:
-        return nothing
-    return jax.lax.cond(
-        index % options.evaluate_every == 0,
-        lambda at: jnp.asarray(evaluate(at), params.dtype),
-        lambda _: nothing,
-        params,
-    )
+    # Where nothing is felt the gradient is zero and the cost stands still, which is no convergence.
+    is_converged = has_converged(options.convergence, carry.recent) & (carry.num_still == 0)
+    stopped = Stopped.where(is_converged, Stopped.converged, stopped)
+    enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
+    stopped = Stopped.where(carry.num_still >= enough, Stopped.nothing_felt, stopped)
+    return Stopped.where(carry.num_in_a_row >= options.patience, Stopped.not_finite, stopped)
 
 
 def _finish(static: PyTree, arrays: PyTree, carry: Carry) -> tuple[Float[Array, ""], Best]:
@@ -411,28 +381,13 @@ def _finish(static: PyTree, arrays: PyTree, carry: Carry) -> tuple[Float[Array, 
     return cost, carry.best.against(Best.measured(params, cost))
 
 
-def _progress(saved: Saved, options: RunOptions) -> Progress:
-    return Progress(
-        step=int(np.max(saved.carry.num_steps)),
-        num_steps=options.num_steps,
-        params=saved.carry.params,
-        best_cost=saved.carry.best.cost,
-        history=saved.history(),
-        seconds=float(saved.seconds.sum()),
-        num_running=int(np.sum(saved.carry.stopped == Stopped.running)),
-    )
-
-
 def _fingerprint(
     options: RunOptions, params: Float[Array, "..."], key: Key[Array, "..."], arrays: PyTree, lowered: Any
 ) -> dict[str, Any]:
     """Say what a resumed run must have in common with this one: the program itself, and all that it is given."""
     return {
-        "num_steps": options.num_steps,
+        **{name: getattr(options, name) for name in ("num_steps", "evaluate_every", "patience", "max_rollouts")},
         "segment": options.segment_size,
-        "evaluate_every": options.evaluate_every,
-        "patience": options.patience,
-        "max_rollouts": options.max_rollouts,
         "convergence": repr(options.convergence),
         "shape": list(params.shape),
         "dtype": str(params.dtype),

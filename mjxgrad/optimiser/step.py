@@ -1,6 +1,5 @@
 """One step along an estimated gradient, how far it may go, and the same as an optax transformation."""
 
-import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -9,12 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators import GradientEstimate
-from mjxgrad.objective import Objective, OpenLoop, ParameterNoise
+from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, flattened, of_vector
 from mjxgrad.optimiser.annealing import Annealing, as_annealing
 from mjxgrad.optimiser.result import Record
 
@@ -71,11 +69,6 @@ class TrustRegion(eqx.Module):
     step_scale: Float[Array, "..."] | float | None = None
 
     def __check_init__(self):
-        """Refuse a radius without meaning.
-
-        Raises:
-            ValueError: if it is not positive.
-        """
         if not self.radius > 0:
             raise ValueError(f"radius must be positive, got {self.radius}")
 
@@ -86,16 +79,7 @@ class TrustRegion(eqx.Module):
         bias_bound: Float[Array, ""],
         objective: Objective,
     ) -> Float[Array, " dim"]:
-        """Shorten a step where it is too long.
-
-        Args:
-            step: the change of the parameters.
-            gradient: the estimate behind it, not clipped.
-            bias_bound: on the norm of its bias; NaN where nothing is known.
-            objective: whose noise gives the unit of length.
-
-        Returns:
-            The step or a shorter one in its direction.
+        """Shorten a step along an estimate, not clipped, where it is too long.
 
         Raises:
             ValueError: if the objective's noise is not on the parameters and `step_scale` was not given.
@@ -127,36 +111,42 @@ class GradientStep(Method):
 
     objective: Objective | AnnealedObjective
     estimator: Estimator
-    optimiser: optax.GradientTransformationExtraArgs = eqx.field(converter=optax.with_extra_args_support)
-    annealing: Annealing | None = eqx.field(converter=as_annealing)
+    optimiser: optax.GradientTransformationExtraArgs
+    annealing: Annealing | None
     trust_region: TrustRegion | None
-    clip_norm: float | None
 
-    def __check_init__(self):
-        """Refuse what does not fit together.
-
-        Raises:
-            ValueError: if `objective` and `annealing` do not belong together, or `clip_norm` is not positive.
-        """
-        if self.annealing is None:
-            as_objective(self.objective)
-        elif isinstance(self.objective, Objective):
+    def __init__(
+        self,
+        objective: Objective | AnnealedObjective,
+        estimator: Estimator,
+        optimiser: optax.GradientTransformation,
+        annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None,
+        trust_region: TrustRegion | None,
+        clip_norm: float | None,
+    ):
+        if annealing is None:
+            as_objective(objective)
+        elif isinstance(objective, Objective):
             raise ValueError(
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
-        if self.clip_norm is not None and not self.clip_norm > 0:
-            raise ValueError(f"clip_norm must be positive, got {self.clip_norm}")
+        if clip_norm is not None:
+            if not clip_norm > 0:
+                raise ValueError(f"clip_norm must be positive, got {clip_norm}")
+            optimiser = optax.chain(optax.clip_by_global_norm(clip_norm), optimiser)
+        self.objective, self.estimator = objective, estimator
+        # The cost goes along for transformations that watch it, such as optax.contrib.reduce_on_plateau.
+        self.optimiser = optax.with_extra_args_support(optimiser)
+        self.annealing, self.trust_region = as_annealing(annealing), trust_region
 
     def init(self, params: Float[Array, " dim"]) -> StepState:
-        """Return the states of the optimiser and of the annealing before the first step."""
         annealing = None if self.annealing is None else self.annealing.init(params.dtype)
         return StepState(jax.tree.map(jnp.asarray, self.optimiser.init(params)), annealing)
 
     def advance(
         self, params: Float[Array, " dim"], state: StepState, key: PRNGKeyArray, step: Int[Array, ""]
     ) -> tuple[Float[Array, " dim"], StepState, Record]:
-        """Take one step along the estimate."""
         scale, objective = self.annealed(self.objective, params, state, step)
         estimate = self.estimator(objective, params, key)
         change, state, is_taken = self.change(params, state, objective, estimate, estimate.value)
@@ -184,25 +174,15 @@ class GradientStep(Method):
         estimate: GradientEstimate,
         gradient: Float[Array, " dim"],
     ) -> tuple[Float[Array, " dim"], StepState, Bool[Array, ""]]:
-        """Clip the gradient, ask the optimiser, limit the step.
+        """Ask the optimiser for the change of the parameters, and limit it.
 
-        Args:
-            params: the point.
-            state: of the step before.
-            objective: at the scale of this step.
-            estimate: of its gradient.
-            gradient: to follow: that of the estimate, and of anything else in the cost.
-
-        Returns:
-            The change of the parameters; the state for the next step; whether the step is taken. If it would not be
-            finite it is not, the change is zero and the state stays as it was.
+        The gradient is that of the estimate and of anything else in the cost. A step that would not be finite is not
+        taken: the change is zero and the state stays as it was.
         """
         is_finite = jnp.isfinite(gradient).all()
         # NaN must not reach the optimiser: what it does with one that is thrown away later is not defined.
         gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
-        # The cost goes along for transformations that watch it, such as optax.contrib.reduce_on_plateau.
-        clipped = clip(gradient, self.clip_norm)
-        updates, optimiser = self.optimiser.update(clipped, state.optimiser, params, value=estimate.objective_mean)
+        updates, optimiser = self.optimiser.update(gradient, state.optimiser, params, value=estimate.objective_mean)
         change = jnp.asarray(updates)
         if self.trust_region is not None:
             change = self.trust_region.limit(change, gradient, estimate.bias_bound, objective)
@@ -214,54 +194,6 @@ class GradientStep(Method):
         return jnp.where(is_taken, change, 0).astype(params.dtype), moved, is_taken
 
 
-class Restored(eqx.Module):
-    """A function of a pytree of parameters, as a function of the vector of them."""
-
-    function: Callable[[PyTree], Any]
-    restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
-
-    def __call__(self, vector: Float[Array, " dim"]) -> Any:
-        """Call the function."""
-        return self.function(self.restore(vector))
-
-
-def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return parameters as a vector.
-
-    Args:
-        params: a pytree whose floating-point arrays are the parameters, such as a dict or an equinox module; or an array.
-
-    Returns:
-        The vector, and the way back, also for one vector per seed; an array as it is, with None.
-
-    Raises:
-        ValueError: if there are no floating-point arrays.
-    """
-    if eqx.is_array_like(params):
-        return jnp.asarray(params), None
-    arrays, others = eqx.partition(params, eqx.is_inexact_array_like)
-    vector, unravel = ravel_pytree(arrays)
-    if vector.size == 0:
-        raise ValueError(f"params must have floating-point arrays, got none in {params}; write 1.0 in place of 1")
-
-    def restore(vector: Float[Array, "..."]) -> PyTree:
-        return eqx.combine(jax.vmap(unravel)(vector) if vector.ndim == 2 else unravel(vector), others)
-
-    return vector, restore
-
-
-def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] | None) -> Any:
-    """Return an objective, or a function from a scale to one, that takes parameters as `flattened` does.
-
-    Noise on actions leaves it as it is: it takes a vector in any case, and its policy has its own way back.
-    """
-    if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
-        return objective
-    if isinstance(objective, ParameterNoise):
-        return dataclasses.replace(objective, function=Restored(objective.function, restore))
-    return lambda scale: of_vector(objective(scale), restore)
-
-
 class EstimatedGradientState(eqx.Module):
     """The state of `estimated_gradient`.
 
@@ -269,7 +201,7 @@ class EstimatedGradientState(eqx.Module):
         step: number of updates so far; the noise of each comes from it.
         num_skipped: of those, the ones that were not finite and so were zero.
         scale: of the annealing at the last update.
-        estimate: the last one; all NaN before the first.
+        estimate: the last one, of the vector; all NaN before the first.
         inner: states of the optimiser and of the annealing.
     """
 
@@ -365,17 +297,7 @@ def _nothing(leaf: jax.ShapeDtypeStruct) -> Array:
 
 
 def as_objective(objective: Any) -> Objective:
-    """Return an objective as it is, refusing anything else.
-
-    Args:
-        objective: as given.
-
-    Returns:
-        The same.
-
-    Raises:
-        ValueError: if it is none.
-    """
+    """Return an objective as it is, refusing anything else."""
     if not isinstance(objective, Objective):
         raise ValueError(
             f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
@@ -385,35 +307,9 @@ def as_objective(objective: Any) -> Objective:
 
 
 def parameter_stddev(objective: Objective, dim: int) -> Float[Array, " dim"] | None:
-    """Give the standard deviation of the noise on each parameter, or None if the noise is elsewhere.
-
-    Args:
-        objective: any.
-        dim: number of parameters.
-
-    Returns:
-        In the parameters' units.
-    """
+    """Return the standard deviation of the noise on each parameter, or None if the noise is elsewhere."""
     if isinstance(objective, OpenLoop):
         return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
     if isinstance(objective, ParameterNoise):
         return jnp.broadcast_to(objective.stddev, (dim,))
     return None
-
-
-def clip(gradient: Float[Array, " dim"], most: float | None) -> Float[Array, " dim"]:
-    """Shorten a gradient to a norm of at most `most`, keeping its direction.
-
-    It is divided by its own norm. (Dividing by the threshold instead leaves it as long as it was, in other units.)
-
-    Args:
-        gradient: any.
-        most: the largest norm; None leaves everything as it is.
-
-    Returns:
-        The gradient or a shorter one.
-    """
-    if most is None:
-        return gradient
-    norm = jnp.linalg.norm(gradient)
-    return gradient * jnp.where(norm > most, most / jnp.where(norm > 0, norm, 1), 1).astype(gradient.dtype)

@@ -1,4 +1,4 @@
-"""When there is nothing left to gain."""
+"""Whether a run has converged."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,11 +32,6 @@ class Convergence(eqx.Module):
     cost: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse settings without meaning.
-
-        Raises:
-            ValueError: if one is out of its range, or nothing is to be looked at.
-        """
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.gradient is None and self.cost is None:
@@ -50,11 +45,7 @@ class Convergence(eqx.Module):
 class Recent(eqx.Module):
     """What convergence is judged by: the last two windows of steps, the oldest first, NaN where there is none yet.
 
-    Attributes:
-        costs: mean cost under noise.
-        squares: squared norm of the gradient.
-        errors: squared norm of its standard error.
-        scale: of the annealing.
+    Squares are those of the norm of the gradient, errors of its standard error.
     """
 
     costs: Float[Array, " both"]
@@ -85,15 +76,7 @@ class Recent(eqx.Module):
 
 
 def has_converged(convergence: Convergence | None, recent: Recent) -> Bool[Array, ""]:
-    """Judge the last steps.
-
-    Args:
-        convergence: what to judge by; None never stops.
-        recent: those steps.
-
-    Returns:
-        Whether to stop. While the windows are not full, comparisons with NaN say no.
-    """
+    """Say whether to stop; while the windows are not full, comparisons with NaN say no."""
     result = jnp.zeros((), bool)
     if convergence is None:
         return result

@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mjxgrad.diagnostics import (
-    Landscape,
-    bias_variance,
-    bootstrap_variance_interval,
-    chi_square_variance_interval,
-    mean_interval,
-)
+from mjxgrad.diagnostics import Landscape, bias_variance, mean_interval
 from mjxgrad.diagnostics.reference import cell_points
+from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, chi_square_variance_interval
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import STDDEV
@@ -159,13 +154,6 @@ def test_the_reference_is_unbiased_and_its_error_on_the_safe_side():
     assert abs(values.mean() - exact) < 4 * values.std() / np.sqrt(times)
     assert (np.abs(values - exact) < 2 * errors).mean() > 0.95
     assert (errors**2).mean() < 4 * values.var()
-
-
-def test_the_smoothed_cost_is_the_mean_under_noise():
-    points, cell = cell_points(jax.random.key(0), jnp.array(-0.6), jnp.array(0.9), 2000)
-    value, error = Landscape(points, points**2, cell).smoothed_cost(jnp.array(0.25), jnp.array(STDDEV))
-    # E (θ + w)² = θ² + σ².
-    assert abs(value - (0.25**2 + STDDEV**2)) < 4 * error < 1e-3
 
 
 def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():

@@ -19,7 +19,7 @@ from mjxgrad.diagnostics import (
     root_mean_square_interval,
     variance_interval,
 )
-from mjxgrad.diagnostics.budget import affordable
+from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
 from mjxgrad.tasks import textbook

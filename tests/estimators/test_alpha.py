@@ -1,6 +1,5 @@
 """The α-order estimate: what it mixes, where it trusts derivatives, and what it says about it."""
 
-import functools
 
 import equinox as eqx
 import jax
@@ -46,22 +45,6 @@ def test_without_control_variate_the_unbiased_part_is_zeroth_order(parts):
     zeroth = textbook.zeroth_order(BUMPY, POINT, key, num_samples=64)
     np.testing.assert_allclose(estimate.value, zeroth.value, rtol=1e-9)
     np.testing.assert_allclose(estimate.standard_error, zeroth.standard_error, rtol=1e-9)
-
-
-def test_each_block_has_its_own_weight(parts):
-    key, first, unbiased = parts
-    blocks = np.array([1, 0, 1])
-    run = functools.partial(estimators.alpha_order, num_samples=200, rule=rules.InverseVariance(), blocks=blocks)
-    estimate = jax.jit(run)(BUMPY, POINT, key)
-    # The variance of terms, without the correction of the standard error for their dependence (1/n of it).
-    zeroth, derivatives = np.asarray(unbiased.covariance_diagonal), np.asarray(first.covariance_diagonal)
-    expected = np.array(
-        [zeroth[mine].sum() / (zeroth + derivatives)[mine].sum() for mine in (blocks == 0, blocks == 1)]
-    )
-    np.testing.assert_allclose(estimate.alpha, expected, rtol=0.01)
-    weights = np.asarray(estimate.alpha)[blocks]
-    mixed = weights * np.asarray(first.value) + (1 - weights) * np.asarray(unbiased.value)
-    np.testing.assert_allclose(estimate.value, mixed, rtol=1e-9)
 
 
 def test_the_error_bar_of_a_mixture_knows_that_its_parts_share_rollouts():
@@ -147,27 +130,16 @@ def test_rollouts_are_counted_once(key):
     assert estimate.num_rollouts == estimate.num_gradient_rollouts == 200
 
 
-@pytest.mark.parametrize(
-    ("blocks", "message"),
-    [
-        (np.array([0.0, 1.0, 1.0]), "integers from 0"),
-        (np.array([0, 1]), "one number for each of the 3 coordinates"),
-        (np.array([0, 2, 2]), "without gaps"),
-    ],
-)
-def test_blocks_that_do_not_fit_are_answered(blocks, message, key):
-    with pytest.raises(ValueError, match=message):
-        estimators.alpha_order(BUMPY, POINT, key, num_samples=10, blocks=blocks)
-
-
-def test_by_step_is_by_coordinate_where_the_noise_is_on_the_parameters(key):
-    rule = rules.InverseVariance()
-    by_step = per_step(BUMPY, POINT, key, num_samples=100, rule=rule)
-    run = functools.partial(estimators.alpha_order, num_samples=100, rule=rule, blocks=np.arange(3))
-    by_coordinate = jax.jit(run)(BUMPY, POINT, key)
-    np.testing.assert_allclose(by_step.alpha, by_coordinate.alpha, rtol=1e-9)
-    np.testing.assert_allclose(by_step.value, by_coordinate.value, rtol=1e-9)
-    assert Reason[Reason.inverse_variance] == Reason[jax.tree.map(lambda leaf: leaf[0], by_step.reason)]
+def test_by_step_each_parameter_has_its_own_weight_where_the_noise_is_on_them(parts):
+    key, first, unbiased = parts
+    estimate = per_step(BUMPY, POINT, key, num_samples=200, rule=rules.InverseVariance())
+    # The variance of terms, without the correction of the standard error for their dependence (1/n of it).
+    zeroth, derivatives = np.asarray(unbiased.covariance_diagonal), np.asarray(first.covariance_diagonal)
+    np.testing.assert_allclose(estimate.alpha, zeroth / (zeroth + derivatives), rtol=0.01)
+    weights = np.asarray(estimate.alpha)
+    mixed = weights * np.asarray(first.value) + (1 - weights) * np.asarray(unbiased.value)
+    np.testing.assert_allclose(estimate.value, mixed, rtol=1e-9)
+    assert Reason[Reason.inverse_variance] == Reason[jax.tree.map(lambda leaf: leaf[0], estimate.reason)]
 
 
 def test_by_step_is_unbiased_in_closed_loop_if_its_parts_are():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxgrad.estimators.consistency import secant_sums
-from mjxgrad.estimators.samples import plan_by_noise, sample_by_noise
+from mjxgrad.estimators.samples import Group, plan_by_noise, sample
 from mjxgrad.estimators.unbiased import gram
 from mjxgrad.objective import parameter_noise
 
@@ -16,7 +16,7 @@ POINT = jnp.array([0.05, -0.3])
 def samples_of(function, key, num_samples=40):
     objective = parameter_noise(function, STDDEVS).sized_for(POINT)
     plan = plan_by_noise(objective, num_samples, None)
-    return sample_by_noise(objective, POINT, key, jnp.arange(num_samples), plan).group
+    return Group.of(sample(objective, POINT, key, plan, jnp.arange(num_samples)))
 
 
 def sums_of(function, key):

@@ -33,11 +33,11 @@ def run(path=None, *, rate=0.05, num_steps=40, **settings):
 
 
 def kill_at(step, error):
-    def callback(progress):
-        if progress.step >= step:
+    def log(done, _):
+        if done >= step:
             raise error
 
-    return callback
+    return log
 
 
 def assert_same(one, other):
@@ -60,9 +60,9 @@ def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uni
     path = tmp_path / "run.npz"
     for step in (7, 21):
         with pytest.raises(error):
-            run(path, callback=kill_at(step, error))
+            run(path, log=kill_at(step, error))
     steps = []
-    resumed = run(path, callback=lambda progress: steps.append(progress.step))
+    resumed = run(path, log=lambda step, _: steps.append(step))
     assert steps == [28, 35, 40]
     assert_same(resumed, uninterrupted)
 
@@ -70,35 +70,30 @@ def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uni
 def test_an_interruption_between_two_saves_loses_nothing(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
     with pytest.raises(KilledError):
-        run(path, checkpoint_every=100, callback=kill_at(14, KilledError))
+        run(path, checkpoint_every=100, log=kill_at(14, KilledError))
     steps = []
-    assert_same(run(path, callback=lambda progress: steps.append(progress.step)), uninterrupted)
+    assert_same(run(path, log=lambda step, _: steps.append(step)), uninterrupted)
     assert steps[0] == 21
-
-
-def test_a_run_stopped_by_its_callback_can_go_on(tmp_path, uninterrupted):
-    path = tmp_path / "run.npz"
-    assert run(path, callback=lambda progress: True).stopped == mg.Stopped.interrupted
-    assert_same(run(path), uninterrupted)
 
 
 def test_a_finished_run_is_read_without_running(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
     run(path)
-    assert_same(run(path, callback=kill_at(0, KilledError)), uninterrupted)
+    assert_same(run(path, log=kill_at(0, KilledError)), uninterrupted)
 
 
 def test_many_seeds_are_resumed(tmp_path):
     path, keys = tmp_path / "run.npz", jax.random.split(KEY, 3)
     with pytest.raises(KilledError):
-        run(path, key=keys, callback=kill_at(7, KilledError))
+        run(path, key=keys, log=kill_at(7, KilledError))
     assert_same(run(path, key=keys), run(key=keys))
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("checkpoint") / "run.npz"
-    run(path, callback=lambda progress: True)
+    with pytest.raises(KilledError):
+        run(path, log=kill_at(7, KilledError))
     return path
 
 
@@ -136,7 +131,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, written, damage):
 def test_a_save_that_fails_leaves_the_former_file(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     with pytest.raises(KilledError):
-        run(path, callback=kill_at(7, KilledError))
+        run(path, log=kill_at(7, KilledError))
     before = path.read_bytes()
 
     def fail(*_):

@@ -1,5 +1,7 @@
 """When a run stops, and that it says why."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,24 +35,79 @@ def test_a_budget_of_seconds_is_looked_at_between_segments(key):
     assert result.num_steps == 8
 
 
-def test_a_callback_sees_every_segment_and_can_stop(key):
-    seen = []
-
-    def callback(progress):
-        seen.append((progress.step, progress.num_steps, progress.num_running, progress.history.cost.size))
-        return progress.step >= 24
-
-    result = run(key, callback=callback)
-    assert seen == [(8, 60, 1, 8), (16, 60, 1, 16), (24, 60, 1, 24)]
-    assert result.stopped == mg.Stopped.interrupted
-    assert result.num_steps == 24
-
-
-def test_a_callback_that_answers_nothing_lets_the_run_end(key):
-    steps = []
-    result = run(key, callback=lambda progress: steps.append(progress.step))
-    assert steps == [8, 16, 24, 32, 40, 48, 56, 60]
+def test_a_log_is_told_the_last_step_of_every_segment(key):
+    told = []
+    result = run(key, log=lambda step, metrics: told.append((step, metrics)))
+    assert [step for step, _ in told] == [8, 16, 24, 32, 40, 48, 56, 60]
     assert mg.Stopped[result.stopped] == "all steps were done"
+    for step, metrics in told:
+        for name in ("cost", "gradient_norm", "alpha", "step_norm", "num_rollouts", "seconds"):
+            assert metrics[name] == getattr(result.history, name)[step - 1]
+    assert told[-1][1]["best_cost"] == result.best_cost
+    assert np.isnan(metrics["noise_free_cost"])
+    assert {type(x) for x in metrics.values()} == {float}
+
+
+def test_a_log_of_many_seeds_has_the_mean_of_those_that_took_the_step(key):
+    """The second seed is given up at its third step."""
+    told, starts = {}, jnp.array([[0.0, 0.5], [3.0, 3.0]])
+    keys = jax.random.split(key, 2)
+    result = mg.optimise(
+        problems.objective, starts, keys, estimator=spoiled, optimiser=optax.sgd(0.1), num_steps=4, patience=3,
+        segment=1, log=lambda step, metrics: told.update({step: metrics}),
+    )  # fmt: skip
+    assert told[1]["cost"] == pytest.approx(result.history.cost[:, 0].mean())
+    assert told[4]["cost"] == pytest.approx(result.history.cost[0, 3])
+
+
+def dead_zone(x):
+    """Nothing within 1 of zero, then a slope: a finger that does not reach the ball."""
+    return 5.0 + jnp.maximum(jnp.abs(x) - 1, 0.0).sum()
+
+
+@pytest.mark.parametrize("name", ["first_order", "zeroth_order", "alpha_order", "control_variate"])
+@pytest.mark.parametrize("convergence", [None, mg.Convergence(window=2, gradient=1.0, cost=0.0)])
+def test_a_run_that_feels_nothing_stops_at_once_and_says_so(key, name, convergence):
+    """A gradient of zero without an error is what convergence looks for, so it must not be asked."""
+    result = mg.optimise(
+        mg.parameter_noise(dead_zone, 0.1),
+        START,
+        key,
+        estimator=functools.partial(getattr(mg.estimators, name), num_samples=8),
+        optimiser=optax.adam(0.1),
+        num_steps=60,
+        convergence=convergence,
+    )
+    assert result.stopped == mg.Stopped.nothing_felt
+    assert "nothing that the parameters change reaches the cost" in mg.Stopped[result.stopped]
+    assert result.num_steps == 3
+    np.testing.assert_array_equal(result.params, START)
+
+
+def test_one_seed_that_feels_nothing_stops_without_the_others(key):
+    starts = jnp.array([[0.0, 0.5], [2.0, 2.0]])
+    result = mg.optimise(
+        mg.parameter_noise(dead_zone, 0.1), starts, jax.random.split(key, 2),
+        estimator=problems.first_order, optimiser=optax.sgd(0.01), num_steps=10,
+    )  # fmt: skip
+    assert list(result.stopped == mg.Stopped.nothing_felt) == [True, False]
+    assert list(result.num_steps) == [3, 10]
+
+
+def test_momentum_has_the_patience_of_the_run_to_leave_a_zone_where_nothing_is_felt(key):
+    """Nothing is felt from 1 to 1.3, where momentum crosses: 0.5, then 0.45, 0.405 ... a step of 0.1."""
+
+    def cost(x):
+        return jnp.where((x[0] > 1.0) & (x[0] < 1.3), 2.0, -x[0])
+
+    settings = {"estimator": problems.first_order, "optimiser": optax.sgd(0.01, momentum=0.9), "num_steps": 60}
+    objective = mg.parameter_noise(cost, 1e-3, dim=1)
+    crossing = mg.optimise(objective, jnp.array([0.5]), key, **settings)
+    assert crossing.stopped == mg.Stopped.finished
+    assert crossing.params[0] > 1.3
+    lost = mg.optimise(mg.parameter_noise(dead_zone, 1e-3), jnp.array([1.005]), key, **settings)
+    assert lost.stopped == mg.Stopped.nothing_felt
+    assert 10 <= lost.num_steps < 20
 
 
 def test_a_cost_that_stands_still_is_convergence(key):

@@ -1,0 +1,293 @@
+r"""What one would otherwise use, in the same loop, with rollouts counted alike: methods that look at costs alone.
+
+Each draws candidates $\theta_i = \mu + \sigma \epsilon_i$ about the present point $\mu$ and moves it by a rule of its
+own. The search noise takes the place of the objective's: candidates are rolled out without that, or, where a task's
+start is random, with a start of their own. The cost in the history is the mean over the candidates, and the best
+parameters are among the points $\mu$, whose noise-free cost `evaluate` measures.
+
+They are written here, for each is short, and a library of them would bring in a neural-network framework.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+
+from mjxgrad.estimators import Reason
+from mjxgrad.objective import ActionNoise, Objective
+from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
+from mjxgrad.optimiser.step import as_objective, parameter_stddev
+
+__all__ = ["cross_entropy", "mppi", "predictive_sampling"]
+
+
+Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tuple[Array, Array]]
+
+
+class Population(Method):
+    """Draw candidates, roll them out, move; the state is the width of the search.
+
+    Attributes:
+        objective: what to minimise.
+        stddev: of the search at the start, one number per parameter.
+        move: from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
+            point and width.
+        num_samples: candidates, and so rollouts, per step.
+        least_finite: how many of them must be finite for a step to be taken.
+        has_present: whether the present point is the first of them.
+    """
+
+    objective: Objective
+    stddev: Float[Array, " dim"]
+    move: Move = eqx.field(static=True)
+    num_samples: int = eqx.field(static=True)
+    least_finite: int = eqx.field(static=True, default=2)
+    has_present: bool = eqx.field(static=True, default=False)
+
+    def init(self, params: Float[Array, " dim"]) -> Float[Array, " dim"]:
+        return self.stddev.astype(params.dtype)
+
+    def advance(
+        self, params: Float[Array, " dim"], state: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
+    ) -> tuple[Float[Array, " dim"], Float[Array, " dim"], Record]:
+        search_key, rollout_key = jax.random.split(key)
+        objective = self.objective.sized_for(params)
+        directions = jax.random.normal(search_key, (self.num_samples, params.size), params.dtype)
+        at = params + state * (directions.at[0].set(0) if self.has_present else directions)
+        rollout_keys = jax.random.split(rollout_key, self.num_samples)
+        costs = jax.vmap(objective.value)(at, jax.vmap(lambda one: without_action_noise(objective, one))(rollout_keys))
+        is_finite = jnp.isfinite(costs)
+        is_taken = is_finite.sum() >= self.least_finite
+        new, stddev = self.move(params, state, at, jnp.where(is_finite, costs, jnp.inf))
+        new, stddev = jnp.where(is_taken, new, params).astype(params.dtype), jnp.where(is_taken, stddev, state)
+        return new, stddev, _record(costs, is_finite, jnp.linalg.norm(new - params), is_taken)
+
+
+def cross_entropy(
+    objective: Objective,
+    params: Float[Array, "..."],
+    key: Key[Array, "..."],
+    *,
+    num_samples: int,
+    num_elite: int,
+    num_steps: int,
+    stddev: ArrayLike | None = None,
+    keep: float = 0.0,
+    min_stddev: float = 0.0,
+    **options: Any,
+) -> Optimisation:
+    r"""Minimise a cost by the cross-entropy method.
+
+    Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
+    best of them, by maximum likelihood (so $\sigma$ has no $n - 1$):
+
+    $$\mu \leftarrow \kappa \mu + (1 - \kappa)\, \mathrm{mean}(\mathrm{elite}), \qquad
+      \sigma \leftarrow \kappa \sigma + (1 - \kappa)\, \mathrm{std}(\mathrm{elite}).$$
+
+    Candidates are rolled out without the objective's noise, from random starts where the task has them; one that is not
+    finite is never elite. A step with fewer than `num_elite` finite ones is not taken.
+
+    Args:
+        objective: what to minimise; only its cost is used.
+        params: the first $\mu$.
+        key: as in `optimise`.
+        num_samples: candidates, and so rollouts, per step.
+        num_elite: the best of them that the fit is to. At least 2.
+        num_steps: at most.
+        stddev: the first $\sigma$, in the parameters' units; one number, or one per parameter. None takes the
+            objective's noise, if that is on the parameters.
+        keep: $\kappa \in [0, 1)$, share of the old fit.
+        min_stddev: $\sigma$ is not let below it, lest the search freeze too early.
+        **options: see `RunOptions`.
+
+    Returns:
+        As `optimise`; what belongs to gradients is NaN.
+
+    Raises:
+        ValueError: if a number is out of range or does not fit, or as in `optimise`.
+
+    References:
+        De Boer, Kroese, Mannor, Rubinstein. A tutorial on the cross-entropy method. Annals of Operations Research 134,
+        2005, section 5 (continuous optimisation, with smoothing of the fit).
+    """
+    width = search_stddev(objective, params, stddev, num_samples)
+    if not 2 <= num_elite <= num_samples:
+        raise ValueError(f"num_elite must be at least 2 and at most num_samples = {num_samples}, got {num_elite}")
+    if not 0 <= keep < 1:
+        raise ValueError(f"keep must be at least 0 and below 1, got {keep}")
+    if not min_stddev >= 0:
+        raise ValueError(f"min_stddev must be at least 0, got {min_stddev}")
+
+    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
+        elite = at[jnp.argsort(costs)[:num_elite]]
+        new = keep * mean + (1 - keep) * elite.mean(axis=0)
+        return new, jnp.maximum(keep * stddev + (1 - keep) * elite.std(axis=0), min_stddev)
+
+    method = Population(objective, width, move, num_samples, least_finite=num_elite)
+    return run(method, params, key, RunOptions(num_steps, **options))
+
+
+def mppi(
+    objective: Objective,
+    params: Float[Array, "..."],
+    key: Key[Array, "..."],
+    *,
+    num_samples: int,
+    num_steps: int,
+    temperature: float = 0.1,
+    is_relative: bool = True,
+    stddev: ArrayLike | None = None,
+    **options: Any,
+) -> Optimisation:
+    r"""Minimise a cost by the update of model-predictive path integral control.
+
+    $$\mu \leftarrow \mu + \sum_i \frac{\exp(-f_i/\lambda)}{\sum_j \exp(-f_j/\lambda)}\, \sigma\epsilon_i,
+      \qquad f_i = f(\mu + \sigma\epsilon_i).$$
+
+    The whole horizon is planned anew in each step; nothing is shifted or executed in between, and the cost is the
+    objective's alone, without the cited method's extra charge $\lambda\mu^\top\Sigma^{-1}\epsilon$ for control.
+    A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
+
+    Args:
+        objective: what to minimise; only its cost is used.
+        params: the first $\mu$, such as controls raveled.
+        key: as in `optimise`.
+        num_samples: candidates, and so rollouts, per step.
+        num_steps: at most.
+        temperature: $\lambda$; low follows the best candidate, high averages over all.
+        is_relative: whether the temperature is in units of the standard deviation of the step's costs, so that the
+            cost's unit has no effect; otherwise in units of the cost.
+        stddev: $\sigma$, as in `cross_entropy`.
+        **options: see `RunOptions`.
+
+    Returns:
+        As `cross_entropy`.
+
+    Raises:
+        ValueError: as `cross_entropy`.
+
+    References:
+        Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based
+        reinforcement learning. ICRA 2017, algorithm 2. Theodorou, Buchli, Schaal. A generalized path integral control
+        approach to reinforcement learning. JMLR 11, 2010, section 3.3 (there with the costs' range as their unit).
+    """
+    width = search_stddev(objective, params, stddev, num_samples)
+    if not temperature > 0:
+        raise ValueError(f"temperature must be positive, got {temperature}; predictive_sampling takes the best alone")
+
+    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
+        scale = jnp.asarray(temperature, costs.dtype)
+        if is_relative:
+            spread = jnp.std(costs, where=jnp.isfinite(costs))
+            # All costs alike: any temperature gives equal weights, but zero would give 0/0.
+            scale *= jnp.where(spread > 0, spread, 1)
+        # Weighting the offsets, not the candidates: equal to rounding, and exact where a weight of one is left.
+        return mean + jax.nn.softmax(-costs / scale) @ (at - mean), stddev
+
+    method = Population(objective, width, move, num_samples)
+    return run(method, params, key, RunOptions(num_steps, **options))
+
+
+def predictive_sampling(
+    objective: Objective,
+    params: Float[Array, "..."],
+    key: Key[Array, "..."],
+    *,
+    num_samples: int,
+    num_steps: int,
+    stddev: ArrayLike | None = None,
+    **options: Any,
+) -> Optimisation:
+    r"""Minimise a cost by going to the best candidate, the present point among them.
+
+    The cost without noise never rises, unless the task's start is random.
+
+    Args:
+        objective: what to minimise; only its cost is used.
+        params: the first point.
+        key: as in `optimise`.
+        num_samples: candidates, and so rollouts, per step; the first is the present point.
+        num_steps: at most.
+        stddev: width of the search, as in `cross_entropy`.
+        **options: see `RunOptions`.
+
+    Returns:
+        As `cross_entropy`.
+
+    Raises:
+        ValueError: as `cross_entropy`.
+
+    References:
+        Howell, Gileadi, Tunyasuvunakool, Zakka, Erez, Tassa. Predictive sampling: real-time behaviour synthesis with
+        MuJoCo. 2022, arXiv:2212.00541, algorithm 1.
+    """
+    width = search_stddev(objective, params, stddev, num_samples)
+
+    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
+        return at[jnp.argmin(costs)], stddev
+
+    method = Population(objective, width, move, num_samples, least_finite=1, has_present=True)
+    return run(method, params, key, RunOptions(num_steps, **options))
+
+
+def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:
+    """Return the noise of a rollout with none on actions or parameters, but a random start where the task has one."""
+    if isinstance(objective, ActionNoise):
+        _, start = objective.split(objective.sample_noise(key))
+        if start is not None:
+            return jnp.zeros(objective.noise_shape, objective.stddev.dtype), start
+    return objective.zero_noise()
+
+
+def search_stddev(
+    objective: Objective, params: Float[Array, "..."], stddev: ArrayLike | None, num_samples: int
+) -> Float[Array, " dim"]:
+    """Return the width of the search for each parameter, refusing what makes no sense."""
+    as_objective(objective)
+    if num_samples < 2:
+        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
+    if stddev is None:
+        stddev = parameter_stddev(objective, dim)
+    if stddev is None:
+        raise ValueError(
+            f"stddev must be given for {type(objective).__name__}, whose noise is not on the parameters; "
+            "it is the width of the search, in the parameters' units"
+        )
+    width = jnp.asarray(stddev, float)
+    if width.shape not in ((), (dim,)):
+        raise ValueError(f"stddev must be one number or {dim}, got shape {width.shape}")
+    if not bool((width > 0).all()):
+        raise ValueError(f"stddev must be positive, got {stddev}")
+    return jnp.broadcast_to(width, (dim,))
+
+
+def _record(
+    costs: Float[Array, " num_samples"],
+    is_finite: Bool[Array, " num_samples"],
+    step_norm: Float[Array, ""],
+    is_taken: Bool[Array, ""],
+) -> Record:
+    count = is_finite.sum()
+    mean = jnp.where(count > 0, jnp.mean(costs, where=is_finite), jnp.nan)
+    variance = jnp.sum(jnp.where(is_finite, costs - mean, 0) ** 2) / jnp.maximum(count - 1, 1)
+    nan = jnp.full((), jnp.nan, costs.dtype)
+    return Record(
+        cost=mean,
+        cost_error=jnp.where(count > 1, jnp.sqrt(variance / jnp.maximum(count, 1)), nan).astype(costs.dtype),
+        gradient_norm=nan,
+        gradient_error=nan,
+        alpha=nan,
+        reason=jax.tree.map(jnp.asarray, Reason.fixed),
+        bias_bound=nan,
+        scale=jnp.ones_like(nan),
+        step_norm=step_norm,
+        finite_fraction=is_finite.mean(dtype=costs.dtype),
+        num_rollouts=jnp.asarray(costs.size, jnp.int32),
+        num_gradient_rollouts=jnp.zeros((), jnp.int32),
+        is_taken=is_taken,
+    )

@@ -1,0 +1,104 @@
+"""Where nothing that the parameters change reaches the cost, every estimate says so; and nowhere else."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import estimators
+from mjxgrad.estimators import Reason
+from tests.estimators import textbook
+
+ESTIMATORS = {
+    "first_order": estimators.first_order,
+    "zeroth_order": estimators.zeroth_order,
+    "zero_noise": functools.partial(estimators.zeroth_order, baseline="zero_noise"),
+    "pairs": functools.partial(estimators.zeroth_order, antithetic=True),
+    "alpha_order": estimators.alpha_order,
+    "per_step": estimators.per_step,
+    "control_variate": estimators.control_variate,
+    "least_squares": estimators.least_squares,
+}
+NOWHERE_NEAR, NEAR = jnp.array([0.0, 0.2]), jnp.array([0.9, 0.2])
+
+
+def dead_zone(x):
+    """Nothing within 1 of zero, then a slope."""
+    return 1e6 + jnp.maximum(jnp.abs(x) - 1, 0.0).sum()
+
+
+def reasons(estimator, function, points, stddev=0.1, **settings):
+    """The reason at each of the points, in one compiled and batched program with chunks."""
+
+    def one(point):
+        settings_ = {"num_samples": 16, "chunk_size": 6} | settings
+        return estimator(mg.parameter_noise(function, stddev), point, jax.random.key(3), **settings_)
+
+    found = jax.jit(jax.vmap(one))(points)
+    return [Reason[item] for item in np.ravel(found.reason)], found
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_dead_zone_is_named_and_its_edge_is_not(name):
+    """From 0.9 the noise of 0.1 takes one sample in six over the edge."""
+    found, estimate = reasons(ESTIMATORS[name], dead_zone, jnp.stack([NOWHERE_NEAR, NEAR]))
+    half = len(found) // 2
+    assert set(found[:half]) == {Reason[Reason.nothing_felt]}
+    assert Reason[Reason.nothing_felt] not in found[half:]
+    np.testing.assert_allclose(estimate.value[0], 0, atol=1e-8)
+    assert np.all(np.asarray(estimate.alpha)[0] == (1 if name == "first_order" else 0))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_optimum_is_felt(name):
+    """Costs differ under noise, be it small, and so do derivatives; also where all costs round to the same number."""
+    for height, stddev in ((0.0, 0.1), (0.0, 1e-6)):
+        found, _ = reasons(ESTIMATORS[name], lambda x, h=height: h + (x**2).sum(), jnp.zeros((1, 2)), stddev)
+        assert Reason[Reason.nothing_felt] not in found
+    if name in ("first_order", "alpha_order", "per_step", "control_variate"):
+        found, _ = reasons(ESTIMATORS[name], lambda x: 1e9 + (x**2).sum(), jnp.zeros((1, 2)), 1e-5)
+        assert Reason[Reason.nothing_felt] not in found
+
+
+def test_noise_that_is_zero_is_no_evidence():
+    """At an optimum without noise all costs are the same and all derivatives are zero."""
+
+    def one(stddev):
+        objective = mg.parameter_noise(lambda x: (x**2).sum(), stddev)
+        return estimators.first_order(objective, jnp.zeros(2), jax.random.key(0), num_samples=4).reason
+
+    found = jax.vmap(one)(jnp.array([0.0, 0.1]))
+    assert not np.any(found == Reason.nothing_felt)
+
+
+def test_a_step_that_some_samples_meet_is_felt(key):
+    """Its derivative is zero everywhere; the costs tell."""
+    estimate = estimators.first_order(mg.parameter_noise(textbook.step, 0.1), jnp.zeros(1), key, num_samples=16)
+    assert Reason[estimate.reason] == Reason[Reason.fixed]
+
+
+def test_samples_that_are_not_finite_are_felt(key):
+    cost = mg.parameter_noise(lambda x: jnp.where(x[0] > 0, jnp.nan, 3.0), 0.1)
+    estimate = estimators.alpha_order(cost, jnp.zeros(1), key, num_samples=16)
+    assert 2 < estimate.num_finite < 16
+    assert Reason[estimate.reason] != Reason[Reason.nothing_felt]
+
+
+class Untouched(textbook.RandomStart):
+    """A ball that rolls from a random start and never meets the hand; the cost is where it ends."""
+
+    def run(self, controls, params=None, noise=None, start=None):
+        return super().run(jnp.zeros((self.horizon, 1)), start=start)
+
+
+@pytest.mark.parametrize("name", ["alpha_order", "zero_noise"])
+def test_random_starts_are_compared_with_themselves(key, name):
+    """Costs differ by their starts; from the same start they do not. The same system with a hand on it is felt."""
+    controls, run = jnp.zeros(4), functools.partial(ESTIMATORS[name], num_samples=16)
+    for task, is_nothing in ((Untouched(), True), (textbook.RandomStart(), False)):
+        estimate = run(mg.open_loop(task, 0.1), controls, key)
+        assert estimate.objective_standard_error > 0
+        assert (Reason[estimate.reason] == Reason[Reason.nothing_felt]) == is_nothing

@@ -1,0 +1,111 @@
+"""Parameters that are a dict or an equinox module: the estimate has their form, and the numbers are those of the vector."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import diagnostics, estimators
+from mjxgrad.objective import parameter_noise
+from tests.estimators import textbook
+
+VECTOR = jnp.array([0.5, -1.2, 0.4])
+STDDEV = jnp.array([0.1, 0.4, 0.2])
+VECTOR_OBJECTIVE = parameter_noise(textbook.bumpy, STDDEV)
+
+
+class Push(eqx.Module):
+    """Parameters beside what is none."""
+
+    force: jax.Array
+    place: jax.Array
+    profile: object
+
+
+FORMS = {
+    "dict": {"force": VECTOR[:2], "place": VECTOR[2]},
+    "module": Push(VECTOR[:2], VECTOR[2], jnp.tanh),
+}
+
+
+def leaves(tree):
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))])
+
+
+OBJECTIVE = parameter_noise(lambda tree: textbook.bumpy(leaves(tree)), STDDEV)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    "name", ["first_order", "zeroth_order", "alpha_order", "per_step", "control_variate", "least_squares"]
+)
+def test_an_estimate_has_the_form_of_the_parameters(key, name, form):
+    estimator = functools.partial(getattr(estimators, name), num_samples=20)
+    tree = eqx.filter_jit(estimator)(OBJECTIVE, FORMS[form], key)
+    vector = eqx.filter_jit(estimator)(VECTOR_OBJECTIVE, VECTOR, key)
+    arrays = eqx.filter(FORMS[form], eqx.is_array)
+    for field in ("value", "standard_error", "covariance_diagonal"):
+        found = getattr(tree, field)
+        assert jax.tree.structure(found) == jax.tree.structure(arrays)
+        np.testing.assert_allclose(leaves(found), getattr(vector, field), rtol=1e-10)
+    np.testing.assert_allclose(tree.variance, vector.variance, rtol=1e-10)
+    assert eqx.apply_updates(FORMS[form], tree.value) is not None
+
+
+def test_both_orders_have_the_form_and_a_batch_keeps_its_variances_apart(key):
+    def both(scale):
+        params = jax.tree.map(lambda leaf: leaf * scale, FORMS["dict"])
+        return estimators.first_and_zeroth_order(OBJECTIVE, params, key, num_samples=20)
+
+    first, zeroth = jax.vmap(both)(jnp.array([1.0, 0.5]))
+    alone = estimators.first_order(VECTOR_OBJECTIVE, 0.5 * VECTOR, key, num_samples=20)
+    assert first.value["force"].shape == zeroth.value["force"].shape == (2, 2)
+    np.testing.assert_allclose(first.variance[1], alone.variance, rtol=1e-10)
+
+
+def test_a_policy_gets_its_gradient_in_its_own_form(key):
+    policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}
+    objective = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.1, params=policy)
+    for estimator in (estimators.zeroth_order, estimators.reinforce):
+        tree = estimator(objective, policy, key, num_samples=8)
+        vector = estimator(objective, objective.ravel(policy), key, num_samples=8)
+        assert tree.value["gain"].shape == (1, 2)
+        np.testing.assert_allclose(objective.ravel(tree.value), vector.value, rtol=1e-12)
+
+
+def test_a_comparison_takes_them_and_a_reference_of_their_form(key):
+    truth = textbook.bumpy_gradient(np.asarray(VECTOR), np.asarray(STDDEV))
+    tables = [
+        diagnostics.compare(
+            {"first": estimators.first_order}, objective, params, key,
+            budget=diagnostics.Rollouts(10), reference=reference, num_repeats=5,
+        )
+        for objective, params, reference in (
+            (VECTOR_OBJECTIVE, VECTOR, truth),
+            (OBJECTIVE, FORMS["dict"], {"force": truth[:2], "place": truth[2]}),
+        )
+    ]  # fmt: skip
+    np.testing.assert_allclose(tables[1].bias, tables[0].bias, rtol=1e-9)
+
+
+def test_a_sweep_over_softness_takes_points_of_their_form(key):
+    def swept(objective, points):
+        return diagnostics.bias_variance(
+            lambda scale: objective.with_stddev(scale * STDDEV), points, key,
+            softness=jnp.array([1.0]), num_samples=8, num_reference=8, num_resamples=10,
+        )  # fmt: skip
+
+    points = jnp.stack([VECTOR, 2 * VECTOR])
+    vector = swept(VECTOR_OBJECTIVE, points)
+    tree = swept(OBJECTIVE, {"force": points[:, :2], "place": points[:, 2]})
+    np.testing.assert_array_equal(tree.params, points)
+    np.testing.assert_allclose(tree.first.value, vector.first.value, rtol=1e-9)
+
+
+def test_parameters_without_a_number_to_move_are_refused(key):
+    with pytest.raises(ValueError, match="params must have floating-point arrays"):
+        estimators.first_order(OBJECTIVE, {"force": 1}, key, num_samples=4)
