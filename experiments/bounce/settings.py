@@ -20,6 +20,11 @@ class ImpedanceSettings(SettingsTable):
     """Over which it rises, in m."""
 
     @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Give them in MuJoCo's order."""
+        return self.first, self.last, self.width
+
+    @property
     def label(self) -> str:
         """Give a name for headings."""
         if self.first == self.last:
