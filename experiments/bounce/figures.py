@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 
-from experiments.bounce.measure import Outcome
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
+from experiments.bounce.measure import TOLERANCE, Outcome
+from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
 
 _LOOKS = {DISCRETE: (FIRST, "o"), EVENT: (ZEROTH, "s"), CONTINUOUS: (ONSET, "D")}
@@ -13,7 +13,7 @@ _LOOKS = {DISCRETE: (FIRST, "o"), EVENT: (ZEROTH, "s"), CONTINUOUS: (ONSET, "D")
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"derivative": derivative, "steps": steps, "error": error}
+    return {"derivative": derivative, "error": error}
 
 
 def derivative(outcome: Outcome):
@@ -77,7 +77,7 @@ def error(outcome: Outcome):
         if j == 0:
             axis.set_ylabel(f"{settings.impedances[i].label}\ntime constant, ms", fontsize=8)
     bar = figure.colorbar(look, ax=axes, shrink=0.8, pad=0.01)
-    names = {1e-3: "≤ 0.1%", 1e-2: "1%", settings.tolerance: f"{settings.tolerance:.0%}", 0.3: "30%", 1: "≥ 100%"}
+    names = {1e-3: "≤ 0.1%", 1e-2: "1%", TOLERANCE: f"{TOLERANCE:.0%}", 0.3: "30%", 1: "≥ 100%"}
     bar.set_ticks(list(names), labels=list(names.values()))
     bar.ax.minorticks_off()
     caption = (
@@ -86,29 +86,3 @@ def error(outcome: Outcome):
         "is unstable there, or the slope is not known well enough."
     )
     return figure, "Error over all contacts", caption
-
-
-def steps(outcome: Outcome):
-    """Errors of all derivatives against how many steps a contact lasts; contacts that set in with a jump apart."""
-    grid, tolerance = outcome.grid, outcome.settings.tolerance
-    figure, axes = subplots(1, 2, height=3.6, sharey=True, sharex=True)
-    has_jump = grid.impedance_first > 0
-    panels = {"Contact sets in with a jump of force": has_jump, "Contact sets in gently": ~has_jump}
-    for axis, (title, chosen) in zip(axes[0], panels.items(), strict=True):
-        shown = (grid.judged & chosen).values
-        for arm in ARMS:
-            colour, marker = _LOOKS[arm]
-            errors = grid.error.sel(arm=arm).clip(min=1e-4).values[shown]
-            count = grid.steps_in_contact.values[shown]
-            axis.plot(count, errors, marker, color=colour, ms=3.5, mec="none", alpha=0.6, label=arm)
-        axis.axhline(tolerance, color=MUTED, lw=1, ls=(0, (2, 3)))
-        axis.set(title=title, xlabel="time steps that the contact lasts", xscale="log", yscale="log")
-        plain(axis.xaxis)
-        plain(axis.yaxis, 100, "%")
-    axes[0, 0].set_ylabel("error")
-    legend_below(figure, axes[0, 0], 3)
-    caption = (
-        "The same errors, of all three, against the number of time steps that the contact lasts: one dot per contact and time "
-        f"step. Dotted, {tolerance:.0%}. Errors larger than the slope lie at 100%, those below 10⁻⁴ there."
-    )
-    return figure, "Error against steps in contact", caption

@@ -4,35 +4,37 @@ import itertools
 
 import numpy as np
 
-from experiments.bounce.measure import CONTACT, Outcome
+from experiments.bounce.measure import CONTACT, TOLERANCE, Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Table
 from experiments.words import joined
 
 # Steps in contact by which the outcome is told apart.
 _STEPS = (0, 3, 6, 10, 20, np.inf)
+# Largest time step at which the tolerance is asked for, and one at which this one is enough (s).
+_FINE, _COARSE, _COARSE_TOLERANCE = 5e-4, 2e-3, 0.3
 _ORDER = (CONTINUOUS, EVENT, DISCRETE)
 
 
 def verdict(outcome: Outcome) -> str:
     """Say how often each derivative is the slope."""
-    settings = outcome.settings
-    fine = outcome.grid.where(outcome.grid.timestep <= settings.fine_timestep, drop=True)
+    grid = outcome.grid
+    fine = grid.isel(timestep=grid.timestep.values <= _FINE)
+    coarse = grid.isel(timestep=np.isclose(grid.timestep.values, _COARSE))
     judged = int(fine.judged.sum())
     if not judged:
         return "At no contact is the slope known well enough: take more phases."
     within = [f"{int(fine.holds.sel(arm=arm).sum())} ({arm})" for arm in _ORDER]
     sentence = (
-        f"Up to {1e3 * settings.fine_timestep:g} ms the mean derivative is within {settings.tolerance:.0%} of the slope at "
-        f"{joined(within)} of {judged} contacts and time steps."
+        f"Up to {1e3 * _FINE:g} ms the mean derivative is within {TOLERANCE:.0%} of the slope at {joined(within)} of {judged} "
+        "contacts and time steps."
     )
-    coarse = outcome.grid.isel(timestep=np.isclose(outcome.grid.timestep, settings.coarse_timestep))
     if not coarse.timestep.size:
         return sentence
-    close = [int(((coarse.error <= settings.coarse_tolerance) & coarse.judged).sel(arm=arm).sum()) for arm in _ORDER]
+    close = [int(((coarse.error <= _COARSE_TOLERANCE) & coarse.judged).sel(arm=arm).sum()) for arm in _ORDER]
     return (
-        f"{sentence} At {1e3 * settings.coarse_timestep:g} ms it is within {settings.coarse_tolerance:.0%} at {close[0]} and "
-        f"{close[1]} (event) of {int(coarse.judged.sum())}."
+        f"{sentence} At {1e3 * _COARSE:g} ms it is within {_COARSE_TOLERANCE:.0%} at {close[0]} and {close[1]} (event) of "
+        f"{int(coarse.judged.sum())}."
     )
 
 
@@ -70,11 +72,7 @@ def findings(outcome: Outcome) -> list[str]:
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate where the derivatives hold: by how many steps the contact lasts, and contact by contact."""
-    return [_by_steps(outcome), _by_contact(outcome)]
-
-
-def _by_steps(outcome: Outcome) -> Table:
+    """Tabulate where the derivatives hold by how many steps the contact lasts."""
     grid, rows = outcome.grid, []
     spread = grid.spread / abs(grid.slope)
     for low, high in itertools.pairwise(_STEPS):
@@ -86,37 +84,9 @@ def _by_steps(outcome: Outcome) -> Table:
             error, width = (float(one.sel(arm=arm).where(inside).median()) for one in (grid.error, spread))
             row += [str(int(grid.holds.sel(arm=arm).where(inside, False).sum())), f"{error:.1%}", f"{width:.2g}"]
         rows.append(row)
-    heads = [
-        f"{what}, {arm}" for arm in _ORDER for what in (f"within {outcome.settings.tolerance:.0%}", "error", "spread")
-    ]
-    return Table(
-        ("steps in contact", "judged", *heads),
-        rows,
+    heads = [f"{what}, {arm}" for arm in _ORDER for what in (f"within {TOLERANCE:.0%}", "error", "spread")]
+    caption = (
         "Contacts and time steps by how long the contact lasts. Error of the mean derivative as a share of the slope of its own "
-        "height, at most 100%, and standard deviation of single derivatives over the slope: medians.",
+        "height, at most 100%, and standard deviation of single derivatives over the slope: medians."
     )
-
-
-def _by_contact(outcome: Outcome) -> Table:
-    grid, rows, emphasised = outcome.grid.sel(arm=CONTINUOUS), [], set()
-    for place in np.ndindex(grid.truth.shape):
-        one = grid.isel(dict(zip(CONTACT, place, strict=True)))
-        emphasised |= {(len(rows), 4 + int(i)) for i in np.flatnonzero(one.fails)}
-        errors = zip(one.error.values, one.judged.values, strict=True)
-        rows.append(
-            [
-                f"{float(one.damping_ratio):g}",
-                f"{1e3 * float(one.time_constant):g}",
-                str(one.impedance.values),
-                f"{float(one.truth):.3f}".replace("-", "−"),
-                *(f"{error:.1%}" if judged else "—" for error, judged in errors),
-            ]
-        )
-    heads = [f"{1e3 * h:g} ms" for h in grid.timestep.values]
-    return Table(
-        ("damping ratio", "time constant, ms", "impedance", "truth", *heads),
-        rows,
-        "Error with contact that begins within the step, contact by contact, by time step. Bold where it is beyond the "
-        "tolerance by more than two standard errors; — where the step is unstable or the slope not known well enough.",
-        frozenset(emphasised),
-    )
+    return [Table(("steps in contact", "judged", *heads), rows, caption)]

@@ -17,29 +17,19 @@ _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 @dataclass(frozen=True)
 class Case:
-    """A motion with impacts.
-
-    Attributes:
-        title: for headings.
-        model: of C MuJoCo, with its own contact, limits, integrator and time step.
-        moved: index in `qpos` of the coordinate to which the parameter is added.
-        interval: of the parameter (m or rad). It moves the first impact through several time steps.
-        labels: of what is read, with units.
-        read: from positions and velocities to what is kept.
-        duration: in s.
-        qpos: start positions that differ from the model's, by index.
-        qvel: start velocities that differ from zero, by index.
-    """
+    """A motion with impacts."""
 
     title: str
-    model: mujoco.MjModel
-    moved: int
-    interval: tuple[float, float]
-    labels: tuple[str, ...]
+    model: mujoco.MjModel  # with its own contact, limits, integrator and time step
+    moved: int  # index in `qpos` of the coordinate to which the parameter is added
+    interval: tuple[
+        float, float
+    ]  # of the parameter (m or rad), through which the first impact moves by several time steps
+    labels: tuple[str, ...]  # of what is read, with units
     read: Read
-    duration: float
-    qpos: Mapping[int, float] = field(default_factory=dict)
-    qvel: Mapping[int, float] = field(default_factory=dict)
+    duration: float  # in s
+    qpos: Mapping[int, float] = field(default_factory=dict)  # start positions that differ from the model's, by index
+    qvel: Mapping[int, float] = field(default_factory=dict)  # start velocities that differ from zero, by index
 
 
 def case(name: str) -> Case:

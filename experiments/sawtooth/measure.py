@@ -1,6 +1,6 @@
 """From settings to numbers."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,8 @@ from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 
 # The trend that an outcome may have over the interval; what it leaves is the sawtooth.
 _DEGREE = 9
+_READING, _SAMPLE = ("arm", "time", "coordinate"), ("arm", "start", "time", "coordinate")
+_NUM_TIMES = 5  # at which outcomes are read, evenly over the motion
 
 
 @dataclass(frozen=True)
@@ -54,37 +56,26 @@ def course(
     outcome by it, over MuJoCo's teeth, and `closer`, its distance from the reference over MuJoCo's.
     """
     found = [arms[arm] for arm in ARMS]
-    start = found[0].parameters
-
-    def by_arm(read: Callable[[SlopeComparison], np.ndarray], *dims: str) -> tuple[tuple[str, ...], np.ndarray]:
-        return ("arm", *dims, "time", "coordinate"), np.stack([read(one) for one in found])
-
-    def over_slope(one: SlopeComparison, size: np.ndarray) -> np.ndarray:
-        return size / np.maximum(np.abs(one.slope), one.resolution)
-
+    start, shape = found[0].parameters, found[0].slope.shape
+    names = ("slope", "mean", "mean_error", "standard_error", "resolution")
     data = xr.Dataset(
-        {
-            "outcome": by_arm(lambda one: one.outcomes, "start"),
-            "residual": by_arm(lambda one: _without_trend(start, one.outcomes), "start"),
-            "derivative": by_arm(lambda one: one.derivatives[0], "start"),
-            "slope": by_arm(lambda one: one.slope),
-            "mean": by_arm(lambda one: one.mean[0]),
-            "mean_error": by_arm(lambda one: one.mean_error[0]),
-            "error": by_arm(lambda one: over_slope(one, np.abs(one.error[0]))),
-            "excess": by_arm(
-                lambda one: over_slope(one, np.maximum(np.abs(one.error[0]) - 2 * one.standard_error[0], 0))
-            ),
-            "within": by_arm(lambda one: np.abs(one.error[0]) <= 2 * np.maximum(one.standard_error[0], one.resolution)),
-            "spread": by_arm(lambda one: _without_trend(start, one.derivatives[0]).std(axis=0)),
-            "far": by_arm(lambda one: np.abs(one.outcomes - (np.nan if reference is None else reference)).mean(axis=0)),
-        },
+        {name: (_READING, np.stack([getattr(one, name).reshape(shape) for one in found])) for name in names},
         coords={"arm": list(ARMS), "start": start, "time": times, "coordinate": list(labels)},
     ).assign_coords(case=name, title=title, timestep=timestep)
+    data["outcome"] = _SAMPLE, np.stack([one.outcomes for one in found])
+    data["derivative"] = _SAMPLE, np.stack([one.derivatives[0] for one in found])
+    data["residual"] = _SAMPLE, np.stack([_without_trend(start, one.outcomes) for one in found])
     data["sawtooth"] = data.residual.std("start")
+    off, slope = abs(data["mean"] - data.slope), np.maximum(abs(data.slope), data.resolution)
+    data["error"], data["excess"] = off / slope, np.maximum(off - 2 * data.standard_error, 0) / slope
+    data["within"] = off <= 2 * np.maximum(data.standard_error, data.resolution)
+    missing = np.full_like(found[0].outcomes, np.nan) if reference is None else reference
+    data["far"] = abs(data.outcome - xr.DataArray(missing, dims=_SAMPLE[1:])).mean("start")
+    spread = np.stack([_without_trend(start, one.derivatives[0]).std(axis=0) for one in found])
     theirs, own = (data.sel(arm=arm, drop=True) for arm in (DISCRETE, CONTINUOUS))
     tiny = np.finfo(float).tiny
     return data.assign(
-        spread=data.spread / abs(own.slope),
+        spread=xr.DataArray(spread, dims=_READING) / abs(own.slope),
         has_impact=theirs.sawtooth > 1e-6 * (abs(theirs.outcome).max("start") + tiny),
         smaller=theirs.sawtooth / np.maximum(own.sawtooth, tiny),
         shift=abs((own.outcome - theirs.outcome).mean("start")) / theirs.sawtooth,
@@ -110,20 +101,12 @@ class _Simulate(eqx.Module):
     onset: mg.Onset | None
     read: Read = eqx.field(static=True)
     moved: int = eqx.field(static=True)
-    num_times: int = eqx.field(static=True)
     gradient: str = eqx.field(static=True)
 
     def __call__(self, parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
         start = self.start.replace(qpos=self.start.qpos.at[self.moved].add(parameter))
-        return motion(
-            self.model,
-            start,
-            self.read,
-            num_times=self.num_times,
-            steps_between=self.steps_between,
-            gradient=self.gradient,
-            onset=self.onset,
-        )
+        between, how = self.steps_between, {"gradient": self.gradient, "onset": self.onset}
+        return motion(self.model, start, self.read, num_times=_NUM_TIMES, steps_between=between, **how)
 
 
 @eqx.filter_jit
@@ -153,11 +136,11 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     start = scene.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
     # Neither evenly spaced nor of one length: teeth must not fall in step with the starts.
     parameters = phases(one.interval, settings.num_phases)
-    steps = max(1, round(one.duration / timestep / settings.num_times))
+    steps = max(1, round(one.duration / timestep / _NUM_TIMES))
 
     def sampled(gradient: str, onset: mg.Onset | None, refinement: int = 1) -> tuple[np.ndarray, np.ndarray]:
         model, count = at_time_step(scene.model, timestep / refinement), jnp.int32(steps * refinement)
-        simulate = _Simulate(model, start, count, onset, one.read, one.moved, settings.num_times, gradient)
+        simulate = _Simulate(model, start, count, onset, one.read, one.moved, gradient)
         values, slopes = _sample(simulate, jnp.asarray(parameters))
         return np.asarray(values), np.asarray(slopes)
 
@@ -166,5 +149,5 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
         outcomes, derivatives = sampled(gradient, onset)
         arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
     reference = sampled("discrete", None, settings.reference)[0] if settings.reference else None
-    times = timestep * steps * np.arange(1, settings.num_times + 1)
+    times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
     return course(name, one.title, one.labels, timestep, times, arms, reference)

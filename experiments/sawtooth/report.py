@@ -29,9 +29,7 @@ def findings(outcome: Outcome) -> list[str]:
     off = [c for c in outcome.courses if (c.excess.sel(arm=CONTINUOUS).where(c.has_impact) > 0.05).any()]
     if off:
         sentences.append(f"Some mean derivative is more than 5% beyond its error in {joined(map(_name, off))}.")
-    shift, closer = _pooled(outcome, "shift"), _pooled(outcome, "closer")
-    if shift.size:
-        sentences.append(f"The mean outcome shifts by {np.median(shift):.2f} of MuJoCo's sawtooth in the median.")
+    closer = _pooled(outcome, "closer")
     if closer.size and np.isfinite(closer).all():
         sentences.append(
             f"Beside MuJoCo's motion at a step many times shorter its error is {np.median(closer):.2f} of MuJoCo's own in the "
