@@ -138,4 +138,4 @@ def errorbar(axis: Axes, x: np.ndarray, value: np.ndarray, ends: np.ndarray, **l
     """Draw values with the ends (low, high) of their intervals."""
     # An end may lie beyond its value by rounding alone.
     errors = np.maximum([value - ends[0], ends[1] - value], 0)
-    axis.errorbar(x, value, errors, **({"lw": 1.0, "elinewidth": 1.1, "capsize": 2} | look))
+    axis.errorbar(x, value, errors.reshape(2, -1), **({"lw": 1.0, "elinewidth": 1.1, "capsize": 2} | look))

@@ -8,20 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import FixedLocator, NullLocator
 
+from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
-from experiments.theme import (
-    DEFAULT,
-    FIRST,
-    MUTED,
-    REFERENCE,
-    ZEROTH,
-    Drawings,
-    errorbar,
-    legend_below,
-    power,
-    shades,
-    subplots,
-)  # fmt: skip
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.workspace import Workspace
 
@@ -37,9 +26,9 @@ def landscape(outcome: Outcome):
     """Cost against angle for each stiffness, without noise and under it."""
     figure, axes = subplots(1, 2, height=4.0, sharey=True)
     found, table = outcome.landscape, outcome.table
-    colours = iter(shades(int((~table.is_default).sum())))
+    colours = iter(theme.shades(int((~table.is_default).sum())))
     looks = [
-        {"color": DEFAULT, "ls": (0, (4, 1.5)), "label": "default"}
+        {"color": theme.DEFAULT, "ls": (0, (4, 1.5)), "label": "default"}
         if is_default
         else {"color": next(colours), "label": power(stiffness)}
         for stiffness, is_default in zip(table.stiffness.values, table.is_default.values, strict=True)
@@ -83,7 +72,7 @@ def gradient(outcome: Outcome):
         axis.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
         axis.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useMathText=True)
     axes[0, 0].set_ylabel("gradient, m²/rad")
-    legend_below(figure, axes[0, 0], 3)
+    theme.legend_below(figure, axes[0, 0], 3)
     caption = (
         f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each angle. "
         "The reference comes from rollouts of its own; the grey band is its interval. Intervals that leave a panel are "
@@ -112,7 +101,7 @@ def bias_variance(outcome: Outcome):
         below.set_yscale("log")
     axes[0, 0].set_ylabel("bias of first order, m²/rad")
     axes[1, 0].set_ylabel("variance of one sample, (m²/rad)²")
-    legend_below(figure, axes[1, 0], 2)
+    theme.legend_below(figure, axes[1, 0], 2)
     percent = f"{outcome.settings.confidence:.0%}"
     caption = (
         f"Above, the mean of the first-order estimate less the reference, with the {percent} interval of the difference; "
@@ -208,7 +197,7 @@ def _bars(axis: Axes, one: xr.Dataset, name: str, colour: str, marker: str, labe
     for rows, look in ((swept, {"marker": marker, "lw": 1.2, "label": label}), (~swept, {"marker": "D", "ls": ""})):
         picked = one.isel(stiffness=rows)
         ends = picked[[f"{name}_low", f"{name}_high"]].to_array().values
-        errorbar(axis, shift * picked.stiffness.values, picked[name].values, ends, color=colour, ms=5, **look)
+        theme.errorbar(axis, shift * picked.stiffness.values, picked[name].values, ends, color=colour, ms=5, **look)
 
 
 def _symlog_ticks(axis: Axes, threshold: float, extreme: float) -> None:

@@ -1,7 +1,5 @@
 """The answer of a bias and variance experiment in words, computed from its numbers."""
 
-from collections.abc import Callable
-
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -64,34 +62,21 @@ def _with_half_width(one: xr.Dataset, name: str) -> str:
 
 
 def _choice(swept: xr.Dataset) -> str:
-    """Say which estimate is closer: by stiffness or by angle, whichever leaves less undecided."""
-    first, zeroth = swept.first_wins.values, swept.zeroth_wins.values
-    for name, wins, others in (("first", first, zeroth), ("zeroth", zeroth, first)):
-        if not others.any():
-            return f"{name} order is {_degree(wins)} at every stiffness and angle"
-    by_stiffness = _sides(first, zeroth, lambda rows: f"at every angle {_range(swept.stiffness, rows)}")
-    by_angle = _sides(first.T, zeroth.T, lambda columns: f"{_angles(swept.angle[columns])} at every stiffness")
-    parts, _ = min(by_stiffness, by_angle, key=lambda sides: sides[1])
-    return joined(parts)
-
-
-def _sides(first: np.ndarray, zeroth: np.ndarray, words: Callable[[ArrayLike], str]) -> tuple[list[str], int]:
-    """Describe the groups (rows) where one estimate never loses, and the others, with the number of their cases."""
-    has_first, has_zeroth = first.any(axis=1), zeroth.any(axis=1)
-    sides = {"first": (first, has_first & ~has_zeroth), "zeroth": (zeroth, has_zeroth & ~has_first)}
-    parts = [
-        f"{name} order is {_degree(wins[rows])} {words(rows)}" for name, (wins, rows) in sides.items() if rows.any()
-    ]
-    if (ties := ~has_first & ~has_zeroth).any():
-        parts.append(f"both are as close {words(ties)}")
-    if (mixed := has_first & has_zeroth).any():
-        count = f"{first[mixed].sum()} to {zeroth[mixed].sum()} of {first[mixed].size} cases"
-        parts.append(f"it is mixed {words(mixed)} (first order to zeroth order: {count})")
-    return parts, int(first[mixed].size)
-
-
-def _degree(wins: np.ndarray) -> str:
-    return "closer" if wins.all() else "as close or closer"
+    """Say up to which stiffness zeroth order is nowhere closer, by angle, and what comes beyond."""
+    zeroth, last = swept.zeroth_wins.values, swept.stiffness.size
+    until = np.where(zeroth.any(axis=0), zeroth.argmax(axis=0), last)
+    beyond = np.arange(last)[:, None] >= until
+    if (until == last).all():
+        return "first order is as close or closer at every stiffness and angle"
+    if (until == 0).all() and zeroth.all():
+        return "zeroth order is closer at every stiffness and angle"
+    parts = []
+    for end in np.unique(until)[::-1]:
+        rows = np.arange(last) < end
+        where = "nowhere" if end == 0 else "everywhere" if end == last else _range(swept.stiffness, rows)
+        parts.append(f"{where} {_angles(swept.angle[until == end])}")
+    count = f"{int((zeroth & beyond).sum())} of {int(beyond.sum())}"
+    return f"first order is as close or closer {joined(parts)}, and beyond that zeroth order is closer in {count} cases"
 
 
 def _angles(angles: xr.DataArray) -> str:

@@ -1,6 +1,5 @@
 """The pictures of the experiment on billiards."""
 
-import numpy as np
 from matplotlib.patches import Circle
 
 from experiments.billiards import hard
@@ -17,14 +16,14 @@ _RADIUS = 0.2
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"cost": cost, "strokes": strokes, "forces": forces}
+    return {"cost": cost, "strokes": strokes}
 
 
 def cost(outcome: Outcome):
     """True cost against steps."""
     figure, axes = subplots(1, 1, height=4.4)
     axis = axes[0, 0]
-    for run, look in zip(outcome.runs, _looks(outcome), strict=True):
+    for run, look in zip(outcome.runs, looks(run.method.label for run in outcome.runs), strict=True):
         style = (0, (4, 2)) if run.touches_at_start else "-"
         axis.plot(run.steps, run.cost, ls=style, ms=4, label=run.method.label, **look)
     for level in (IDLE, hard.optimum()[0]):
@@ -59,25 +58,6 @@ def strokes(outcome: Outcome):
     return figure, "The strokes", caption
 
 
-def forces(outcome: Outcome):
-    """Force along the line of the balls against time."""
-    figure, axes = subplots(1, 1, height=3.4)
-    axis = axes[0, 0]
-    count = outcome.settings.num_pieces
-    times = np.arange(count + 1) / count
-    for run, look in zip(outcome.runs, _looks(outcome), strict=True):
-        along = run.forces.sum(axis=1) / np.sqrt(2)
-        axis.stairs(along, times, color=look["color"], lw=1.3, baseline=None, label=run.method.label)
-    _, end, speed = hard.optimum()
-    gap = np.sqrt(2) - 2 * _RADIUS
-    first, last = 6 * gap / end**2 - 2 * speed / end, 4 * speed / end - 6 * gap / end**2
-    axis.plot([0, end, end, 1], [first, last, 0, 0], color=REFERENCE, lw=1.0)
-    axis.set(xlabel="time, s", ylabel="force, N")
-    legend_below(figure, axis, 3)
-    caption = "Force along the line of the balls that each descent ended with, and the best one for hard balls (black)."
-    return figure, "The forces", caption
-
-
 def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     """Draw a stroke that stands still and the best one, and give the file and its caption."""
     mj_model = load_scene(scene_path("billiards")).mj_model
@@ -103,7 +83,3 @@ def _shown(outcome: Outcome) -> list[Run]:
     stuck = [run for run in apart if run.is_stuck][:1]
     solved = sorted((run for run in apart if not run.is_stuck), key=lambda run: run.final_cost)
     return (stuck + solved)[:4] or list(outcome.runs[:4])
-
-
-def _looks(outcome: Outcome) -> list[dict]:
-    return looks(run.method.label for run in outcome.runs)

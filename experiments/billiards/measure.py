@@ -19,6 +19,9 @@ from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.billiards import Billiards, billiards
 
 IDLE = 2.0  # m², the cost of standing still
+_LEARNING_RATE = 0.1  # of Adam, in N; it falls along a cosine to a twentieth
+_FINAL_SCALE = 0.02  # left at the last step of noise, margin or length; margin and length are then taken away
+_EVALUATIONS = 20  # how often along a descent the true cost is measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +33,6 @@ class Run:
     cost: np.ndarray
     final_cost: float  # of the best forces that were measured
     hard_cost: float  # of the same forces with balls that collide in no time, by another program
-    forces: np.ndarray  # (pieces, 2), in N
     qpos: np.ndarray  # (states, 4) of the stroke with these forces
     touches_at_start: bool
     num_rollouts: int
@@ -69,7 +71,7 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Descend by every method."""
-    task = billiards(num_pieces=settings.num_pieces)
+    task = billiards()
     workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)
     runs = []
@@ -84,10 +86,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 def _run(
     method: MethodSettings, task: Billiards, settings: Settings, key: Array, play: Callable[[Array], Array]
 ) -> Run:
-    every = -(-settings.num_steps // settings.evaluations)
+    every = -(-settings.num_steps // _EVALUATIONS)
     start = task.start(method.start)
-    rate = optax.cosine_decay_schedule(settings.learning_rate, settings.num_steps, 0.05)
-    decay = optax.exponential_decay(1.0, settings.num_steps, settings.final_scale)
+    rate = optax.cosine_decay_schedule(_LEARNING_RATE, settings.num_steps, 0.05)
+    decay = optax.exponential_decay(1.0, settings.num_steps, _FINAL_SCALE)
     result = mg.optimise(
         _objective(method, task.with_gradient(method.gradient), settings),
         start,
@@ -100,14 +102,12 @@ def _run(
         evaluate_every=every,
     )
     steps = np.arange(0, settings.num_steps, every)
-    forces = np.asarray(result.best_params).reshape(-1, 2)
     return Run(
         method=method,
         steps=np.append(steps, settings.num_steps),
         cost=np.append(np.asarray(result.history.noise_free_cost)[steps], result.final_cost),
         final_cost=float(result.best_cost),
-        hard_cost=hard.cost(forces),
-        forces=forces,
+        hard_cost=hard.cost(np.asarray(result.best_params).reshape(-1, 2)),
         qpos=np.asarray(play(result.best_params)),
         touches_at_start=bool(np.any(np.asarray(play(start))[-1, 2:] != 0)),
         num_rollouts=int(result.num_rollouts),
@@ -122,7 +122,7 @@ def _objective(
     """From the scale of the smoothing to what is minimised at it."""
     own = task.scene.model.pair_margin[0]
     # In the last tenth of the steps the contact is as it is.
-    last = settings.final_scale**0.9
+    last = _FINAL_SCALE**0.9
 
     def objective(scale: Float[Array, ""]) -> mg.Objective:
         smoothed = task

@@ -45,39 +45,21 @@ class Outcome:
         return self.grid.to_dataframe().reset_index().to_dict("records")
 
 
-class _Contacts(eqx.Module):
-    """All contacts at one time step; time steps differ in arrays alone, so one compilation serves them all."""
-
-    scene: Scene
-    solref: Float[Array, "cells 2"]
-    solimp: Float[Array, "cells 5"]
-    timestep: Float[Array, ""]
-    num_steps: Int[Array, ""]
-
-    def height(self, start: Float[Array, ""], cell: Int[Array, ""], arm: str) -> Float[Array, ""]:
-        """Bounce once, from a start height to the height at the end."""
-        model = at_time_step(self.scene.model, self.timestep)
-        model = model.replace(
-            geom_solref=jnp.broadcast_to(self.solref[cell], model.geom_solref.shape),
-            geom_solimp=jnp.broadcast_to(self.solimp[cell], model.geom_solimp.shape),
-        )
-        data = self.scene.data.replace(qpos=start[None], qvel=jnp.array([-SPEED]))
-        gradient, onset = ARMS[arm]
-        read = motion(model, data, _height, num_times=1, steps_between=self.num_steps, gradient=gradient, onset=onset)
-        return read[0]
-
-
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Compare derivatives with the slope for every contact and time step."""
     cells = list(itertools.product(settings.damping_ratios, settings.time_constants, settings.impedances))
     shape = (len(settings.damping_ratios), len(settings.time_constants), len(settings.impedances))
     scene, starts = bounce_scene(), jnp.asarray(phases(settings.heights, settings.num_phases))
+    contacts = (
+        jnp.array([(constant, ratio) for ratio, constant, _ in cells]),
+        jnp.array([(*impedance.numbers, 0.5, 2.0) for *_, impedance in cells]),
+    )
     sampled = []
     with workspace.stage("rollouts", "time steps", len(settings.timesteps)) as advance_to:
-        for timestep in settings.timesteps:
-            contacts, width = _contacts(scene, cells, settings, timestep), SPEED * timestep
-            pairs = [_values_and_derivatives(contacts, starts, arm) for arm in ARMS]
-            ends = [_values_and_derivatives(contacts, starts + side * width / 2, DISCRETE)[0] for side in (1, -1)]
+        for h in settings.timesteps:
+            time, width = (jnp.asarray(h), jnp.int32(round(settings.duration / h))), SPEED * h
+            pairs = [_sample(scene, contacts, starts, *time, arm) for arm in ARMS]
+            ends = [_sample(scene, contacts, starts + side * width / 2, *time, DISCRETE)[0] for side in (1, -1)]
             sampled.append([*itertools.chain(*pairs), (ends[0] - ends[1]) / width])
             advance_to(len(sampled))
     *columns, wide = (np.stack(each, axis=1).reshape(len(starts), -1, *shape) for each in zip(*sampled, strict=True))
@@ -128,29 +110,31 @@ def _truth(ratio: float, constant: float, impedance: ImpedanceSettings) -> tuple
     return -restitution, closed, duration
 
 
-def _contacts(scene: Scene, cells: list[tuple], settings: Settings, timestep: float) -> _Contacts:
-    return _Contacts(
-        scene,
-        jnp.array([(constant, ratio) for ratio, constant, _ in cells]),
-        jnp.array([(*impedance.numbers, 0.5, 2.0) for *_, impedance in cells]),
-        jnp.asarray(timestep),
-        jnp.int32(round(settings.duration / timestep)),
-    )
-
-
 def _height(qpos: Float[Array, " 1"], qvel: Float[Array, " 1"]) -> Float[Array, ""]:
     return qpos[0]
 
 
 @eqx.filter_jit
-def _values_and_derivatives(
-    contacts: _Contacts, starts: Float[Array, " phases"], arm: str
-) -> tuple[Float[Array, "phases cells"], Float[Array, "phases cells"]]:
-    """Bounce from every start on every contact, as a single batch."""
+def _sample(
+    scene: Scene, contacts: tuple[Array, Array], starts: Array, timestep: Array, num_steps: Array, arm: str
+) -> tuple[Float[Array, "phases contacts"], Float[Array, "phases contacts"]]:
+    """Give heights and derivatives from every start on every contact, as a single batch.
 
-    def one(start: Float[Array, ""], cell: Int[Array, ""]) -> tuple[Array, Array]:
-        return jax.jvp(lambda x: contacts.height(x, cell, arm), (start,), (jnp.ones_like(start),))
+    Time steps differ in arrays alone, so one compilation serves them all.
+    """
+    (gradient, onset), (solref, solimp), count = ARMS[arm], contacts, len(contacts[0])
 
-    count = len(contacts.solref)
+    def height(start: Float[Array, ""], contact: Int[Array, ""]) -> Float[Array, ""]:
+        model = at_time_step(scene.model, timestep)
+        model = model.replace(
+            geom_solref=jnp.broadcast_to(solref[contact], model.geom_solref.shape),
+            geom_solimp=jnp.broadcast_to(solimp[contact], model.geom_solimp.shape),
+        )
+        data = scene.data.replace(qpos=start[None], qvel=jnp.array([-SPEED]))
+        return motion(model, data, _height, num_times=1, steps_between=num_steps, gradient=gradient, onset=onset)[0]
+
+    def one(start: Float[Array, ""], contact: Int[Array, ""]) -> tuple[Array, Array]:
+        return jax.jvp(lambda x: height(x, contact), (start,), (jnp.ones_like(start),))
+
     values = jax.vmap(one)(jnp.repeat(starts, count), jnp.tile(jnp.arange(count), len(starts)))
     return jax.tree.map(lambda x: x.reshape(len(starts), count), values)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, Read, at_time_step, motion
@@ -92,29 +92,18 @@ def _without_trend(
     return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(values.shape)
 
 
-class _Simulate(eqx.Module):
-    """From the parameter to the readings; time steps differ in arrays alone, so one compilation serves them all."""
-
-    model: mjx.Model
-    start: mjx.Data
-    steps_between: Int[Array, ""]
-    onset: mg.Onset | None
-    read: Read = eqx.field(static=True)
-    moved: int = eqx.field(static=True)
-    gradient: str = eqx.field(static=True)
-
-    def __call__(self, parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
-        start = self.start.replace(qpos=self.start.qpos.at[self.moved].add(parameter))
-        between, how = self.steps_between, {"gradient": self.gradient, "onset": self.onset}
-        return motion(self.model, start, self.read, num_times=_NUM_TIMES, steps_between=between, **how)
-
-
 @eqx.filter_jit
-def _sample(simulate: _Simulate, parameters: Float[Array, " starts"]) -> tuple[Array, Array]:
-    def one(parameter: Float[Array, ""]) -> tuple[Array, Array]:
-        return jax.jvp(simulate, (parameter,), (jnp.ones_like(parameter),))
+def _sample(
+    model: mjx.Model, start: mjx.Data, parameters: Array, steps_between: Array, read: Read, moved: int, arm: str
+) -> tuple[Array, Array]:
+    """Give readings and derivatives; time steps differ in arrays alone, so one compilation serves them all."""
+    gradient, onset = ARMS[arm]
+    how = {"num_times": _NUM_TIMES, "steps_between": steps_between, "gradient": gradient, "onset": onset}
 
-    return jax.vmap(one)(parameters)
+    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+        return motion(model, start.replace(qpos=start.qpos.at[moved].add(parameter)), read, **how)
+
+    return jax.vmap(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)))(parameters)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -138,16 +127,15 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     parameters = phases(one.interval, settings.num_phases)
     steps = max(1, round(one.duration / timestep / _NUM_TIMES))
 
-    def sampled(gradient: str, onset: mg.Onset | None, refinement: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def sampled(arm: str, refinement: int = 1) -> list[np.ndarray]:
         model, count = at_time_step(scene.model, timestep / refinement), jnp.int32(steps * refinement)
-        simulate = _Simulate(model, start, count, onset, one.read, one.moved, gradient)
-        values, slopes = _sample(simulate, jnp.asarray(parameters))
-        return np.asarray(values), np.asarray(slopes)
+        both = _sample(model, start, jnp.asarray(parameters), count, one.read, one.moved, arm)
+        return [np.asarray(each) for each in both]
 
     arms = {}
-    for arm, (gradient, onset) in ARMS.items():
-        outcomes, derivatives = sampled(gradient, onset)
+    for arm in ARMS:
+        outcomes, derivatives = sampled(arm)
         arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
-    reference = sampled("discrete", None, settings.reference)[0] if settings.reference else None
+    reference = sampled(DISCRETE, settings.reference)[0] if settings.reference else None
     times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
     return course(name, one.title, one.labels, timestep, times, arms, reference)

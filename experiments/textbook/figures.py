@@ -16,7 +16,7 @@ def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
     found: dict[str, Any] = {"problem": problem, "samples": samples}
     found |= {} if outcome.by_stiffness is None else {"stiffness": stiffness}
-    return found | ({} if outcome.missing is None else {"missing": missing})
+    return found | ({"missing": missing} if outcome.hits else {})
 
 
 def stiffness_name(outcome: Outcome) -> str:
@@ -90,40 +90,36 @@ def stiffness(outcome: Outcome):
 
 def missing(outcome: Outcome):
     """Chance that N samples all miss the slope, and the variance that this implies."""
-    assert outcome.missing is not None
     figure, axes = subplots(1, 2, height=4.0)
     left, right = axes[0]
-    found, x, counts = outcome.missing.found, np.asarray(outcome.settings.stiffness), outcome.missing.counts
-    exact = outcome.missing.probability
-    grid = np.geomspace(counts[0], counts[-1], 200)
-    for i, (p, colour) in enumerate(zip(exact, theme.shades(len(x)), strict=True)):
-        left.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(x[i]))
-        left.plot(counts, outcome.missing.frequency[i], ".", color=colour, ms=4)
+    settings, x, grid = outcome.settings, np.asarray(outcome.settings.stiffness), np.geomspace(2, 1000, 200)
+    for stiff, (p, found), colour in zip(x, outcome.hits, theme.shades(len(x)), strict=True):
+        left.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(stiff))
         if p > 0.5:
             continue  # most samples are on the slope, so that the event is to be on it
         # Where half of the sets miss, and so the interval is widest; bands of all stiffnesses would hide each other.
-        at = np.clip(np.log(0.5) / np.log1p(-p), counts[0], counts[-1])
-        middle, ends = found[i].miss_probability(at), found[i].miss_probability_interval(at)
+        at = np.clip(np.log(0.5) / np.log1p(-p), 2, 1000)
+        middle, ends = found.miss_probability(at), found.miss_probability_interval(at)
         theme.errorbar(left, at, middle, ends, color=colour, marker="D", ms=5, capsize=3, mec="white")
     left.set(title="Chance that all samples miss", xlabel="samples N", xscale="log", ylim=(-0.03, 1.03))
     _ticks(left, np.array([2.0, 10.0, 100.0, 1000.0]))
     look = {"fontsize": 8, "title_fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
     left.legend(title=stiffness_name(outcome), **look)
+    exact, told = np.array([p for p, _ in outcome.hits]), [found for _, found in outcome.hits]
     right.plot(x, (2 * x) ** 2 * exact * (1 - exact), color=REFERENCE, label="variance of a sample, closed form")
-    right.plot(x, [one.variance or np.nan for one in found], "o", color=FIRST, ms=5, label="as the samples show it")
-    bound, label = [one.implied_variance_bound or np.nan for one in found], "at least, from Δ and the bound of β"
+    right.plot(x, [one.variance or np.nan for one in told], "o", color=FIRST, ms=5, label="as the samples show it")
+    bound, label = [one.implied_variance_bound or np.nan for one in told], "at least, from Δ and the bound of β"
     right.plot(x, bound, "_", color=ZEROTH, ms=11, mew=2, label=label)
-    for stiff in x[[one.num_outlying == 0 for one in found]]:
+    for stiff in x[[one.num_outlying == 0 for one in told]]:
         right.axvspan(stiff / 1.25, stiff * 1.25, color=MUTED, alpha=0.15, lw=0)
     right.set(title="Variance of first order", xlabel=stiffness_name(outcome), xscale="log", yscale="log")
     right.legend(loc="lower right")
     _ticks(right, x)
-    settings = outcome.settings
     caption = (
-        "Left, for each stiffness: line, the closed form (1 − β)ᴺ; dots, how often N simulated samples all missed; diamonds, "
-        f"what {settings.missed_samples} first-order samples tell, with its {settings.confidence:.0%} interval. Right, the "
-        "variance of a sample of first order, as the same samples show it, and the least that the discrepancy between them and "
-        "the gradient implies; shaded where no sample hit the slope, so that they show none."
+        "Left, for each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what "
+        f"{settings.missed_samples} first-order samples tell, with its {settings.confidence:.0%} interval. Right, the variance of "
+        "a sample of first order, as the same samples show it, and the least that the discrepancy between them and the gradient "
+        "implies; shaded where no sample hit the slope, so that they show none."
     )
     return figure, "How often samples miss the slope", caption
 

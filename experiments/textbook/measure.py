@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 from scipy import stats
 
 from experiments.failure import ExperimentError, suggest
@@ -22,18 +22,6 @@ from mjxgrad.tasks import textbook
 from mjxgrad.tasks.textbook import Textbook
 
 _RULES = {"consistent": rules.Consistent, "inverse_variance": rules.InverseVariance, "concavity": rules.Concavity}
-# Simulated sets of samples, of which is counted how many miss the slope.
-_SETS = 4000
-
-
-@dataclass(frozen=True)
-class Missing:
-    """How often samples miss the slope of a soft step."""
-
-    counts: Int[np.ndarray, " counts"]  # numbers of samples N
-    probability: Float[np.ndarray, " stiffness"]  # exact chance of one sample to hit the slope
-    frequency: Float[np.ndarray, "stiffness counts"]  # with which N simulated samples all missed it
-    found: list[EmpiricalBias]  # what first-order samples tell of it, by stiffness
 
 
 @dataclass(frozen=True)
@@ -49,7 +37,8 @@ class Outcome:
     by_samples: xr.Dataset
     by_stiffness: xr.Dataset | None
     curves: xr.Dataset  # of the shown problem, along its parameter: cost and gradient, with and without noise
-    missing: Missing | None  # for the soft step
+    # For the soft step, by stiffness: the exact chance β of a sample to hit the slope, and what first-order samples tell of it.
+    hits: list[tuple[float, EmpiricalBias]]
 
     @property
     def sweeps(self) -> list[xr.Dataset]:
@@ -78,7 +67,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     named = {one.label: _estimator(one) for one in settings.estimators}
     shown = settings.shown_stiffness
     problem = _problem(settings, shown)
-    samples_key, stiffness_key, missing_key = jax.random.split(jax.random.key(settings.seed), 3)
+    samples_key, stiffness_key, hits_key = jax.random.split(jax.random.key(settings.seed), 3)
 
     def run(key: Array, stiffness: float | None, rollouts: int) -> Comparison:
         problem = _problem(settings, stiffness)
@@ -105,12 +94,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("estimates", "settings", len(by_samples) + len(by_stiffness)) as advance_to:
         over_samples = sweep(samples_key, by_samples, 0)
         over_stiffness = sweep(stiffness_key, by_stiffness, len(by_samples)) if by_stiffness else None
-    missing = None
-    if settings.problem == "soft_heaviside":
-        with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
-            missing = _missing(settings, missing_key)
+    with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
+        hits = _hits(settings, hits_key) if settings.problem == "soft_heaviside" else []
     gradient = float(problem.gradient(settings.point, settings.stddev))
-    return Outcome(settings, gradient, over_samples, over_stiffness, _curves(problem, settings), missing)
+    return Outcome(settings, gradient, over_samples, over_stiffness, _curves(problem, settings), hits)
 
 
 def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tables: Sequence[Comparison]) -> xr.Dataset:
@@ -177,23 +164,14 @@ def _curves(problem: Textbook, settings: Settings) -> xr.Dataset:
     return xr.Dataset(curves, coords={"parameter": np.asarray(grid)})
 
 
-def _missing(settings: Settings, key: Array) -> Missing:
-    """Estimate the chance to miss the slope from first-order samples, and count how often it is missed."""
-    counts = np.unique(np.geomspace(2, 1000, 25).astype(int))
-    exact, found, frequency = [], [], []
-    point, stddev = settings.point, settings.stddev
+def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:
+    """Estimate the chance to hit the slope from first-order samples."""
+    found, point, stddev = [], settings.point, settings.stddev
     for i, stiffness in enumerate(settings.stiffness):
-        problem = textbook.soft_heaviside(1 / stiffness)
-        samples_key, sets_key = jax.random.split(jax.random.fold_in(key, i))
-        samples = first_order_samples(
-            problem.objective(stddev), jnp.array([point]), samples_key, num_samples=settings.missed_samples
-        )
+        problem, params = textbook.soft_heaviside(1 / stiffness), jnp.array([point])
+        objective, count = problem.objective(stddev), settings.missed_samples
+        samples = first_order_samples(objective, params, jax.random.fold_in(key, i), num_samples=count)
         truth = float(problem.gradient(point, stddev))
-        found.append(empirical_bias(samples, reference=truth, confidence=settings.confidence))
-        exact.append(float(problem.slope_probability(point, stddev)))
-        noise = stddev * np.asarray(jax.random.normal(sets_key, (_SETS, int(counts[-1])), jnp.float32))
-        is_hit = np.abs(point + noise) < 0.5 / stiffness
-        # A set of N misses if its first hit comes later than N.
-        first_hit = np.where(is_hit.any(axis=1), is_hit.argmax(axis=1), np.iinfo(int).max)
-        frequency.append([(first_hit >= count).mean() for count in counts])
-    return Missing(counts, np.array(exact), np.array(frequency), found)
+        told = empirical_bias(samples, reference=truth, confidence=settings.confidence)
+        found.append((float(problem.slope_probability(point, stddev)), told))
+    return found

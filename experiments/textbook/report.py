@@ -108,21 +108,18 @@ def _crossing(outcome: Outcome) -> str | None:
     return f"With {count} rollouts zeroth order is closer at {ahead.sum()} of {len(x)} values of {name}."
 
 
-def _unseen(outcome: Outcome) -> str | None:
-    if outcome.missing is None:
-        return None
-    x, found, exact = outcome.settings.stiffness, outcome.missing.found, outcome.missing.probability
-    rarer = np.minimum(exact, 1 - exact)
-    covered = [
-        one.probability_interval[0] <= p <= one.probability_interval[1] for one, p in zip(found, rarer, strict=True)
-    ]
-    sentence = f"The interval of β contains the closed form at {sum(covered)} of {len(x)} stiffnesses."
-    i = next((i for i, one in enumerate(found) if one.num_outlying == 0), None)
-    if i is None:
-        return sentence
-    return (
-        f"{sentence} At {stiffness_name(outcome)} = {power(x[i])} none of {found[i].num_samples} samples hit the slope "
-        f"and their variance is {found[i].variance:.3g}; the discrepancy to the gradient implies at least "
-        f"{quantity(found[i].implied_variance_bound)}, and the truth is "
-        f"{quantity((2 * x[i]) ** 2 * exact[i] * (1 - exact[i]))}."
-    )
+def _unseen(outcome: Outcome) -> str:
+    """Say whether samples tell how rare hits of the slope are, and what the first stiffness without any implies."""
+    if not outcome.hits:
+        return ""
+    rarer = [(min(p, 1 - p), found.probability_interval) for p, found in outcome.hits]
+    covered = sum(low <= p <= high for p, (low, high) in rarer)
+    sentence = f"The interval of β contains the closed form at {covered} of {len(rarer)} stiffnesses."
+    for x, (p, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True):
+        if found.num_outlying == 0:
+            return (
+                f"{sentence} At {stiffness_name(outcome)} = {power(x)} none of {found.num_samples} samples hit the slope and "
+                f"their variance is {found.variance:.3g}; the discrepancy to the gradient implies at least "
+                f"{quantity(found.implied_variance_bound)}, and the truth is {quantity((2 * x) ** 2 * p * (1 - p))}."
+            )
+    return sentence

@@ -71,7 +71,7 @@ def test_pieces_must_be_whole_steps():
 def run_of(label, cost, *, touches=False):
     return Run(
         method=MethodSettings(label=label), steps=np.array([0, 80]), cost=np.array([2.3, cost]), final_cost=cost,
-        hard_cost=cost + 0.005, forces=np.zeros((20, 2)), qpos=np.zeros((3, 4)), touches_at_start=touches,
+        hard_cost=cost + 0.005, qpos=np.zeros((3, 4)), touches_at_start=touches,
         num_rollouts=160, seconds=1.0, compile_seconds=1.0,
     )  # fmt: skip
 
