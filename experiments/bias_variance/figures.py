@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import NullLocator, SymmetricalLogLocator
 
 from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
@@ -95,7 +95,8 @@ def bias_variance(outcome: Outcome):
         above.plot(chance.stiffness, chance.bias, "o", ms=5, mfc="white", mec=FIRST, zorder=3)
         above.set_yscale("symlog", linthresh=threshold)
         above.set_ylim(-2 * extreme, 2 * extreme)
-        _symlog_ticks(above, threshold, extreme)
+        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=threshold))
+        above.yaxis.get_major_locator().set_params(numticks=7)
         _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
         _bars(below, one, "first_order_variance", FIRST, "o", "first order")
         below.set_yscale("log")
@@ -198,12 +199,3 @@ def _bars(axis: Axes, one: xr.Dataset, name: str, colour: str, marker: str, labe
         picked = one.isel(stiffness=rows)
         ends = picked[[f"{name}_low", f"{name}_high"]].to_array().values
         theme.errorbar(axis, shift * picked.stiffness.values, picked[name].values, ends, color=colour, ms=5, **look)
-
-
-def _symlog_ticks(axis: Axes, threshold: float, extreme: float) -> None:
-    decades = 10.0 ** np.arange(np.ceil(np.log10(threshold)), np.floor(np.log10(2 * extreme)) + 1)
-    decades = decades[:: max(1, len(decades) // 3)]
-    ticks = [*(-decades[::-1]), 0.0, *decades]
-    axis.yaxis.set_major_locator(FixedLocator(ticks))
-    axis.yaxis.set_minor_locator(NullLocator())
-    axis.set_yticks(ticks, ["0" if t == 0 else ("−" if t < 0 else "") + power(abs(t)) for t in ticks])

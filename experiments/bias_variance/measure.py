@@ -23,12 +23,11 @@ from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
-DEFAULT_STIFFNESS = 1 / (0.02 * 1.0) ** 2
-DEFAULT_IMPEDANCE, DEFAULT_WIDTH = (0.9, 0.95), 0.001
+_DEFAULT = (1 / (0.02 * 1.0) ** 2, 1.0, (0.9, 0.95), 0.001)
 # A ratio of errors nearer to 1 is a tie: a few hundred samples know their variance no better.
-MARGIN = 1.25
+_MARGIN = 1.25
 # The landscape is smoothed for the picture where it reaches four standard deviations to both sides.
-REACH = 4.0
+_REACH = 4.0
 
 
 @dataclass(frozen=True)
@@ -106,16 +105,12 @@ def wall_contact(
     task: BallWall, stiffness: Float[np.ndarray, " rows"], damping_ratio: float, *, with_default: bool
 ) -> mg.Softness:
     """Give the wall each stiffness with its own impedance, and MuJoCo's default contact as one more row."""
-    rows = len(stiffness)
     pair = [pair.names for pair in task.scene.pairs].index(WALL_CONTACT[0])
-    own = task.scene.mj_model.pair_solimp[task.scene.pairs[pair].explicit]
+    *impedance, width = task.scene.mj_model.pair_solimp[task.scene.pairs[pair].explicit][:3]
     # MuJoCo reads an impedance of 0 as its smallest, and the scene would warn of it.
-    impedance = np.tile(np.clip(own[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP), (rows, 1))
-    damping, width = np.full(rows, damping_ratio), np.full(rows, own[2])
-    if with_default:
-        stiffness, damping = np.append(stiffness, DEFAULT_STIFFNESS), np.append(damping, 1.0)
-        impedance, width = np.vstack([impedance, DEFAULT_IMPEDANCE]), np.append(width, DEFAULT_WIDTH)
-    return mg.Softness(stiffness, damping, impedance, width, pairs=WALL_CONTACT)
+    impedance = np.clip(impedance, mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    rows = [(value, damping_ratio, impedance, width) for value in stiffness] + [_DEFAULT] * with_default
+    return mg.Softness(*map(np.array, zip(*rows, strict=True)), pairs=WALL_CONTACT)
 
 
 # Stiffness by row, what is swept with a leading axis of rows, and from one of these to the cost under noise.
@@ -170,8 +165,8 @@ def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settin
         table.bias.where(table.is_biased, 0.0), np.sqrt(table.first_order_variance / budget)
     )
     table["zeroth_order_error"] = np.sqrt(table.zeroth_order_variance / budget)
-    table["first_wins"] = MARGIN * table.first_order_error < table.zeroth_order_error
-    table["zeroth_wins"] = MARGIN * table.zeroth_order_error < table.first_order_error
+    table["first_wins"] = _MARGIN * table.first_order_error < table.zeroth_order_error
+    table["zeroth_wins"] = _MARGIN * table.zeroth_order_error < table.first_order_error
     table["finite_share"] = cell, np.asarray(first.finite_fraction)
     return table
 
@@ -180,7 +175,7 @@ def _landscape(measured: BiasVariance, stddev: float) -> xr.Dataset:
     """Average the landscape under the noise's density, which costs no further rollouts."""
     assert measured.landscape is not None
     points, costs = np.asarray(measured.landscape.points)[0], np.asarray(measured.landscape.costs)
-    grid = np.linspace(points[0] + REACH * stddev, points[-1] - REACH * stddev, 300)
+    grid = np.linspace(points[0] + _REACH * stddev, points[-1] - _REACH * stddev, 300)
     weights = np.exp(-0.5 * ((points[:, None] - grid) / stddev) ** 2)
     smoothed = costs @ (weights / weights.sum(axis=0))
     return xr.Dataset(

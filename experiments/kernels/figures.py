@@ -20,17 +20,17 @@ def profiles(outcome: Outcome):
     figure, axes = subplots(1, 3, height=3.8)
     near, far, right = axes[0]
     length = outcome.settings.length
-    for one in outcome.profiles:
-        colour, width = COLOURS[one.name], 1.4 if one.name in TITLES else 1.1
-        x, force = one.distance / length, one.force / (one.found.slope * length)
-        near.plot(x, force, color=colour, lw=width, label=NAMES[one.name])
-        if one.name in TITLES:
-            far.plot(x, force, color=colour, lw=width)
-        if one.found.stddev != 0:
-            right.plot(one.found.noise / length, one.found.density * length, color=colour, lw=width)
+    x = outcome.force.distance.values / length
+    for name, found in outcome.noise.items():
+        look = {"color": COLOURS[name], "lw": 1.4 if name in TITLES else 1.1}
+        force = outcome.force.sel(profile=name) / (found.slope * length)
+        near.plot(x, force, label=NAMES[name], **look)
+        if name in TITLES:
+            far.plot(x, force, **look)
+        if found.stddev != 0:
+            right.plot(found.noise / length, found.density * length, **look)
         else:
-            right.axvline(one.found.mean / length, color=colour, lw=width)
-    x = np.linspace(-4, 4, 401)
+            right.axvline(found.mean / length, **look)
     near.plot(x, np.maximum(-x, 0), color=REFERENCE, lw=0.9, ls=(0, (3, 2)), label="hard contact", zorder=1)
     near.set(xlim=(-2.5, 2.5), ylim=(-0.08, 2.2), title="Force, over slope × length", xlabel="distance / length")
     far.set(xlim=(0, 4), ylim=(1e-4, 1), yscale="log", title="The same, far out", xlabel="distance / length")

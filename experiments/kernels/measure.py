@@ -32,16 +32,6 @@ WAYS = ("smoothed solver", "mean of derivatives", "zeroth order")
 
 
 @dataclass(frozen=True)
-class Profile:
-    """One contact's static force against distance, and what noise it is."""
-
-    name: str  # for legends
-    distance: Float[np.ndarray, " n"]  # between the bodies (m)
-    force: Float[np.ndarray, " n"]  # per mass (N/kg)
-    found: EquivalentNoise
-
-
-@dataclass(frozen=True)
 class Outcome:
     """All that was measured.
 
@@ -52,7 +42,8 @@ class Outcome:
     """
 
     settings: Settings
-    profiles: list[Profile]
+    force: xr.DataArray  # static, per mass (N/kg), by `profile` and `distance` between the bodies (m)
+    noise: dict[str, EquivalentNoise]  # of each profile
     motion: xr.Dataset
     linear: xr.Dataset
 
@@ -65,8 +56,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise."""
     scene = _scene(settings, settings.impedance, settings.impedance)
     workspace.check(scene, speed=settings.speed)
-    profiles, velocities = _profiles(settings), (0.0, -settings.speed)
-    motions, linear = [], []
+    motions, linear, velocities = [], [], (0.0, -settings.speed)
     with workspace.stage("kernels", "kernels", len(settings.kernels)) as advance_to:
         for i, name in enumerate(settings.kernels):
             motion_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), i))
@@ -87,7 +77,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     dims = {"kernel": list(settings.kernels), "velocity": list(velocities), "entry": list(_ENTRIES), "way": list(WAYS)}
     table = xr.Dataset({"value": (list(dims), value), "error": (list(dims), error)}, coords=dims)
     deviation = abs(table.value - table.value.isel(way=0)) / table.error.where(table.error > 0, np.inf)
-    return Outcome(settings, profiles, motion, table.assign(deviation=deviation))
+    return Outcome(settings, *_profiles(settings), motion, table.assign(deviation=deviation))
 
 
 def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
@@ -97,18 +87,17 @@ def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -
     return mg.load_scene(text)
 
 
-def _profiles(settings: Settings) -> list[Profile]:
+def _profiles(settings: Settings) -> tuple[xr.DataArray, dict[str, EquivalentNoise]]:
     """Probe each kernel on a constant impedance, and what MuJoCo has of its own."""
-    plain = _scene(settings, 0.9, 0.9)
-    cases = {name: contact_profile(plain, smoothing=mg.Smoothing(settings.length, name)) for name in settings.kernels}
+    plain, length = _scene(settings, 0.9, 0.9), settings.length
+    cases = {name: contact_profile(plain, smoothing=mg.Smoothing(length, name)) for name in settings.kernels}
     # Those of both bodies add up.
-    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=settings.length / 2))
+    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=length / 2))
     cases["impedance"] = contact_profile(_scene(settings, 0.2, 0.9))
-    grid = np.linspace(-4 * settings.length, 4 * settings.length, 401)
-    return [
-        Profile(name, grid, np.asarray(profile(jnp.asarray(grid))), probe(profile, reach=25 * settings.length))
-        for name, profile in cases.items()
-    ]
+    grid = np.linspace(-4 * length, 4 * length, 401)
+    force = np.stack([np.asarray(profile(jnp.asarray(grid))) for profile in cases.values()])
+    noise = {name: probe(profile, reach=25 * length) for name, profile in cases.items()}
+    return xr.DataArray(force, {"profile": list(cases), "distance": grid}), noise
 
 
 def _draw(name: str, key: Array, shape: tuple[int, ...]) -> Array:

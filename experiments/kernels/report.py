@@ -15,8 +15,8 @@ _FAR = 4.0
 
 def verdict(outcome: Outcome) -> str:
     """Say which profiles are noise, and whether the smoothed solver is the mean over it."""
-    noisy = [NAMES[one.name] for one in outcome.profiles if one.found.is_noise and one.found.stddev > 0]
-    others = [NAMES[one.name] for one in outcome.profiles if not one.found.is_noise]
+    noisy = [NAMES[name] for name, found in outcome.noise.items() if found.is_noise and found.stddev > 0]
+    others = [NAMES[name] for name, found in outcome.noise.items() if not found.is_noise]
     motion = outcome.motion
     height = float(abs(motion.height - motion.sampled).max())
     slope = float(abs(motion.slope - motion.sampled_slope).max())
@@ -35,7 +35,7 @@ def verdict(outcome: Outcome) -> str:
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what each profile is as noise, and how often A and B agree."""
-    found = [f"{capitalised(NAMES[one.name])}: {_describe(one.found)}." for one in outcome.profiles]
+    found = [f"{capitalised(NAMES[name])}: {_describe(one)}." for name, one in outcome.noise.items()]
     for way in WAYS[:0:-1]:
         close = outcome.linear.deviation.sel(way=way) <= _FAR
         found.append(

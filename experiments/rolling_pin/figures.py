@@ -11,14 +11,14 @@ from experiments.workspace import Workspace
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"descent": descent, "bed": bed}
+    return {"descent": descent}
 
 
 def descent(outcome: Outcome):
     """True cost against steps and against rollouts."""
     figure, axes = subplots(1, 2, height=4.4, sharey=True)
     left, right = axes[0]
-    for one, look in zip(outcome.descents, _looks(outcome), strict=True):
+    for one, look in zip(outcome.descents, looks(one.label for one in outcome.descents), strict=True):
         steps = np.arange(len(one.costs))
         look |= {"ms": 4, "markevery": max(1, len(steps) // 8)}
         left.plot(steps, one.costs, label=one.label, **look)
@@ -40,25 +40,6 @@ def descent(outcome: Outcome):
     return figure, "True cost of each descent", caption
 
 
-def bed(outcome: Outcome):
-    """Final heights, one small panel for each descent."""
-    rows, target = -(-len(outcome.descents) // 4), 1e3 * np.asarray(outcome.task.target)
-    figure, axes = subplots(rows, 4, height=2.2 * rows, sharex=True, sharey=True)
-    places = np.arange(1, len(target) + 1)
-    for axis, one, look in zip(axes.flat, outcome.descents, _looks(outcome), strict=True):
-        axis.step(places, target, where="mid", color=MUTED, lw=3, alpha=0.5)
-        axis.plot(places, 1e3 * one.heights, "o", ms=5, color=look["color"])
-        axis.set_title(one.label)
-        axis.set_xticks(places)
-    figure.supxlabel("pillar", fontsize=9.5)
-    figure.supylabel("height (mm)", fontsize=9.5)
-    caption = (
-        "Heights of the eight pillars in the end, under the true motion; grey, the dent that was asked for. The pin starts "
-        "above the third."
-    )
-    return figure, "The bed in the end", caption
-
-
 def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     """Draw the motion of the best controls, and give the file and its caption; nothing if none was asked for."""
     wanted, best = outcome.settings.video, outcome.best
@@ -70,7 +51,3 @@ def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     )
     mj_model = with_coarse_shadows(outcome.task.scene.mj_model)
     return film(workspace, [(mj_model, qpos)], wanted, camera="side", caption=caption)
-
-
-def _looks(outcome: Outcome) -> list[dict]:
-    return looks(one.label for one in outcome.descents)

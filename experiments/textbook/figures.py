@@ -116,10 +116,10 @@ def missing(outcome: Outcome):
     right.legend(loc="lower right")
     _ticks(right, x)
     caption = (
-        "Left, for each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what "
-        f"{settings.missed_samples} first-order samples tell, with its {settings.confidence:.0%} interval. Right, the variance of "
-        "a sample of first order, as the same samples show it, and the least that the discrepancy between them and the gradient "
-        "implies; shaded where no sample hit the slope, so that they show none."
+        f"Left, for each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what {settings.missed_samples} first-order samples "
+        f"tell, with its {settings.confidence:.0%} interval. Right, the variance of a sample of first order, as the same samples "
+        "show it, and the least that the discrepancy between them and the gradient implies; shaded where no sample hit the "
+        "slope, so that they show none."
     )
     return figure, "How often samples miss the slope", caption
 

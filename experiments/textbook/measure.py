@@ -69,24 +69,22 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     problem = _problem(settings, shown)
     samples_key, stiffness_key, hits_key = jax.random.split(jax.random.key(settings.seed), 3)
 
-    def run(key: Array, stiffness: float | None, rollouts: int) -> Comparison:
-        problem = _problem(settings, stiffness)
-        return compare(
-            named,
-            problem.objective(settings.stddev),
-            jnp.array([settings.point]),
-            key,
-            budget=Rollouts(rollouts),
-            reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
-            num_repeats=settings.num_repeats,
-            confidence=settings.confidence,
-        )
-
     def sweep(key: Array, cells: Sequence[tuple[float | None, int]], done: int) -> xr.Dataset:
         tables = []
-        for i, cell in enumerate(cells):
-            tables.append(run(jax.random.fold_in(key, i), *cell))
-            advance_to(done + i + 1)
+        for i, (stiffness, rollouts) in enumerate(cells):
+            problem = _problem(settings, stiffness)
+            table = compare(
+                named,
+                problem.objective(settings.stddev),
+                jnp.array([settings.point]),
+                jax.random.fold_in(key, i),
+                budget=Rollouts(rollouts),
+                reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
+                num_repeats=settings.num_repeats,
+                confidence=settings.confidence,
+            )
+            tables.append(table)
+            advance_to(done + len(tables))
         return _dataset(settings, cells, tables)
 
     by_samples = [(shown, rollouts) for rollouts in settings.num_samples]
