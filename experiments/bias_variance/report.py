@@ -72,8 +72,8 @@ def _choice(swept: xr.Dataset) -> str:
         return "zeroth order is closer at every stiffness and angle"
     parts = []
     for end in np.unique(until)[::-1]:
-        rows = np.arange(last) < end
-        where = "nowhere" if end == 0 else "everywhere" if end == last else _range(swept.stiffness, rows)
+        limit = f"up to {power(swept.stiffness.values[end - 1])} 1/s²"
+        where = "nowhere" if end == 0 else "everywhere" if end == last else limit
         parts.append(f"{where} {_angles(swept.angle[until == end])}")
     count = f"{int((zeroth & beyond).sum())} of {int(beyond.sum())}"
     return f"first order is as close or closer {joined(parts)}, and beyond that zeroth order is closer in {count} cases"
@@ -87,13 +87,8 @@ def _range(stiffness: xr.DataArray, rows: ArrayLike) -> str:
     """Words for the stiffnesses of some rows of the sweep: a range if they are neighbours, else a list."""
     picked = np.flatnonzero(np.asarray(rows))
     labels = [power(k) for k in stiffness.values[picked]]
-    if len(picked) == 1 or (np.diff(picked) > 1).any():
-        return f"at {joined(labels)} 1/s²"
-    if picked[0] == 0:
-        return f"up to a stiffness of {labels[-1]} 1/s²"
-    if picked[-1] == stiffness.size - 1:
-        return f"from {labels[0]} 1/s² on"
-    return f"from {labels[0]} to {labels[-1]} 1/s²"
+    is_range = len(picked) > 2 and (np.diff(picked) == 1).all()
+    return f"from {labels[0]} to {labels[-1]} 1/s²" if is_range else f"at {joined(labels)} 1/s²"
 
 
 def _bias(outcome: Outcome) -> str:

@@ -1,22 +1,18 @@
 """The pictures of the experiment on billiards."""
 
-from matplotlib.patches import Circle
-
 from experiments.billiards import hard
-from experiments.billiards.measure import IDLE, Outcome, Run
+from experiments.billiards.measure import IDLE, Outcome
 from experiments.settings import VideoSettings
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, looks, subplots
+from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film
 from experiments.workspace import Workspace
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.files import scene_path
 
-_RADIUS = 0.2
-
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"cost": cost, "strokes": strokes}
+    return {"cost": cost}
 
 
 def cost(outcome: Outcome):
@@ -37,27 +33,6 @@ def cost(outcome: Outcome):
     return figure, "Cost against steps", caption
 
 
-def strokes(outcome: Outcome):
-    """Ways of both balls from above, the best of each kind."""
-    shown = _shown(outcome)
-    figure, axes = subplots(1, len(shown), height=3.6, sharey=True)
-    for axis, run in zip(axes[0], shown, strict=True):
-        driven, knocked = run.qpos[:, :2] - 2.0, run.qpos[:, 2:] - 1.0
-        axis.add_patch(Circle((0, 0), _RADIUS, fill=False, ec=REFERENCE, lw=1.2))
-        for way, colour in ((driven, ZEROTH), (knocked, FIRST)):
-            axis.plot(*way.T, color=colour)
-            axis.add_patch(Circle(way[0], _RADIUS, fill=False, ec=colour, ls=(0, (2, 2))))
-            axis.add_patch(Circle(way[-1], _RADIUS, color=colour, alpha=0.5, lw=0))
-        axis.set(title=run.method.label, xlabel="x, m", aspect="equal", xlim=(-2.4, 0.4), ylim=(-2.4, 0.4))
-    axes[0, 0].set_ylabel("y, m")
-    _, time, speed = hard.optimum()
-    caption = (
-        "From above: the driven ball's way (blue), the knocked ball's (orange), both where they end; the ring is the target. "
-        f"The best stroke with hard balls hits after {time:.3f} s at {speed:.2f} m/s."
-    )
-    return figure, "The strokes", caption
-
-
 def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     """Draw a stroke that stands still and the best one, and give the file and its caption."""
     mj_model = load_scene(scene_path("billiards")).mj_model
@@ -73,13 +48,4 @@ def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
         caption="The strokes that two descents end with, at 0.5 of real speed; the dark disc is the target.",
         titles=[f"{run.method.label}: {run.final_cost:.3f}" for run in chosen],
         columns=2,
-        timestep=outcome.timestep,
     )
-
-
-def _shown(outcome: Outcome) -> list[Run]:
-    """At most four: those that stand still first, then the solved ones."""
-    apart = [run for run in outcome.runs if not run.touches_at_start]
-    stuck = [run for run in apart if run.is_stuck][:1]
-    solved = sorted((run for run in apart if not run.is_stuck), key=lambda run: run.final_cost)
-    return (stuck + solved)[:4] or list(outcome.runs[:4])

@@ -56,7 +56,6 @@ class Outcome:
 
     settings: Settings
     runs: tuple[Run, ...]  # one per method
-    timestep: float  # of the scene, in s
 
     def rows(self) -> list[dict[str, Any]]:
         """Give the cost along each descent, for metrics.csv."""
@@ -80,7 +79,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             key = jax.random.fold_in(jax.random.key(settings.seed), i)
             runs.append(_run(method, task, settings, key, play))
             advance_to(len(runs))
-    return Outcome(settings, tuple(runs), float(task.scene.mj_model.opt.timestep))
+    return Outcome(settings, tuple(runs))
 
 
 def _run(

@@ -30,10 +30,11 @@ def verdict(outcome: Outcome) -> str:
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what costs of soft and hard balls mean beside each other."""
+    best, time, speed = hard.optimum()
     return [
-        f"Hard balls collide in no time (another program: closed forms and root finding); over all forces the optimum is "
-        f"{hard.optimum()[0]:.6f}, as published. The simulated cost may lie below that by half a per cent: a soft collision "
-        "takes time, in which the driven ball goes on pushing."
+        f"Hard balls collide in no time (another program: closed forms and root finding); their optimum over all forces is "
+        f"{best:.6f}, as published, with a hit after {time:.3f} s at {speed:.2f} m/s. The simulated cost may lie below that by "
+        "half a per cent: a soft collision takes time, in which the driven ball goes on pushing."
     ]
 
 

@@ -42,9 +42,10 @@ def descent(outcome: Outcome):
 
 def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     """Draw the motion of the best controls, and give the file and its caption; nothing if none was asked for."""
-    wanted, best = outcome.settings.video, outcome.best
+    wanted = outcome.settings.video
     if wanted is None:
         return None, ""
+    best = min(outcome.descents, key=lambda one: one.costs[-1])
     qpos = np.asarray(positions(outcome.task, jnp.asarray(best.params)))
     caption = (
         f"The motion that {best.label} ends with, {shown_speed(wanted.speed)}; the green line is the wanted depth."

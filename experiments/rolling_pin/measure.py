@@ -50,11 +50,6 @@ class Outcome:
     start_gradient: float  # largest element of the gradient of the true cost at the start
     task: RollingPin
 
-    @property
-    def best(self) -> Descent:
-        """The descent that ends lowest."""
-        return min(self.descents, key=lambda one: one.costs[-1])
-
     def is_solved(self, descent: Descent) -> bool:
         """Say whether a descent ends below the cost that counts as solved."""
         return bool(descent.costs[-1] < self.settings.solved_below)
