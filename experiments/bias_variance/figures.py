@@ -186,9 +186,9 @@ def _panels(outcome: Outcome, *, rows: int, height: float):
         axis.xaxis.set_minor_locator(NullLocator())
         for stiffness in table.stiffness.values[table.is_default.values]:
             axis.axvline(stiffness, color=MUTED, lw=1.0, ls=(0, (4, 3)), zorder=0)
-    for axis, angle in zip(axes[0], table.angle.values, strict=True):
-        axis.set_title(f"{angle:g} rad")
-    figure.supxlabel(f"contact stiffness, {UNIT}", fontsize=9.5, color="#3b4452")
+    for top, bottom, angle in zip(axes[0], axes[-1], table.angle.values, strict=True):
+        top.set_title(f"{angle:g} rad")
+        bottom.set_xlabel(f"stiffness, {UNIT}")
     return figure, axes
 
 

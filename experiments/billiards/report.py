@@ -40,25 +40,17 @@ def findings(outcome: Outcome) -> list[str]:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all descents."""
-    rows = [
-        [
-            run.method.label,
-            "yes" if run.touches_at_start else "no",
-            f"{run.cost[0]:.3f}",
-            f"{run.final_cost:.4f}",
-            f"{run.hard_cost:.4f}",
-            str(run.num_rollouts),
-            f"{run.seconds:.1f}",
-            f"{run.compile_seconds:.1f}",
-        ]
-        for run in outcome.runs
-    ]
-    solved = frozenset((i, 3) for i, run in enumerate(outcome.runs) if run.is_solved)
+    rows = []
+    for run in outcome.runs:
+        costs = [f"{cost:.4f}" for cost in (run.cost[0], run.final_cost, run.hard_cost)]
+        seconds = [f"{time:.1f}" for time in (run.seconds, run.compile_seconds)]
+        touches = "yes" if run.touches_at_start else "no"
+        rows.append([run.method.label, touches, *costs, str(run.num_rollouts), *seconds])
     costs = ("cost at the start", "best cost", "with hard balls")
     columns = ("method", "touches at the start", *costs, "rollouts", "s", "s compiling")
-    return [
-        Table(columns, rows, "Costs in m², without noise; bold where the stroke is solved to one per cent.", solved)
-    ]
+    solved = frozenset((i, 3) for i, run in enumerate(outcome.runs) if run.is_solved)
+    caption = "Costs in m², without noise; bold where the stroke is solved to one per cent."
+    return [Table(columns, rows, caption, solved)]
 
 
 def _listed(runs: list[Run]) -> str:

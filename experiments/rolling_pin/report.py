@@ -46,17 +46,10 @@ def tables(outcome: Outcome) -> list[Table]:
     rows = []
     for one in outcome.descents:
         steps = one.steps_to(outcome.settings.solved_below)
-        rows.append(
-            [
-                one.label,
-                str(one.num_samples),
-                quantity(float(one.costs[-1])),
-                quantity(float(one.costs.min())),
-                "never" if steps is None else str(steps),
-                "" if steps is None else str(steps * one.num_samples),
-                f"{1e3 * abs(one.heights - target).max():.1f}",
-            ]
-        )
+        reached = ["never", ""] if steps is None else [str(steps), str(steps * one.num_samples)]
+        costs = [quantity(float(cost)) for cost in (one.costs[-1], one.costs.min())]
+        worst = f"{1e3 * abs(one.heights - target).max():.1f}"
+        rows.append([one.label, str(one.num_samples), *costs, *reached, worst])
     columns = (
         "descent along", "rollouts a step", "final true cost", "least true cost", f"steps to stay below {below}",
         "rollouts for that", "worst pillar (mm)",

@@ -22,9 +22,7 @@ class Case:
     title: str
     model: mujoco.MjModel  # with its own contact, limits, integrator and time step
     moved: int  # index in `qpos` of the coordinate to which the parameter is added
-    interval: tuple[
-        float, float
-    ]  # of the parameter (m or rad), through which the first impact moves by several time steps
+    interval: tuple[float, float]  # of the parameter (m or rad); it moves the first impact through several time steps
     labels: tuple[str, ...]  # of what is read, with units
     read: Read
     duration: float  # in s

@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from experiments import theme
 from experiments.textbook.measure import Outcome
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -89,37 +89,23 @@ def stiffness(outcome: Outcome):
 
 
 def missing(outcome: Outcome):
-    """Chance that N samples all miss the slope, and the variance that this implies."""
-    figure, axes = subplots(1, 2, height=4.0)
-    left, right = axes[0]
-    settings, x, grid = outcome.settings, np.asarray(outcome.settings.stiffness), np.geomspace(2, 1000, 200)
-    for stiff, (p, found), colour in zip(x, outcome.hits, theme.shades(len(x)), strict=True):
-        left.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(stiff))
+    """Chance that N samples all miss the slope."""
+    figure, axes = subplots(1, 1, height=4.0)
+    axis, settings, grid = axes[0, 0], outcome.settings, np.geomspace(2, 1000, 200)
+    for x, (p, found), colour in zip(settings.stiffness, outcome.hits, theme.shades(len(outcome.hits)), strict=True):
+        axis.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(x))
         if p > 0.5:
             continue  # most samples are on the slope, so that the event is to be on it
         # Where half of the sets miss, and so the interval is widest; bands of all stiffnesses would hide each other.
         at = np.clip(np.log(0.5) / np.log1p(-p), 2, 1000)
         middle, ends = found.miss_probability(at), found.miss_probability_interval(at)
-        theme.errorbar(left, at, middle, ends, color=colour, marker="D", ms=5, capsize=3, mec="white")
-    left.set(title="Chance that all samples miss", xlabel="samples N", xscale="log", ylim=(-0.03, 1.03))
-    _ticks(left, np.array([2.0, 10.0, 100.0, 1000.0]))
-    look = {"fontsize": 8, "title_fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-    left.legend(title=stiffness_name(outcome), **look)
-    exact, told = np.array([p for p, _ in outcome.hits]), [found for _, found in outcome.hits]
-    right.plot(x, (2 * x) ** 2 * exact * (1 - exact), color=REFERENCE, label="variance of a sample, closed form")
-    right.plot(x, [one.variance or np.nan for one in told], "o", color=FIRST, ms=5, label="as the samples show it")
-    bound, label = [one.implied_variance_bound or np.nan for one in told], "at least, from Δ and the bound of β"
-    right.plot(x, bound, "_", color=ZEROTH, ms=11, mew=2, label=label)
-    for stiff in x[[one.num_outlying == 0 for one in told]]:
-        right.axvspan(stiff / 1.25, stiff * 1.25, color=MUTED, alpha=0.15, lw=0)
-    right.set(title="Variance of first order", xlabel=stiffness_name(outcome), xscale="log", yscale="log")
-    right.legend(loc="lower right")
-    _ticks(right, x)
+        theme.errorbar(axis, at, middle, ends, color=colour, marker="D", ms=5, capsize=3, mec="white")
+    axis.set(xlabel="samples N", ylabel="chance that all miss", xscale="log", ylim=(-0.03, 1.03))
+    _ticks(axis, np.array([2.0, 10.0, 100.0, 1000.0]))
+    axis.legend(title=stiffness_name(outcome), loc="upper left", bbox_to_anchor=(1.0, 1.0))
     caption = (
-        f"Left, for each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what {settings.missed_samples} first-order samples "
-        f"tell, with its {settings.confidence:.0%} interval. Right, the variance of a sample of first order, as the same samples "
-        "show it, and the least that the discrepancy between them and the gradient implies; shaded where no sample hit the "
-        "slope, so that they show none."
+        f"For each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what {settings.missed_samples} first-order samples tell, "
+        f"with its {settings.confidence:.0%} interval."
     )
     return figure, "How often samples miss the slope", caption
 
