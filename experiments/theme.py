@@ -1,6 +1,7 @@
 """How the figures look: one type size, few lines, colours that colour-blind readers can tell apart."""
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,20 @@ from cycler import cycler
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Picture
+from matplotlib.ticker import FuncFormatter
 
 from experiments.report import Figure
 from experiments.words import superscript
 
 # Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
 FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
-DEFAULT, MUTED = "#cc79a7", "#8b94a1"
+DEFAULT, MUTED, ONSET = "#cc79a7", "#8b94a1", "#009e73"
+# For what comes besides, in order; told apart by their markers, too.
+OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#393b79")
+MARKERS = "osD^vP*X<>"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
 
 # By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
@@ -107,3 +114,28 @@ def power(value: float) -> str:
         return f"{value:g}"
     head = "" if np.isclose(mantissa, 1) else f"{mantissa:.3g}×"
     return f"{head}10{superscript(exponent)}"
+
+
+def looks(labels: Iterable[str]) -> list[dict[str, Any]]:
+    """Give each line its colour and marker; first and zeroth order have their colours everywhere."""
+    fixed, others = {"first order": FIRST, "zeroth order": ZEROTH}, itertools.cycle(OTHERS)
+    pairs = zip(labels, itertools.cycle(MARKERS))
+    return [{"color": fixed.get(label) or next(others), "marker": marker} for label, marker in pairs]
+
+
+def legend_below(figure: Picture, axis: Axes, columns: int) -> None:
+    """Name under the panels what one of them shows."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), fontsize=8.5)
+
+
+def plain(axis: Axis, scale: float = 1.0, unit: str = "") -> None:
+    """Write the numbers of a logarithmic axis without powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{scale * value:g}{unit}".replace("-", "−")))
+
+
+def errorbar(axis: Axes, x: np.ndarray, value: np.ndarray, ends: np.ndarray, **look: Any) -> None:
+    """Draw values with the ends (low, high) of their intervals."""
+    # An end may lie beyond its value by rounding alone.
+    errors = np.maximum([value - ends[0], ends[1] - value], 0)
+    axis.errorbar(x, value, errors.reshape(2, -1), **({"lw": 1.0, "elinewidth": 1.1, "capsize": 2} | look))

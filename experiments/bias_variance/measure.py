@@ -1,21 +1,68 @@
 """From a problem to the numbers."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
-from jaxtyping import Float
+import xarray as xr
+from jaxtyping import Array, Float, PyTree
+from scipy import stats
 
-from experiments.bias_variance.outcome import Interval, Outcome
-from experiments.bias_variance.problems import Problem
-from experiments.bias_variance.problems import problem as set_up
+import mjxgrad as mg
 from experiments.bias_variance.settings import Settings
 from experiments.failure import ExperimentError
 from experiments.theme import power
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics import BiasVariance, Landscape, bias_variance
+from mjxgrad.diagnostics import BiasVariance, bias_variance
+from mjxgrad.objective import Objective, parameter_noise
+from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
 
+# What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
+_DEFAULT = (1 / (0.02 * 1.0) ** 2, 1.0, (0.9, 0.95), 0.001)
+# A ratio of errors nearer to 1 is a tie: a few hundred samples know their variance no better.
+_MARGIN = 1.25
 # The landscape is smoothed for the picture where it reaches four standard deviations to both sides.
-REACH = 4.0
+_REACH = 4.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Both estimates by `stiffness` (in 1/s²; ascending, the default last if `is_default`) and `angle` (rad).
+
+    `table` has `first_order`, `zeroth_order`, `reference` and `bias` in m²/rad, and the variances of one sample of both
+    estimates, each with the ends `_low` and `_high` of its interval; whether first order `is_biased` or `has_wrong_sign`; the
+    expected errors within the budget and which is clearly smaller. `landscape` has the cost (m²) without noise over `grid` and
+    its mean under noise over `smooth_grid`.
+    """
+
+    settings: Settings
+    table: xr.Dataset
+    landscape: xr.Dataset
+    task: BallWall | None  # to draw, if it can be drawn
+
+    @property
+    def swept(self) -> xr.Dataset:
+        """The rows of the sweep, without the default."""
+        return self.table.isel(stiffness=~self.table.is_default.values)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per stiffness and angle, for metrics.csv."""
+        return self.table.to_dataframe().reset_index().to_dict("records")
+
+
+class Ramp(eqx.Module):
+    """A step that rises from −1 to 1 with a given slope about zero, on a parabola: a contact's jump in one line."""
+
+    slope: Float[Array, ""]
+
+    def __call__(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
+        """Give the cost."""
+        return jnp.clip(self.slope * angle[0], -1, 1) + angle[0] ** 2
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -24,72 +71,114 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     Raises:
         ExperimentError: if at some stiffness and angle there is no estimate, for hardly any rollout was finite.
     """
-    problem = set_up(settings)
-    rows = len(problem.stiffness)
-    if problem.task is not None:
-        workspace.check(problem.task.scene)
-    with workspace.stage("gradients", "stiffnesses", rows) as advance_to:
+    task = ball_wall() if settings.task == "ball_wall" else None
+    stiffness, knob, objective = _ramp(settings) if task is None else _wall(task, settings)
+    if task is not None:
+        workspace.check(task.scene)
+    with workspace.stage("gradients", "stiffnesses", len(stiffness)) as advance_to:
         measured = bias_variance(
-            problem.objective,
+            objective,
             jnp.asarray(settings.angles)[:, None],
             jax.random.key(settings.seed),
-            softness=problem.knob,
+            softness=knob,
             num_samples=settings.num_samples,
             num_reference=settings.reference_samples,
             confidence=settings.confidence,
             progress=lambda done, _: advance_to(done),
         )
-    _refuse_without_estimate(measured, problem)
-    outcome = _outcome(measured, problem, settings)
-    for i in np.flatnonzero(outcome.finite.min(axis=1) < 1):
-        workspace.warnings.append(
-            f"At stiffness {power(problem.stiffness[i])}, {1 - outcome.finite[i].min():.2%} of the rollouts at one angle were "
-            "not finite and were left out, so its means are over the others."
-        )
-    return outcome
-
-
-def _refuse_without_estimate(measured: BiasVariance, problem: Problem) -> None:
-    bad = ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))
-    if bad.any():
-        stiffness = ", ".join(power(value) for value in problem.stiffness[bad])
+    if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
         raise ExperimentError(
-            f"stiffness {stiffness} gives no estimate: too few of its rollouts, or of their derivatives, are finite; "
-            "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
+            f"stiffness {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
+            "derivatives, are finite; leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
         )
+    table = _table(measured, stiffness, settings)
+    for i in np.flatnonzero((table.finite_share < 1).any("angle")):
+        lost = 1 - float(table.finite_share[i].min())
+        workspace.warnings.append(
+            f"At stiffness {power(stiffness[i])}, {lost:.2%} of the rollouts at one angle were not finite and were left out, so "
+            "its means are over the others."
+        )
+    return Outcome(settings, table, _landscape(measured, settings.stddev), task)
 
 
-def _outcome(measured: BiasVariance, problem: Problem, settings: Settings) -> Outcome:
-    first, zeroth = measured.first, measured.zeroth
-    assert measured.landscape is not None
-    smooth_grid, smoothed = _smoothed(measured.landscape, settings.stddev)
-    return Outcome(
-        stiffness=problem.stiffness,
-        angles=np.asarray(settings.angles),
-        has_default=problem.has_default,
-        settings=settings,
-        first=_interval(first.value, measured.first_interval),
-        zeroth=_interval(zeroth.value, measured.zeroth_interval),
-        reference=_interval(measured.reference, measured.reference_interval),
-        bias=_interval(measured.bias, measured.bias_interval),
-        bias_error=np.asarray(measured.bias_error)[..., 0],
-        first_variance=_interval(first.covariance_diagonal, measured.first_variance_interval[..., None]),
-        zeroth_variance=_interval(zeroth.covariance_diagonal, measured.zeroth_variance_interval[..., None]),
-        finite=np.asarray(first.finite_fraction),
-        grid=np.asarray(measured.landscape.points)[0],
-        cost=np.asarray(measured.landscape.costs),
-        smooth_grid=smooth_grid,
-        smoothed=smoothed,
+def wall_contact(
+    task: BallWall, stiffness: Float[np.ndarray, " rows"], damping_ratio: float, *, with_default: bool
+) -> mg.Softness:
+    """Give the wall each stiffness with its own impedance, and MuJoCo's default contact as one more row."""
+    pair = [pair.names for pair in task.scene.pairs].index(WALL_CONTACT[0])
+    *impedance, width = task.scene.mj_model.pair_solimp[task.scene.pairs[pair].explicit][:3]
+    # MuJoCo reads an impedance of 0 as its smallest, and the scene would warn of it.
+    impedance = np.clip(impedance, mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    rows = [(value, damping_ratio, impedance, width) for value in stiffness] + [_DEFAULT] * with_default
+    return mg.Softness(*map(np.array, zip(*rows, strict=True)), pairs=WALL_CONTACT)
+
+
+# Stiffness by row, what is swept with a leading axis of rows, and from one of these to the cost under noise.
+_Problem = tuple[Float[np.ndarray, " rows"], PyTree, Callable[[Any], Objective]]
+
+
+def _wall(task: BallWall, settings: Settings) -> _Problem:
+    knob = wall_contact(
+        task, np.sort(settings.stiffness), settings.damping_ratio, with_default=settings.include_default
     )
+    stiffness = np.asarray(knob.stiffness)
+    for row in range(len(stiffness)):
+        # Outside of a trace, where the scene knows its values and warns of what its time step cannot follow.
+        task.with_softness(jax.tree.map(lambda leaf, row=row: leaf[row], knob))
+    return stiffness, knob, lambda softness: task.objective(settings.stddev, softness)
 
 
-def _interval(value: jax.Array, ends: Float[np.ndarray, "2 stiffness angles 1"]) -> Interval:
-    return Interval(np.asarray(value)[..., 0], ends[0, ..., 0], ends[1, ..., 0])
+def _ramp(settings: Settings) -> _Problem:
+    slopes = np.sort(np.asarray(settings.stiffness))
+    knob = jnp.asarray(slopes, jax.dtypes.canonicalize_dtype(float))
+    return slopes, knob, lambda slope: parameter_noise(Ramp(slope), settings.stddev, dim=1)
 
 
-def _smoothed(landscape: Landscape, stddev: float) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, "rows grid"]]:
+def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settings: Settings) -> xr.Dataset:
+    first, zeroth, cell = measured.first, measured.zeroth, ("stiffness", "angle")
+    intervals = {
+        "first_order": (first.value, measured.first_interval),
+        "zeroth_order": (zeroth.value, measured.zeroth_interval),
+        "reference": (measured.reference, measured.reference_interval),
+        "bias": (measured.bias, measured.bias_interval),
+        "first_order_variance": (first.covariance_diagonal, measured.first_variance_interval[..., None]),
+        "zeroth_order_variance": (zeroth.covariance_diagonal, measured.zeroth_variance_interval[..., None]),
+    }
+    table = xr.Dataset(coords={"stiffness": stiffness, "angle": list(settings.angles)})
+    has_default = settings.task == "ball_wall" and settings.include_default
+    table["is_default"] = "stiffness", np.arange(len(stiffness)) >= len(stiffness) - has_default
+    for name, (value, (low, high)) in intervals.items():
+        for end, values in (("", value), ("_low", low), ("_high", high)):
+            table[name + end] = cell, np.asarray(values)[..., 0]
+    # Of many intervals some miss by chance, so each is widened until all of them hold together as often as one is said to
+    # (Bonferroni).
+    tail = (1 - settings.confidence) / 2 / table.bias.size
+    reach = stats.t.isf(tail, settings.num_samples - 1) * np.asarray(measured.bias_error)[..., 0]
+    table["is_biased"] = abs(table.bias) > reach
+    # Both means are surely not zero and point in opposite directions.
+    table["has_wrong_sign"] = ((table.first_order_low > 0) & (table.reference_high < 0)) | (
+        (table.first_order_high < 0) & (table.reference_low > 0)
+    )
+    # Root of bias² + variance / rollouts.
+    budget = settings.rollouts_per_gradient
+    table["first_order_error"] = np.hypot(
+        table.bias.where(table.is_biased, 0.0), np.sqrt(table.first_order_variance / budget)
+    )
+    table["zeroth_order_error"] = np.sqrt(table.zeroth_order_variance / budget)
+    table["first_wins"] = _MARGIN * table.first_order_error < table.zeroth_order_error
+    table["zeroth_wins"] = _MARGIN * table.zeroth_order_error < table.first_order_error
+    table["finite_share"] = cell, np.asarray(first.finite_fraction)
+    return table
+
+
+def _landscape(measured: BiasVariance, stddev: float) -> xr.Dataset:
     """Average the landscape under the noise's density, which costs no further rollouts."""
-    points, costs = np.asarray(landscape.points)[0], np.asarray(landscape.costs)
-    grid = np.linspace(points[0] + REACH * stddev, points[-1] - REACH * stddev, 300)
+    assert measured.landscape is not None
+    points, costs = np.asarray(measured.landscape.points)[0], np.asarray(measured.landscape.costs)
+    grid = np.linspace(points[0] + _REACH * stddev, points[-1] - _REACH * stddev, 300)
     weights = np.exp(-0.5 * ((points[:, None] - grid) / stddev) ** 2)
-    return grid, costs @ (weights / weights.sum(axis=0))
+    smoothed = costs @ (weights / weights.sum(axis=0))
+    return xr.Dataset(
+        {"cost": (("stiffness", "grid"), costs), "smoothed": (("stiffness", "smooth_grid"), smoothed)},
+        coords={"grid": points, "smooth_grid": grid},
+    )

@@ -1,84 +1,36 @@
 """The pictures of the experiment on billiards."""
 
-import numpy as np
-from matplotlib.patches import Circle
-
-from experiments.billiards.outcome import IDLE, Outcome, Run
+from experiments.billiards import hard
+from experiments.billiards.measure import IDLE, Outcome
 from experiments.settings import VideoSettings
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
+from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film
 from experiments.workspace import Workspace
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 
-_COLOURS = (FIRST, "#8c6d31", ZEROTH, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6ecf", "#393b79", "#8b94a1")
-_MARKERS = "osD^vP*X<>"
-_RADIUS = 0.2
-
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"cost": cost, "strokes": strokes, "forces": forces}
+    return {"cost": cost}
 
 
 def cost(outcome: Outcome):
     """True cost against steps."""
     figure, axes = subplots(1, 1, height=4.4)
     axis = axes[0, 0]
-    for run, colour, marker in zip(outcome.runs, _COLOURS, _MARKERS, strict=False):
-        style = (0, (4, 2)) if run.has_touched else "-"
-        axis.plot(run.steps, run.cost, color=colour, ls=style, marker=marker, ms=4, label=run.method.label)
-    for level in (IDLE, outcome.optimum[0]):
+    for run, look in zip(outcome.runs, looks(run.method.label for run in outcome.runs), strict=True):
+        style = (0, (4, 2)) if run.touches_at_start else "-"
+        axis.plot(run.steps, run.cost, ls=style, ms=4, label=run.method.label, **look)
+    for level in (IDLE, hard.optimum()[0]):
         axis.axhline(level, color=MUTED, lw=1.0, ls=(0, (1, 2)), zorder=0)
     axis.set(xlabel="step", ylabel="cost, m²", ylim=(1.3, 2.5))
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8.5)
-    best = outcome.optimum[0]
+    legend_below(figure, axis, 3)
     caption = (
         "Cost without noise and with the contact as it is, along each descent. Solid: the balls do not touch at the start; "
-        f"dashed: they do. Dotted: standing still, and the optimum for hard balls, {best:.6f}. Descents that coincide cover "
-        "each other."
+        "dashed: they do. Dotted: standing still, and the optimum for hard balls. Descents that coincide cover each other."
     )
     return figure, "Cost against steps", caption
-
-
-def strokes(outcome: Outcome):
-    """Ways of both balls from above, the best of each kind."""
-    shown = _shown(outcome)
-    figure, axes = subplots(1, len(shown), height=3.6, sharey=True)
-    for axis, run in zip(axes[0], shown, strict=True):
-        driven, knocked = run.qpos[:, :2] - 2.0, run.qpos[:, 2:] - 1.0
-        axis.add_patch(Circle((0, 0), _RADIUS, fill=False, ec=REFERENCE, lw=1.2))
-        for way, colour in ((driven, ZEROTH), (knocked, FIRST)):
-            axis.plot(*way.T, color=colour)
-            axis.add_patch(Circle(way[0], _RADIUS, fill=False, ec=colour, ls=(0, (2, 2))))
-            axis.add_patch(Circle(way[-1], _RADIUS, color=colour, alpha=0.5, lw=0))
-        axis.set(title=run.method.label, xlabel="x, m", aspect="equal", xlim=(-2.4, 0.4), ylim=(-2.4, 0.4))
-    axes[0, 0].set_ylabel("y, m")
-    _, time, speed = outcome.optimum
-    caption = (
-        "From above: the driven ball's way (blue), the knocked ball's (orange), both where they end; the ring is the target. "
-        f"The best stroke with hard balls hits after {time:.3f} s at {speed:.2f} m/s."
-    )
-    return figure, "The strokes", caption
-
-
-def forces(outcome: Outcome):
-    """Force along the line of the balls against time."""
-    figure, axes = subplots(1, 1, height=3.4)
-    axis = axes[0, 0]
-    count = outcome.settings.num_pieces
-    times = np.arange(count + 1) / count
-    for run, colour in zip(outcome.runs, _COLOURS, strict=False):
-        along = run.forces.sum(axis=1) / np.sqrt(2)
-        axis.stairs(along, times, color=colour, lw=1.3, baseline=None, label=run.method.label)
-    _, end, speed = outcome.optimum
-    gap = np.sqrt(2) - 2 * _RADIUS
-    first, last = 6 * gap / end**2 - 2 * speed / end, 4 * speed / end - 6 * gap / end**2
-    axis.plot([0, end, end, 1], [first, last, 0, 0], color=REFERENCE, lw=1.0)
-    axis.set(xlabel="time, s", ylabel="force, N")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8.5)
-    caption = "Force along the line of the balls that each descent ended with, and the best one for hard balls (black)."
-    return figure, "The forces", caption
 
 
 def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
@@ -86,7 +38,7 @@ def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     mj_model = load_scene(scene_path("billiards")).mj_model
     # Without a GPU fine shadows double the time of a frame, and coarse ones speckle the table.
     mj_model.light_castshadow[:] = False
-    apart = [run for run in outcome.runs if not run.has_touched] or list(outcome.runs)
+    apart = [run for run in outcome.runs if not run.touches_at_start] or list(outcome.runs)
     chosen = [max(apart, key=lambda run: run.final_cost), min(apart, key=lambda run: run.final_cost)]
     return film(
         workspace,
@@ -96,13 +48,4 @@ def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
         caption="The strokes that two descents end with, at 0.5 of real speed; the dark disc is the target.",
         titles=[f"{run.method.label}: {run.final_cost:.3f}" for run in chosen],
         columns=2,
-        timestep=outcome.timestep,
     )
-
-
-def _shown(outcome: Outcome) -> list[Run]:
-    """At most four: those that stand still first, then the solved ones."""
-    apart = [run for run in outcome.runs if not run.has_touched]
-    stuck = [run for run in apart if run.is_stuck][:1]
-    solved = sorted((run for run in apart if not run.is_stuck), key=lambda run: run.final_cost)
-    return (stuck + solved)[:4] or list(outcome.runs[:4])

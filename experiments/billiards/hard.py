@@ -2,8 +2,10 @@ r"""The same stroke with hard balls: closed forms that share no code with the si
 
 A driven ball from rest, accelerated by $u$, has to cover the vector $d$ in the time $s$ and arrive at velocity $v$. The
 least $\int |u|^2$ for that is $12 |d|^2/s^3 - 12\, d \cdot v/s^2 + 4 |v|^2/s$ (a force linear in time). Then both balls, of
-equal mass, exchange what is along the line of centres.
+equal mass, exchange what is along the line of centres: the collision is elastic.
 """
+
+import functools
 
 import numpy as np
 from scipy.optimize import brentq, minimize
@@ -13,37 +15,23 @@ CONTACT = 0.4  # m, between the centres
 EFFORT = 0.1
 
 
-def optimum(restitution: float = 1.0) -> tuple[float, float, float]:
-    """Find the best stroke.
-
-    Args:
-        restitution: speed after over speed before the collision; 1 is elastic.
-
-    Returns:
-        Its cost, the time of the collision (s) and the speed at it (m/s).
-    """
+@functools.cache
+def optimum() -> tuple[float, float, float]:
+    """Find the best stroke: its cost (m²), the time of the collision (s) and the speed at it (m/s)."""
     gap = np.linalg.norm(KNOCKED - DRIVEN) - CONTACT
     miss = np.linalg.norm(KNOCKED)
 
     def cost(x):
         time, speed = x
         effort = 12 * gap**2 / time**3 - 12 * gap * speed / time**2 + 4 * speed**2 / time
-        return (miss - (1 - time) * speed * (1 + restitution) / 2) ** 2 + EFFORT * effort
+        return (miss - (1 - time) * speed) ** 2 + EFFORT * effort
 
     best = minimize(cost, [0.7, 2.5], method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14})
     return float(best.fun), float(best.x[0]), float(best.x[1])
 
 
-def cost(forces: np.ndarray, restitution: float = 1.0) -> float:
-    """Play forces that are constant over pieces of the second on hard balls, which meet at most once.
-
-    Args:
-        forces: (pieces, 2), in N.
-        restitution: 1 is elastic.
-
-    Returns:
-        The cost, in m².
-    """
+def cost(forces: np.ndarray) -> float:
+    """Play forces (pieces, 2), in N and constant over pieces of the second, on hard balls; gives the cost (m²)."""
     forces = np.asarray(forces, float)
     piece = 1 / len(forces)
     position, velocity = DRIVEN.copy(), np.zeros(2)
@@ -60,7 +48,7 @@ def cost(forces: np.ndarray, restitution: float = 1.0) -> float:
             time = float(brentq(distance, *bracket)) if inside[0] else 0.0  # pyright: ignore[reportArgumentType]
             normal = KNOCKED - (position + time * velocity + time**2 / 2 * force)
             normal /= np.linalg.norm(normal)
-            speed = (velocity + time * force) @ normal * (1 + restitution) / 2
+            speed = (velocity + time * force) @ normal
             end = KNOCKED + (1 - i * piece - time) * speed * normal
             break
         position, velocity = position + piece * velocity + piece**2 / 2 * force, velocity + piece * force

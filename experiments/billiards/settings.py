@@ -6,8 +6,6 @@ from pydantic import Field, model_validator
 
 from experiments.settings import Positive, RunSettings, SettingsTable
 
-Share = Annotated[float, Field(gt=0, le=1)]
-
 
 class MethodSettings(SettingsTable):
     """One way to descend, from one start."""
@@ -43,14 +41,6 @@ class Settings(RunSettings):
     """In the order of the legend."""
     num_steps: Annotated[int, Field(ge=10)] = 80
     """Of each descent."""
-    learning_rate: Positive = 0.1
-    """Of Adam, in N; it falls along a cosine to a twentieth."""
-    final_scale: Share = 0.02
-    """What is left at the last step of noise, margin or length; margin and length are then taken away."""
-    num_pieces: Annotated[int, Field(ge=2)] = 20
-    """In which the force is constant."""
-    evaluations: Annotated[int, Field(ge=2)] = 20
-    """How often along a descent the true cost is measured."""
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":

@@ -4,149 +4,89 @@ import itertools
 
 import numpy as np
 
-from experiments.bounce.outcome import Outcome
+from experiments.bounce.measure import CONTACT, TOLERANCE, Outcome
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Table
 from experiments.words import joined
 
 # Steps in contact by which the outcome is told apart.
 _STEPS = (0, 3, 6, 10, 20, np.inf)
+# Largest time step at which the tolerance is asked for, and one at which this one is enough (s).
+_FINE, _COARSE, _COARSE_TOLERANCE = 5e-4, 2e-3, 0.3
+_ORDER = (CONTINUOUS, EVENT, DISCRETE)
 
 
 def verdict(outcome: Outcome) -> str:
     """Say how often each derivative is the slope."""
-    settings = outcome.settings
-    fine = outcome.timesteps <= settings.fine_timestep
-    judged = outcome.can_judge[fine]
-    if not judged.any():
+    grid = outcome.grid
+    fine = grid.isel(timestep=grid.timestep.values <= _FINE)
+    coarse = grid.isel(timestep=np.isclose(grid.timestep.values, _COARSE))
+    judged = int(fine.judged.sum())
+    if not judged:
         return "At no contact is the slope known well enough: take more phases."
-    within = [f"{outcome.holds(arm)[fine].sum()} ({arm})" for arm in (CONTINUOUS, EVENT, DISCRETE)]
-    sentences = [
-        f"Up to {1e3 * settings.fine_timestep:g} ms the mean derivative is within {settings.tolerance:.0%} of the slope at "
-        f"{joined(within)} of {judged.sum()} contacts and time steps."
-    ]
-    if (coarse := _coarse(outcome)) is not None:
-        sentences.append(coarse)
-    return " ".join(sentences)
+    within = [f"{int(fine.holds.sel(arm=arm).sum())} ({arm})" for arm in _ORDER]
+    sentence = (
+        f"Up to {1e3 * _FINE:g} ms the mean derivative is within {TOLERANCE:.0%} of the slope at {joined(within)} of {judged} "
+        "contacts and time steps."
+    )
+    if not coarse.timestep.size:
+        return sentence
+    close = [int(((coarse.error <= _COARSE_TOLERANCE) & coarse.judged).sel(arm=arm).sum()) for arm in _ORDER]
+    return (
+        f"{sentence} At {1e3 * _COARSE:g} ms it is within {_COARSE_TOLERANCE:.0%} at {close[0]} and {close[1]} (event) of "
+        f"{int(coarse.judged.sum())}."
+    )
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    return [
-        sentence
-        for sentence in (_jump(outcome), _gentle(outcome), _wide(outcome), _closed_form(outcome))
-        if sentence is not None
-    ]
+    """Say what no table shows: the discrete gradient by how contact sets in, differences, and how well the truth is known."""
+    grid, sentences = outcome.grid, []
+    ratio = abs(grid["mean"].sel(arm=DISCRETE) / grid.slope.sel(arm=DISCRETE))
+    jumps = ratio.where(grid.judged & (grid.impedance_first > 0))
+    if jumps.notnull().any():
+        sentences.append(
+            f"Where contact sets in with a jump of force the discrete gradient is {float(jumps.median()):.3g} times the slope "
+            f"in the median and up to {float(jumps.max()):.3g} times."
+        )
+    change = abs(grid["mean"].sel(arm=EVENT) - grid["mean"].sel(arm=DISCRETE)) / abs(grid.slope.sel(arm=DISCRETE))
+    gentle = change.where(grid.judged & (grid.impedance_first == 0))
+    if gentle.notnull().any():
+        sentences.append(
+            "Where contact sets in gently there is nothing to correct, and both gradients differ by "
+            f"{float(gentle.median()):.1%} of the slope in the median and {float(gentle.max()):.1%} at most."
+        )
+    wide = abs(grid.wide / grid.slope.sel(arm=DISCRETE) - 1).where(grid.judged)
+    sentences.append(
+        f"Finite differences over one step's flight, two rollouts per parameter, are off by {float(wide.median()):.1%} of the "
+        f"slope in the median and {float(wide.max()):.0%} at most; far shorter ones give the discrete gradient."
+    )
+    if grid.closed_form.notnull().any():
+        finest = grid.isel(timestep=0)
+        off = abs(finest.slope / grid.truth - 1).where(finest.judged).max(CONTACT)
+        sentences.append(
+            f"Quadrature and closed form agree to {float(abs(grid.truth - grid.closed_form).max()):.0e} where there is one. At "
+            f"{1e3 * float(finest.timestep):g} ms the slope of the simulated height is within "
+            f"{float(off.sel(arm=DISCRETE)):.1%} of the truth, with an onset within {float(off.sel(arm=CONTINUOUS)):.1%}."
+        )
+    return sentences
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate where the derivatives hold: by how many steps the contact lasts, and contact by contact."""
-    return [_by_steps(outcome), _by_contact(outcome)]
-
-
-def _coarse(outcome: Outcome) -> str | None:
-    settings = outcome.settings
-    at = np.flatnonzero(np.isclose(outcome.timesteps, settings.coarse_timestep))
-    if not at.size:
-        return None
-    judged = outcome.can_judge[at[0]]
-    close = [(outcome.error(arm)[at[0]] <= settings.coarse_tolerance) & judged for arm in (CONTINUOUS, EVENT)]
-    return (
-        f"At {1e3 * settings.coarse_timestep:g} ms it is within {settings.coarse_tolerance:.0%} at {close[0].sum()} and "
-        f"{close[1].sum()} (event) of {judged.sum()}."
-    )
-
-
-def _jump(outcome: Outcome) -> str | None:
-    has_jump = np.array([cell.impedance.first > 0 for cell in outcome.cells])
-    ratio = np.abs(outcome.mean(DISCRETE) / outcome.slope())[outcome.can_judge & has_jump]
-    if not ratio.size:
-        return None
-    return (
-        f"Where contact sets in with a jump of force the discrete gradient is {np.median(ratio):.3g} times the slope in the "
-        f"median and up to {ratio.max():.3g} times."
-    )
-
-
-def _gentle(outcome: Outcome) -> str | None:
-    gentle = outcome.can_judge & np.array([cell.impedance.first == 0 for cell in outcome.cells])
-    if not gentle.any():
-        return None
-    change = np.abs(outcome.mean(EVENT) - outcome.mean(DISCRETE))[gentle] / np.abs(outcome.slope())[gentle]
-    return (
-        f"Where contact sets in gently there is nothing to correct, and both gradients differ by {np.median(change):.1%} of the "
-        f"slope in the median and {change.max():.1%} at most."
-    )
-
-
-def _wide(outcome: Outcome) -> str:
-    slope = outcome.slope()[outcome.can_judge]
-    error = np.abs(outcome.wide[outcome.can_judge] - slope) / np.abs(slope)
-    return (
-        f"Finite differences over one step's flight, two rollouts per parameter, are off by {np.median(error):.1%} of the slope "
-        f"in the median and {error.max():.0%} at most; far shorter ones give the discrete gradient."
-    )
-
-
-def _closed_form(outcome: Outcome) -> str | None:
-    closed = np.array([cell.closed_form for cell in outcome.cells])
-    has_closed = np.isfinite(closed)
-    if not has_closed.any():
-        return None
-    truth = np.array([cell.truth for cell in outcome.cells])
-    apart = np.abs(truth - closed)[has_closed].max()
-    finest = outcome.can_judge[0]
-    off = [np.abs(outcome.slope(arm)[0] - truth)[finest] / np.abs(truth)[finest] for arm in (DISCRETE, CONTINUOUS)]
-    return (
-        f"Quadrature and closed form agree to {apart:.0e} where there is one. At {1e3 * outcome.timesteps[0]:g} ms the slope of "
-        f"the simulated height is within {off[0].max():.1%} of the truth, with an onset within {off[1].max():.1%}."
-    )
-
-
-def _by_steps(outcome: Outcome) -> Table:
-    count, rows = outcome.steps_in_contact, []
+    """Tabulate where the derivatives hold by how many steps the contact lasts."""
+    grid, rows = outcome.grid, []
+    spread = grid.spread / abs(grid.slope)
     for low, high in itertools.pairwise(_STEPS):
-        inside = outcome.can_judge & (count >= low) & (count < high)
+        inside = grid.judged & (grid.steps_in_contact >= low) & (grid.steps_in_contact < high)
         if not inside.any():
             continue
-        name = f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} and more"
-        row = [name, f"{inside.sum()}"]
-        for arm in (CONTINUOUS, EVENT, DISCRETE):
-            errors = outcome.error(arm)[inside]
-            spread = (outcome.spread(arm) / np.abs(outcome.slope(arm)))[inside]
-            row += [f"{outcome.holds(arm)[inside].sum()}", f"{np.median(errors):.1%}", f"{np.median(spread):.2g}"]
+        row = [f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} and more", str(int(inside.sum()))]
+        for arm in _ORDER:
+            error, width = (float(one.sel(arm=arm).where(inside).median()) for one in (grid.error, spread))
+            row += [str(int(grid.holds.sel(arm=arm).where(inside, False).sum())), f"{error:.1%}", f"{width:.2g}"]
         rows.append(row)
-    percent = f"{outcome.settings.tolerance:.0%}"
-    heads = [
-        f"{what}, {arm}" for arm in (CONTINUOUS, EVENT, DISCRETE) for what in (f"within {percent}", "error", "spread")
-    ]
-    return Table(
-        ("steps in contact", "judged", *heads),
-        rows,
+    heads = [f"{what}, {arm}" for arm in _ORDER for what in (f"within {TOLERANCE:.0%}", "error", "spread")]
+    caption = (
         "Contacts and time steps by how long the contact lasts. Error of the mean derivative as a share of the slope of its own "
-        "height, at most 100%, and standard deviation of single derivatives over the slope: medians.",
+        "height, at most 100%, and standard deviation of single derivatives over the slope: medians."
     )
-
-
-def _by_contact(outcome: Outcome) -> Table:
-    errors, fails, rows, emphasised = outcome.error(CONTINUOUS), outcome.fails(CONTINUOUS), [], set()
-    for j, cell in enumerate(outcome.cells):
-        for i in np.flatnonzero(fails[:, j]):
-            emphasised.add((j, 4 + int(i)))
-        rows.append(
-            [
-                f"{cell.damping_ratio:g}",
-                f"{1e3 * cell.time_constant:g}",
-                cell.impedance.label,
-                f"{cell.truth:.3f}".replace("-", "−"),
-                *(f"{errors[i, j]:.1%}" if outcome.can_judge[i, j] else "—" for i in range(len(outcome.timesteps))),
-            ]
-        )
-    heads = [f"{1e3 * h:g} ms" for h in outcome.timesteps]
-    return Table(
-        ("damping ratio", "time constant, ms", "impedance", "truth", *heads),
-        rows,
-        "Error with contact that begins within the step, contact by contact, by time step. Bold where it is beyond the "
-        "tolerance by more than two standard errors; — where the step is unstable or the slope not known well enough.",
-        frozenset(emphasised),
-    )
+    return [Table(("steps in contact", "judged", *heads), rows, caption)]

@@ -20,6 +20,11 @@ class ImpedanceSettings(SettingsTable):
     """Over which it rises, in m."""
 
     @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Give them in MuJoCo's order."""
+        return self.first, self.last, self.width
+
+    @property
     def label(self) -> str:
         """Give a name for headings."""
         if self.first == self.last:
@@ -42,18 +47,8 @@ class Settings(RunSettings):
     """Start heights over which the slope and the means are taken."""
     heights: tuple[Positive, Positive] = (0.01, 0.05)
     """Between which the ball starts, in m above the floor."""
-    speed: Positive = 1.0
-    """Of the ball towards the floor, in m/s."""
     duration: Positive = 0.2
-    """After which its height is read, in s."""
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.05
-    """Error that a derivative may have, as a share of the larger of the slope and the discrete gradient's own error."""
-    coarse_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.3
-    """Error that it may have at the time step `coarse_timestep`, as a share of the slope."""
-    coarse_timestep: Positive = 2e-3
-    """In s; errors below `fine_timestep` are measured by `tolerance`."""
-    fine_timestep: Positive = 5e-4
-    """Largest time step at which `tolerance` is asked for, in s."""
+    """After which its height is read, in s; it flies at 1 m/s."""
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
@@ -61,6 +56,6 @@ class Settings(RunSettings):
             raise ValueError(f"timesteps must increase, got {list(self.timesteps)}")
         if not self.heights[0] < self.heights[1]:
             raise ValueError(f"heights must be two numbers, the smaller one first, got {list(self.heights)}")
-        if self.heights[1] / self.speed >= self.duration:
-            raise ValueError("duration must be longer than heights[1] / speed, when the last ball lands")
+        if self.heights[1] >= self.duration:
+            raise ValueError("duration must be longer than heights[1] / (1 m/s), when the last ball lands")
         return self

@@ -2,16 +2,11 @@
 
 import numpy as np
 
-from experiments.kernels.outcome import TITLES, Outcome
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
+from experiments.kernels.measure import Outcome
+from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 
-COLOURS = {
-    "gaussian": FIRST,
-    "logistic": ZEROTH,
-    "log_barrier": "#009e73",
-    "margin": DEFAULT,
-    "impedance": MUTED,
-}
+COLOURS = {"gaussian": FIRST, "logistic": ZEROTH, "log_barrier": ONSET, "margin": DEFAULT, "impedance": MUTED}
+TITLES = {"gaussian": "Gaussian", "logistic": "logistic", "log_barrier": "log barrier"}
 NAMES = TITLES | {"margin": "margin of one length", "impedance": "impedance from 0.2 to 0.9"}
 
 
@@ -25,23 +20,23 @@ def profiles(outcome: Outcome):
     figure, axes = subplots(1, 3, height=3.8)
     near, far, right = axes[0]
     length = outcome.settings.length
-    for one in outcome.profiles:
-        colour, width = COLOURS[one.name], 1.4 if one.name in TITLES else 1.1
-        x, force = one.distance / length, one.force / (one.found.slope * length)
-        near.plot(x, force, color=colour, lw=width, label=NAMES[one.name])
-        if one.name in TITLES:
-            far.plot(x, force, color=colour, lw=width)
-        if one.found.stddev != 0:
-            right.plot(one.found.noise / length, one.found.density * length, color=colour, lw=width)
+    x = outcome.force.distance.values / length
+    for name, found in outcome.noise.items():
+        look = {"color": COLOURS[name], "lw": 1.4 if name in TITLES else 1.1}
+        force = outcome.force.sel(profile=name) / (found.slope * length)
+        near.plot(x, force, label=NAMES[name], **look)
+        if name in TITLES:
+            far.plot(x, force, **look)
+        if found.stddev != 0:
+            right.plot(found.noise / length, found.density * length, **look)
         else:
-            right.axvline(one.found.mean / length, color=colour, lw=width)
-    x = np.linspace(-4, 4, 401)
+            right.axvline(found.mean / length, **look)
     near.plot(x, np.maximum(-x, 0), color=REFERENCE, lw=0.9, ls=(0, (3, 2)), label="hard contact", zorder=1)
     near.set(xlim=(-2.5, 2.5), ylim=(-0.08, 2.2), title="Force, over slope × length", xlabel="distance / length")
     far.set(xlim=(0, 4), ylim=(1e-4, 1), yscale="log", title="The same, far out", xlabel="distance / length")
     right.set(xlim=(-3, 3), ylim=(-0.45, 0.75), title="Density of the noise, × length", xlabel="noise / length")
     right.axhline(0, color=MUTED, lw=0.7)
-    figure.legend(*near.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8.5)
+    legend_below(figure, near, 6)
     settings = outcome.settings
     caption = (
         "Static force of a contact against distance, in units of its slope deep inside and of the length of the noise, "
@@ -56,29 +51,20 @@ def motion(outcome: Outcome):
     """Height and its derivative over time, lines smoothed and dots sampled."""
     figure, axes = subplots(1, 2, height=4.0)
     left, right = axes[0]
-    left.plot(outcome.time, 1e3 * outcome.hard, color=REFERENCE, lw=1.0, ls=(0, (3, 2)), label="without noise")
-    right.plot(outcome.time, outcome.hard_slope, color=REFERENCE, lw=1.0, ls=(0, (3, 2)), label="without noise")
-    every = slice(None, None, max(1, len(outcome.time) // 30))
-    for name, one in outcome.motions.items():
-        colour = COLOURS[name]
-        pairs = (
-            (left, 1e3 * one.height, 1e3 * one.sampled, 1e3 * one.sampled_error),
-            (right, one.slope, one.sampled_slope, one.sampled_slope_error),
-        )
-        for axis, line, dots, error in pairs:
-            axis.plot(outcome.time, line, color=colour, label=TITLES[name])
-            axis.errorbar(
-                outcome.time[every], dots[every], 2 * error[every], color=colour, fmt="o", ms=3.2, lw=0.9,
-                label="sampled",
-            )  # fmt: skip
+    found, time = outcome.motion, outcome.motion.time.values
+    few = found.isel(time=slice(None, None, max(1, len(time) // 30)))
+    panels = ((left, 1e3, "hard", "height", "sampled"), (right, 1.0, "hard_slope", "slope", "sampled_slope"))
+    for axis, scale, hard, line, dots in panels:
+        axis.plot(time, scale * found[hard], color=REFERENCE, lw=1.0, ls=(0, (3, 2)), label="without noise")
+        for name in found.kernel.values:
+            one, look = few.sel(kernel=name), {"color": COLOURS[name], "fmt": "o", "ms": 3.2, "lw": 0.9}
+            axis.plot(time, scale * found[line].sel(kernel=name), color=COLOURS[name], label=TITLES[name])
+            axis.errorbar(one.time, scale * one[dots], 2 * scale * one[f"{dots}_error"], label="sampled", **look)
     left.set(title="Height (mm)", xlabel="time (s)")
     right.set(title="Derivative of the height by the start height", xlabel="time (s)")
     # The derivative without noise is one of the simulated map, and may leave the picture.
-    seen = np.concatenate([np.stack([m.slope, m.sampled_slope]) for m in outcome.motions.values()])
-    right.set_ylim(min(1.5 * seen.min(), -0.3), 1.2)
-    figure.legend(
-        *left.get_legend_handles_labels(), loc="outside lower center", ncols=7, columnspacing=1.2, fontsize=8.5
-    )
+    right.set_ylim(min(1.5 * float(found[["slope", "sampled_slope"]].to_array().min()), -0.3), 1.2)
+    legend_below(figure, left, 7)
     settings = outcome.settings
     caption = (
         f"A ball thrown at a plane with {settings.speed:g} m/s. Lines: one rollout of the smoothed solver. Dots: mean over "

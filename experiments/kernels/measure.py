@@ -1,16 +1,19 @@
 """From settings to numbers."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array, Float
 
 import mjxgrad as mg
-from experiments.kernels.outcome import Linear, Motion, Outcome, Profile
 from experiments.kernels.settings import Settings
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics.equivalent_noise import contact_profile, probe
+from mjxgrad.diagnostics.equivalent_noise import EquivalentNoise, contact_profile, probe
 from mjxgrad.dynamics.kernels import KERNELS
 
 # A ball on a slide joint over a plane, without gravity, driven by a force.
@@ -23,22 +26,58 @@ _SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" t
 _LITTLE = 1e-3
 
 
+# Derivatives of the velocity after a step, and what they are by: two entries of A and the one of B.
+_ENTRIES = ("velocity by height (1/s)", "velocity by velocity", "velocity by force (1/N)")
+WAYS = ("smoothed solver", "mean of derivatives", "zeroth order")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured.
+
+    `motion` is by `kernel` and `time` (s): the `height` (m) of the smoothed rollout and its `slope` by the start height, the
+    same of the mean over rollouts with noise in each step (`sampled`, `sampled_slope`, each with its `_error`), and without
+    noise (`hard`, `hard_slope`, that of the simulated map). `linear` is A and B of one step by `kernel`, `velocity` (m/s),
+    `entry` and `way`, with the `error`, zero where nothing is sampled, and the `deviation` from the smoothed solver in errors.
+    """
+
+    settings: Settings
+    force: xr.DataArray  # static, per mass (N/kg), by `profile` and `distance` between the bodies (m)
+    noise: dict[str, EquivalentNoise]  # of each profile
+    motion: xr.Dataset
+    linear: xr.Dataset
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per kernel, velocity, entry and way, for metrics.csv."""
+        return self.linear.to_dataframe().reset_index().to_dict("records")
+
+
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Probe forces at a distance, then hold smoothed motion and derivatives against sampled noise."""
     scene = _scene(settings, settings.impedance, settings.impedance)
     workspace.check(scene, speed=settings.speed)
-    profiles = _profiles(settings)
-    motions, linear = {}, {}
-    hard, hard_slope = _smoothed_motion(scene, settings, None)
+    motions, linear, velocities = [], [], (0.0, -settings.speed)
     with workspace.stage("kernels", "kernels", len(settings.kernels)) as advance_to:
         for i, name in enumerate(settings.kernels):
             motion_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), i))
-            height, slope = _smoothed_motion(scene, settings, mg.Smoothing(settings.length, name))
-            motions[name] = Motion(height, slope, *_sampled_motion(scene, settings, name, motion_key))
-            linear[name] = [_linear(scene, settings, name, v, step_key) for v in (0.0, -settings.speed)]
+            smoothed = _smoothed_motion(scene, settings, mg.Smoothing(settings.length, name))
+            motions.append([*smoothed, *_sampled_motion(scene, settings, name, motion_key)])
+            linear.append([_linear(scene, settings, name, velocity, step_key) for velocity in velocities])
             advance_to(i + 1)
-    time = settings.timestep * np.arange(settings.horizon + 1)
-    return Outcome(settings, profiles, time, hard, hard_slope, motions, linear)
+    names = ("height", "slope", "sampled", "sampled_error", "sampled_slope", "sampled_slope_error")
+    columns = {
+        name: (("kernel", "time"), np.stack(each)) for name, each in zip(names, zip(*motions, strict=True), strict=True)
+    }
+    hard, hard_slope = _smoothed_motion(scene, settings, None)
+    motion = xr.Dataset(
+        columns | {"hard": ("time", hard), "hard_slope": ("time", hard_slope)},
+        coords={"kernel": list(settings.kernels), "time": settings.timestep * np.arange(settings.horizon + 1)},
+    )
+    value, error = np.moveaxis(np.array(linear), 2, 0)
+    dims = {"kernel": list(settings.kernels), "velocity": list(velocities), "entry": list(_ENTRIES), "way": list(WAYS)}
+    table = xr.Dataset({"value": (list(dims), value), "error": (list(dims), error)}, coords=dims)
+    deviation = abs(table.value - table.value.isel(way=0)) / table.error.where(table.error > 0, np.inf)
+    return Outcome(settings, *_profiles(settings), motion, table.assign(deviation=deviation))
 
 
 def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
@@ -48,18 +87,17 @@ def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -
     return mg.load_scene(text)
 
 
-def _profiles(settings: Settings) -> list[Profile]:
+def _profiles(settings: Settings) -> tuple[xr.DataArray, dict[str, EquivalentNoise]]:
     """Probe each kernel on a constant impedance, and what MuJoCo has of its own."""
-    plain = _scene(settings, 0.9, 0.9)
-    cases = {name: contact_profile(plain, smoothing=mg.Smoothing(settings.length, name)) for name in settings.kernels}
+    plain, length = _scene(settings, 0.9, 0.9), settings.length
+    cases = {name: contact_profile(plain, smoothing=mg.Smoothing(length, name)) for name in settings.kernels}
     # Those of both bodies add up.
-    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=settings.length / 2))
+    cases["margin"] = contact_profile(_scene(settings, 0.9, 0.9, margin=length / 2))
     cases["impedance"] = contact_profile(_scene(settings, 0.2, 0.9))
-    grid = np.linspace(-4 * settings.length, 4 * settings.length, 401)
-    return [
-        Profile(name, grid, np.asarray(profile(jnp.asarray(grid))), probe(profile, reach=25 * settings.length))
-        for name, profile in cases.items()
-    ]
+    grid = np.linspace(-4 * length, 4 * length, 401)
+    force = np.stack([np.asarray(profile(jnp.asarray(grid))) for profile in cases.values()])
+    noise = {name: probe(profile, reach=25 * length) for name, profile in cases.items()}
+    return xr.DataArray(force, {"profile": list(cases), "distance": grid}), noise
 
 
 def _draw(name: str, key: Array, shape: tuple[int, ...]) -> Array:
@@ -144,16 +182,16 @@ def _samples(scene, point, noise, score):
     return jax.vmap(sample)(noise, score)
 
 
-def _linear(scene, settings: Settings, name: str, velocity: float, key: Array) -> Linear:
-    """Differentiate the velocity after one step, half a length above the plane, in three ways."""
-    smoothing, length = mg.Smoothing(settings.length, name), settings.length
+def _linear(
+    scene, settings: Settings, name: str, velocity: float, key: Array
+) -> tuple[Float[np.ndarray, "entries ways"], Float[np.ndarray, "entries ways"]]:
+    """Differentiate the velocity after one step, half a length above the plane, in three ways: values and their errors."""
+    length = settings.length
     point = jnp.array([0.5 * length, velocity, 0.0])
-
     noise = length * _draw(name, key, (settings.num_samples,))
     # The noise on height moves the height itself, so the derivative of the mean is minus that by the noise, whose score is known.
     density = KERNELS[name].density
     score = -jax.vmap(jax.grad(lambda w: jnp.log(density(w))))(noise / length) / length
     first, zeroth = (_mean(samples) for samples in _samples(scene, point, noise, score))
-    exact = np.asarray(_slope(scene, smoothing, point, jnp.zeros(()))[1])
-    value = np.stack([exact, first[0], zeroth[0]], axis=1)
-    return Linear(velocity, value, np.stack([0 * exact, first[1], zeroth[1]], axis=1))
+    exact = np.asarray(_slope(scene, mg.Smoothing(length, name), point, jnp.zeros(()))[1])
+    return np.stack([exact, first[0], zeroth[0]], axis=1), np.stack([0 * exact, first[1], zeroth[1]], axis=1)

@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 
-from experiments.kernels.figures import NAMES
-from experiments.kernels.outcome import ENTRIES, TITLES, WAYS, Outcome
+from experiments.kernels.figures import NAMES, TITLES
+from experiments.kernels.measure import WAYS, Outcome
 from experiments.report import Table
-from experiments.words import capitalised, quantity
+from experiments.words import capitalised, joined, quantity
 
 # Beyond it, of some twenty numbers, none is expected by chance.
 _FAR = 4.0
@@ -15,29 +15,32 @@ _FAR = 4.0
 
 def verdict(outcome: Outcome) -> str:
     """Say which profiles are noise, and whether the smoothed solver is the mean over it."""
-    noisy = [NAMES[one.name] for one in outcome.profiles if one.found.is_noise and one.found.stddev > 0]
-    others = [NAMES[one.name] for one in outcome.profiles if not one.found.is_noise]
-    sentence = f"Equivalent to noise on the distance: {', '.join(noisy) or 'none'}; to none: {', '.join(others) or 'no profile'}."
-    height, slope = _motion_errors(outcome)
+    noisy = [NAMES[name] for name, found in outcome.noise.items() if found.is_noise and found.stddev > 0]
+    others = [NAMES[name] for name, found in outcome.noise.items() if not found.is_noise]
+    motion = outcome.motion
+    height = float(abs(motion.height - motion.sampled).max())
+    slope = float(abs(motion.slope - motion.sampled_slope).max())
+    last = motion.isel(time=-1)
+    ends = [
+        f"{quantity(float(one.sampled_slope), float(one.sampled_slope_error))} ({TITLES[str(one.kernel.values)]})"
+        for one in (last.isel(kernel=i) for i in range(last.kernel.size))
+    ]
     return (
-        f"{sentence} The smoothed rollout is within {1e3 * height:.2g} mm of the mean over sampled noise, and its derivative "
-        f"within {slope:.2g} of that mean's slope, which ends at {_ends(outcome)}; without noise the derivative ends at "
-        f"{outcome.hard_slope[-1]:.3g}.".replace("-", "−")
+        f"Equivalent to noise on the distance: {joined(noisy or ['none'])}; to none: {joined(others or ['no profile'])}. The "
+        f"smoothed rollout is within {1e3 * height:.2g} mm of the mean over sampled noise, and its derivative within "
+        f"{slope:.2g} of that mean's slope. That slope ends at {joined(ends)}; without noise the derivative ends at "
+        f"{quantity(float(last.hard_slope))}."
     )
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    found = [f"{capitalised(NAMES[one.name])}: {_describe(one.found)}." for one in outcome.profiles]
-    for way in (2, 1):
-        close, total = 0, 0
-        for states in outcome.linear.values():
-            for one in states:
-                close += int((one.deviation[:, way] <= _FAR).sum())
-                total += len(ENTRIES)
+    """Say what each profile is as noise, and how often A and B agree."""
+    found = [f"{capitalised(NAMES[name])}: {_describe(one)}." for name, one in outcome.noise.items()]
+    for way in WAYS[:0:-1]:
+        close = outcome.linear.deviation.sel(way=way) <= _FAR
         found.append(
-            f"A and B by {WAYS[way]} agree with the smoothed solver within {_FAR:g} standard errors in {close} of {total} "
-            "entries."
+            f"A and B by {way} agree with the smoothed solver within {_FAR:g} standard errors in {int(close.sum())} of "
+            f"{close.size} entries."
         )
     return found
 
@@ -45,12 +48,12 @@ def findings(outcome: Outcome) -> list[str]:
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate A and B three ways."""
     rows, emphasised = [], set()
-    for name, states in outcome.linear.items():
-        for one in states:
-            for i, entry in enumerate(ENTRIES):
-                cells = [quantity(v, e if e > 0 else None) for v, e in zip(one.value[i], one.error[i], strict=True)]
-                emphasised |= {(len(rows), 3 + j) for j in np.flatnonzero(one.deviation[i] > _FAR)}
-                rows.append([TITLES[name], f"{one.velocity:g}".replace("-", "−"), entry, *cells])
+    linear = outcome.linear.stack(row=("kernel", "velocity", "entry")).transpose("row", "way")
+    for i, (kernel, velocity, entry) in enumerate(linear.row.values):
+        one = linear.isel(row=i)
+        cells = [quantity(v, e or None) for v, e in zip(one.value.values, one.error.values, strict=True)]
+        rows.append([TITLES[kernel], f"{velocity:g}".replace("-", "−"), entry, *cells])
+        emphasised |= {(i, 3 + int(j)) for j in np.flatnonzero(one.deviation > _FAR)}
     caption = (
         "Derivatives of the velocity after one step, half a length above the plane, at rest and approaching. In bold what is "
         f"more than {_FAR:g} standard errors from the smoothed solver. Derivatives of sampled steps do not know that noise moves "
@@ -61,21 +64,10 @@ def tables(outcome: Outcome) -> list[Table]:
 
 def _describe(found) -> str:
     if not found.is_noise:
-        return re.sub(r"-(?=\d)", "−", found.reason)
-    if found.stddev == 0:
-        return f"noise of no width, shifted by {1e3 * found.mean:.3g} mm".replace("-", "−")
-    width = "infinite" if np.isinf(found.stddev) else f"{1e3 * found.stddev:.3g} mm"
-    return f"{found.reason}, mean {1e3 * found.mean:.2g} mm, standard deviation {width}".replace("-", "−")
-
-
-def _motion_errors(outcome: Outcome) -> tuple[float, float]:
-    every = outcome.motions.values()
-    height = max(float(np.abs(m.height - m.sampled).max()) for m in every)
-    return height, max(float(np.abs(m.slope - m.sampled_slope).max()) for m in every)
-
-
-def _ends(outcome: Outcome) -> str:
-    parts = [
-        f"{quantity(m.sampled_slope[-1], m.sampled_slope_error[-1])} ({TITLES[k]})" for k, m in outcome.motions.items()
-    ]
-    return ", ".join(parts)
+        text = found.reason
+    elif found.stddev == 0:
+        text = f"noise of no width, shifted by {1e3 * found.mean:.3g} mm"
+    else:
+        width = "infinite" if np.isinf(found.stddev) else f"{1e3 * found.stddev:.3g} mm"
+        text = f"{found.reason}, mean {1e3 * found.mean:.2g} mm, standard deviation {width}"
+    return re.sub(r"-(?=\d)", "−", text)

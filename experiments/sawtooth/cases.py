@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax.numpy as jnp
@@ -16,40 +17,21 @@ _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 @dataclass(frozen=True)
 class Case:
-    """A motion with impacts.
-
-    Attributes:
-        title: for headings.
-        model: of C MuJoCo, with its own contact, limits, integrator and time step.
-        moved: index in `qpos` of the coordinate to which the parameter is added.
-        interval: of the parameter (m or rad). It moves the first impact through several time steps.
-        labels: of what is read, with units.
-        read: from positions and velocities to what is kept.
-        duration: in s.
-        qpos: start positions that differ from the model's, by index.
-        qvel: start velocities that differ from zero, by index.
-    """
+    """A motion with impacts."""
 
     title: str
-    model: mujoco.MjModel
-    moved: int
-    interval: tuple[float, float]
-    labels: tuple[str, ...]
+    model: mujoco.MjModel  # with its own contact, limits, integrator and time step
+    moved: int  # index in `qpos` of the coordinate to which the parameter is added
+    interval: tuple[float, float]  # of the parameter (m or rad); it moves the first impact through several time steps
+    labels: tuple[str, ...]  # of what is read, with units
     read: Read
-    duration: float
-    qpos: Mapping[int, float] = field(default_factory=dict)
-    qvel: Mapping[int, float] = field(default_factory=dict)
+    duration: float  # in s
+    qpos: Mapping[int, float] = field(default_factory=dict)  # start positions that differ from the model's, by index
+    qvel: Mapping[int, float] = field(default_factory=dict)  # start velocities that differ from zero, by index
 
 
 def case(name: str) -> Case:
-    """Build a motion.
-
-    Args:
-        name: see `experiments.sawtooth.settings.CaseName`.
-
-    Returns:
-        The motion.
-    """
+    """Build a motion by one of the names in `experiments.sawtooth.settings.CaseName`."""
     return _BUILDERS[name]()
 
 
@@ -74,65 +56,11 @@ def _arm(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, "
     return qpos[:2]
 
 
-def _gymnasium(file: str) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(str(_ASSETS / file))
-
-
-def _hopper() -> Case:
-    return Case(
-        "Hopper",
-        _gymnasium("hopper.xml"),
-        moved=1,
-        interval=(0.0, 0.03),
-        labels=("x", "z", "pitch (rad)"),
-        read=_planar,
-        duration=0.5,
-        qpos={1: 1.22, 3: -0.4, 4: -0.5, 5: 0.3},
-        qvel={0: 0.5},
-    )
-
-
-def _walker() -> Case:
-    return Case(
-        "Walker2d",
-        _gymnasium("walker2d.xml"),
-        moved=1,
-        interval=(0.0, 0.03),
-        labels=("x", "z", "pitch (rad)"),
-        read=_planar,
-        duration=0.5,
-        qpos={1: 1.24, 3: -0.3, 4: -0.4, 5: 0.3, 6: -0.1, 7: -0.7, 8: 0.2},
-        qvel={0: 0.5},
-    )
-
-
-def _half_cheetah() -> Case:
-    return Case(
-        "Half cheetah",
-        _gymnasium("half_cheetah.xml"),
-        moved=1,
-        interval=(0.0, 0.03),
-        labels=("x", "z", "pitch (rad)"),
-        read=_planar,
-        duration=0.5,
-        qpos={1: 0.05, 2: 0.1, 3: 0.3, 4: -0.3, 6: 0.2},
-        qvel={0: 0.5},
-    )
-
-
-def _ant() -> Case:
-    # Legs half bent and the trunk tilted, so that the feet land one after the other.
-    return Case(
-        "Ant",
-        _gymnasium("ant.xml"),
-        moved=2,
-        interval=(0.0, 0.03),
-        labels=("x", "z", "pitch (sine)"),
-        read=_free,
-        duration=0.5,
-        qpos={2: 0.72, 3: 0.9962, 4: 0.05, 5: 0.07, 7: 0.2, 8: 0.9, 10: -0.9, 12: -0.8, 14: 0.8},
-        qvel={0: 0.3},
-    )
+def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **other: Any) -> Case:
+    """One of gymnasium's robots, dropped while it moves forwards."""
+    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": _planar}
+    model = mujoco.MjModel.from_xml_path(str(_ASSETS / file))
+    return Case(title, model, interval=(0.0, 0.03), duration=0.5, qpos=qpos, qvel={0: speed}, **planar | other)
 
 
 _BALL = """
@@ -208,24 +136,22 @@ _ARM_MJCF = """
 """
 
 
-def _arm_case() -> Case:
-    return Case(
-        "Two-link arm",
-        mujoco.MjModel.from_xml_string(_ARM_MJCF),
-        moved=0,
-        interval=(0.0, 0.06),
-        labels=("shoulder (rad)", "elbow (rad)"),
-        read=_arm,
-        duration=0.4,
-        qpos={0: 0.3, 1: 0.4},
-    )
-
-
 _BUILDERS = {
-    "hopper": _hopper,
-    "walker2d": _walker,
-    "half_cheetah": _half_cheetah,
-    "ant": _ant,
+    "hopper": lambda: _robot("Hopper", "hopper.xml", {1: 1.22, 3: -0.4, 4: -0.5, 5: 0.3}),
+    "walker2d": lambda: _robot(
+        "Walker2d", "walker2d.xml", {1: 1.24, 3: -0.3, 4: -0.4, 5: 0.3, 6: -0.1, 7: -0.7, 8: 0.2}
+    ),
+    "half_cheetah": lambda: _robot("Half cheetah", "half_cheetah.xml", {1: 0.05, 2: 0.1, 3: 0.3, 4: -0.3, 6: 0.2}),
+    # Legs half bent and the trunk tilted, so that the feet land one after the other.
+    "ant": lambda: _robot(
+        "Ant",
+        "ant.xml",
+        {2: 0.72, 3: 0.9962, 4: 0.05, 5: 0.07, 7: 0.2, 8: 0.9, 10: -0.9, 12: -0.8, 14: 0.8},
+        speed=0.3,
+        moved=2,
+        labels=("x", "z", "pitch (sine)"),
+        read=_free,
+    ),
     "ball_frictionless": lambda: _ball_case("pyramidal", 1),
     "ball": lambda: _ball_case("pyramidal", 3),
     "ball_elliptic": lambda: _ball_case("elliptic", 3),
@@ -235,5 +161,14 @@ _BUILDERS = {
     "ball_inclined_rolling": lambda: _ball_case("elliptic", 6, 20.0),
     "two_balls": lambda: _two_balls_case("pyramidal"),
     "two_balls_elliptic": lambda: _two_balls_case("elliptic"),
-    "arm": _arm_case,
+    "arm": lambda: Case(
+        "Two-link arm",
+        mujoco.MjModel.from_xml_string(_ARM_MJCF),
+        moved=0,
+        interval=(0.0, 0.06),
+        labels=("shoulder (rad)", "elbow (rad)"),
+        read=_arm,
+        duration=0.4,
+        qpos={0: 0.3, 1: 0.4},
+    ),
 }

@@ -1,41 +1,36 @@
 """The answer of the experiment on the sawtooth in words, computed from its numbers."""
 
-from typing import Any
-
 import numpy as np
+import xarray as xr
 
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
 from experiments.report import Table
-from experiments.sawtooth.measure import Course, Outcome
+from experiments.sawtooth.measure import Outcome
+from experiments.words import joined
 
 
 def verdict(outcome: Outcome) -> str:
     """Say whether teeth are gone, and whose mean derivative is the slope."""
-    courses = outcome.courses
-    ratio, spread = _pooled(courses, _ratio), _pooled(courses, lambda c: c.spread(CONTINUOUS))
-    if not ratio.size:
+    smaller, spread = _pooled(outcome, "smaller"), _pooled(outcome, "spread", CONTINUOUS)
+    if not smaller.size:
         return "Nothing touches in these motions: there are no teeth."
-    off = {arm: float(np.mean(_pooled(courses, lambda c, a=arm: _off(c, a)) <= 2)) for arm in ARMS}
+    within = {arm: _pooled(outcome, "within", arm).mean() for arm in ARMS}
     return (
-        f"The sawtooth is {np.median(ratio):.0f} times smaller in the median ({np.quantile(ratio, 0.1):.0f} at the tenth "
+        f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
-        f"standard errors at {off[CONTINUOUS]:.0%} of {ratio.size} readings ({off[DISCRETE]:.0%} without, {off[EVENT]:.0%} for "
-        f"the event gradient), and single derivatives scatter by {np.median(spread):.2f} of it."
+        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings ({within[DISCRETE]:.0%} without, "
+        f"{within[EVENT]:.0%} for the event gradient), and single derivatives scatter by {np.median(spread):.2f} of it."
     )
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    courses = outcome.courses
+    """Say what the table's medians do not show: where a mean derivative is off, and how often the motion is worse."""
     sentences = []
-    beyond = [(course, _excess(course, CONTINUOUS)) for course in courses]
-    worst = [f"{c.title}, {1e3 * c.timestep:g} ms" for c, e in beyond if (e[c.has_impact] > 0.05).any()]
-    if worst:
-        sentences.append(f"Some mean derivative is more than 5% beyond its error in {'; '.join(worst)}.")
-    moved = _pooled(courses, lambda c: c.shift / c.sawtooth(DISCRETE))
-    sentences.append(f"The mean outcome shifts by {np.median(moved):.2f} of MuJoCo's sawtooth in the median.")
-    if all(c.reference is not None for c in courses):
-        closer = _pooled(courses, _closer)
+    off = [c for c in outcome.courses if (c.excess.sel(arm=CONTINUOUS).where(c.has_impact) > 0.05).any()]
+    if off:
+        sentences.append(f"Some mean derivative is more than 5% beyond its error in {joined(map(_name, off))}.")
+    closer = _pooled(outcome, "closer")
+    if closer.size and np.isfinite(closer).all():
         sentences.append(
             f"Beside MuJoCo's motion at a step many times shorter its error is {np.median(closer):.2f} of MuJoCo's own in the "
             f"median, and larger at {np.mean(closer > 1):.0%} of the readings."
@@ -49,14 +44,15 @@ def tables(outcome: Outcome) -> list[Table]:
     for c in outcome.courses:
         if not c.has_impact.any():
             continue
-        pick = c.has_impact
-        row = [c.title, f"{1e3 * c.timestep:g}", f"{np.median(_ratio(c)[pick]):.0f} ({_ratio(c)[pick].min():.1f})"]
-        row += [f"{np.median(c.spread(arm)[pick]):.2g}" for arm in ARMS]
-        row += [f"{int((_off(c, arm)[pick] <= 2).sum())} of {int(pick.sum())}" for arm in ARMS]
-        row.append(f"{np.median((c.shift / c.sawtooth(DISCRETE))[pick]):.2f}")
-        closer = _closer(c)
-        error = "–" if closer is None else f"{np.median(closer[pick]):.2f}"
-        rows.append([*row, error])
+        picked = c.where(c.has_impact)
+        middle = picked.median(("time", "coordinate"))
+        within = (c.within & c.has_impact).sum(("time", "coordinate"))
+        row = [str(c.title.values), f"{1e3 * float(c.timestep):g}"]
+        row.append(f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})")
+        row += [f"{value:.2g}" for value in middle.spread.values]
+        row += [f"{value} of {int(c.has_impact.sum())}" for value in within.values]
+        row.append(f"{float(middle['shift']):.2f}")
+        rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
     columns += [f"spread, {arm}" for arm in ARMS] + [f"within 2 errors, {arm}" for arm in ARMS]
     columns += ["shift of the mean", "error"]
@@ -69,29 +65,11 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(columns, rows, caption)]
 
 
-def _pooled(courses: list[Course], values: Any) -> np.ndarray:
-    return np.concatenate([np.broadcast_to(values(c), c.has_impact.shape)[c.has_impact] for c in courses])
+def _pooled(outcome: Outcome, name: str, arm: str | None = None) -> np.ndarray:
+    """Give a number at every reading with an impact before it, of all motions."""
+    picked = [(c[name] if arm is None else c[name].sel(arm=arm), c.has_impact) for c in outcome.courses]
+    return np.concatenate([values.values[has_impact.values] for values, has_impact in picked])
 
 
-def _ratio(course: Course) -> np.ndarray:
-    return course.sawtooth(DISCRETE) / np.maximum(course.sawtooth(CONTINUOUS), np.finfo(float).tiny)
-
-
-def _off(course: Course, arm: str) -> np.ndarray:
-    """Give by how many of its standard errors the mean derivative is off the slope of its own outcome."""
-    found = course.arms[arm]
-    return np.abs(found.error[0]) / np.maximum(found.standard_error[0], found.resolution)
-
-
-def _excess(course: Course, arm: str) -> np.ndarray:
-    """Give the error beyond two standard errors, over the slope."""
-    found = course.arms[arm]
-    return np.maximum(np.abs(found.error[0]) - 2 * found.standard_error[0], 0) / np.maximum(
-        np.abs(found.slope), found.resolution
-    )
-
-
-def _closer(course: Course) -> np.ndarray | None:
-    """Give the error beside the converged motion over that of MuJoCo's step; None without a reference."""
-    own, theirs = course.error(CONTINUOUS), course.error(DISCRETE)
-    return None if own is None or theirs is None else own / theirs
+def _name(course: xr.Dataset) -> str:
+    return f"{course.title.values}, {1e3 * float(course.timestep):g} ms"

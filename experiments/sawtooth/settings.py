@@ -33,7 +33,5 @@ class Settings(RunSettings):
     """In s, besides the motion's own."""
     num_phases: Annotated[int, Field(ge=64)] = 192
     """Starts over the interval."""
-    num_times: Annotated[int, Field(ge=2)] = 5
-    """At which outcomes are read, evenly over the motion."""
     reference: Annotated[int, Field(ge=0, le=64)] = 0
     """By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out."""

@@ -1,31 +1,61 @@
 """From settings to numbers."""
 
 import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import xarray as xr
+from jaxtyping import Array
+from scipy import stats
 
 from experiments.failure import ExperimentError, suggest
-from experiments.textbook.outcome import Curves, Missing, Outcome
 from experiments.textbook.settings import EstimatorSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
-from mjxgrad.diagnostics import Comparison, Rollouts, compare, empirical_bias, first_order_samples
+from mjxgrad.diagnostics import Comparison, EmpiricalBias, Rollouts, compare, empirical_bias, first_order_samples
 from mjxgrad.estimators import rules
 from mjxgrad.tasks import textbook
 from mjxgrad.tasks.textbook import Textbook
 
-_RULES = {
-    "consistent": rules.Consistent,
-    "inverse_variance": rules.InverseVariance,
-    "concavity": rules.Concavity,
-}
+_RULES = {"consistent": rules.Consistent, "inverse_variance": rules.InverseVariance, "concavity": rules.Concavity}
 
-# Simulated sets of samples, of which is counted how many miss the slope.
-_SETS = 4000
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured.
+
+    The sweeps are by `setting` and `estimator`: what `Comparison` has, intervals as `_low` and `_high`, and `exact_rmse`, the
+    root-mean-square error in closed form, NaN where there is none.
+    """
+
+    settings: Settings
+    gradient: float  # the truth at the shown stiffness
+    by_samples: xr.Dataset
+    by_stiffness: xr.Dataset | None
+    curves: xr.Dataset  # of the shown problem, along its parameter: cost and gradient, with and without noise
+    # For the soft step, by stiffness: the exact chance β of a sample to hit the slope, and what first-order samples tell of it.
+    hits: list[tuple[float, EmpiricalBias]]
+
+    @property
+    def sweeps(self) -> list[xr.Dataset]:
+        """Those that there are."""
+        return [self.by_samples, *([] if self.by_stiffness is None else [self.by_stiffness])]
+
+    @property
+    def is_biased(self) -> xr.DataArray:
+        """Where the bias differs from zero, beyond chance over all numbers of rollouts and estimators (Bonferroni)."""
+        table = self.by_samples
+        quantile = stats.t.isf((1 - self.settings.confidence) / 2 / table.bias.size, table.num_finite - 1)
+        # Where nothing varies, a difference of rounding alone is none.
+        return abs(table.bias) > quantile * np.sqrt(table.variance / table.num_finite) + 1e-9 * abs(self.gradient)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per setting and estimator, for metrics.csv."""
+        return [row for sweep in self.sweeps for row in sweep.to_dataframe().reset_index().to_dict("records")]
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -35,49 +65,52 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         ExperimentError: if there is no estimator of some name.
     """
     named = {one.label: _estimator(one) for one in settings.estimators}
-    problem = _problem(settings, settings.shown_stiffness)
-    samples_key, stiffness_key, missing_key = jax.random.split(jax.random.key(settings.seed), 3)
+    shown = settings.shown_stiffness
+    problem = _problem(settings, shown)
+    samples_key, stiffness_key, hits_key = jax.random.split(jax.random.key(settings.seed), 3)
 
-    def run(problem: Textbook, key: Array, rollouts: int) -> Comparison:
-        return compare(
-            named,
-            problem.objective(settings.stddev),
-            jnp.array([settings.point]),
-            key,
-            budget=Rollouts(rollouts),
-            reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
-            num_repeats=settings.num_repeats,
-            confidence=settings.confidence,
-        )
+    def sweep(key: Array, cells: Sequence[tuple[float | None, int]], done: int) -> xr.Dataset:
+        tables = []
+        for i, (stiffness, rollouts) in enumerate(cells):
+            problem = _problem(settings, stiffness)
+            table = compare(
+                named,
+                problem.objective(settings.stddev),
+                jnp.array([settings.point]),
+                jax.random.fold_in(key, i),
+                budget=Rollouts(rollouts),
+                reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
+                num_repeats=settings.num_repeats,
+                confidence=settings.confidence,
+            )
+            tables.append(table)
+            advance_to(done + len(tables))
+        return _dataset(settings, cells, tables)
 
-    cells = len(settings.num_samples) + len(settings.stiffness)
-    by_samples, by_stiffness = [], []
-    with workspace.stage("estimates", "settings", cells) as advance_to:
-        for i, rollouts in enumerate(settings.num_samples):
-            by_samples.append(run(problem, jax.random.fold_in(samples_key, i), rollouts))
-            advance_to(len(by_samples))
-        for i, stiffness in enumerate(settings.stiffness):
-            key = jax.random.fold_in(stiffness_key, i)
-            by_stiffness.append(run(_problem(settings, stiffness), key, settings.samples_at_stiffness))
-            advance_to(len(by_samples) + len(by_stiffness))
-    missing = None
-    if settings.problem == "soft_heaviside":
-        with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
-            missing = _missing(settings, missing_key)
-    return Outcome(
-        settings=settings,
-        gradient=float(problem.gradient(settings.point, settings.stddev)),
-        by_samples=by_samples,
-        by_stiffness=by_stiffness,
-        exact_by_samples=_exact(settings, [problem] * len(settings.num_samples), settings.num_samples),
-        exact_by_stiffness=_exact(
-            settings,
-            [_problem(settings, stiffness) for stiffness in settings.stiffness],
-            [settings.samples_at_stiffness] * len(settings.stiffness),
-        ),
-        curves=_curves(problem, settings),
-        missing=missing,
-    )
+    by_samples = [(shown, rollouts) for rollouts in settings.num_samples]
+    by_stiffness = [(stiffness, settings.samples_at_stiffness) for stiffness in settings.stiffness]
+    with workspace.stage("estimates", "settings", len(by_samples) + len(by_stiffness)) as advance_to:
+        over_samples = sweep(samples_key, by_samples, 0)
+        over_stiffness = sweep(stiffness_key, by_stiffness, len(by_samples)) if by_stiffness else None
+    with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
+        hits = _hits(settings, hits_key) if settings.problem == "soft_heaviside" else []
+    gradient = float(problem.gradient(settings.point, settings.stddev))
+    return Outcome(settings, gradient, over_samples, over_stiffness, _curves(problem, settings), hits)
+
+
+def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tables: Sequence[Comparison]) -> xr.Dataset:
+    dims, stiffness = ("setting", "estimator"), [np.nan if one is None else one for one, _ in cells]
+    labels = [one.label for one in settings.estimators]
+    data = xr.Dataset(coords={"estimator": labels, "stiffness": ("setting", stiffness)})
+    one_each = ("num_samples", "num_rollouts", "num_gradient_rollouts", "num_finite", "claimed_variance")
+    for name in (*one_each, "mean", "bias", "rmse", "variance"):
+        data[name] = dims, np.stack([getattr(table, name).reshape(len(labels)) for table in tables])
+    for name in ("bias", "rmse", "variance"):
+        ends = np.stack([getattr(table, f"{name}_interval").reshape(2, len(labels)) for table in tables], axis=1)
+        data[f"{name}_low"], data[f"{name}_high"] = (dims, ends[0]), (dims, ends[1])
+    data["variance_method"] = dims, [table.variance_methods for table in tables]
+    exact = [[_exact_error(one, settings, *cell) for one in settings.estimators] for cell in cells]
+    return data.assign(exact_rmse=(dims, exact))
 
 
 def _estimator(settings: EstimatorSettings) -> functools.partial:
@@ -100,29 +133,14 @@ def _problem(settings: Settings, stiffness: float | None) -> Textbook:
     return textbook.quadratic_sine(settings.amplitude, stiffness)
 
 
-def _exact(
-    settings: Settings, problems: list[Textbook], rollouts: list[int] | tuple[int, ...]
-) -> dict[str, Float[np.ndarray, " settings"]]:
-    """Give the root-mean-square error of each estimator that has a closed form, at each setting."""
-    found = {}
-    for one in settings.estimators:
-        errors = [
-            _exact_error(one, problem, settings, count) for problem, count in zip(problems, rollouts, strict=True)
-        ]
-        if errors and not np.isnan(errors).any():
-            found[one.label] = np.array(errors)
-    return found
-
-
-def _exact_error(one: EstimatorSettings, problem: Textbook, settings: Settings, rollouts: int) -> float:
-    point, stddev = settings.point, settings.stddev
-    if one.antithetic:
+def _exact_error(one: EstimatorSettings, settings: Settings, stiffness: float | None, rollouts: int) -> float:
+    """Give the root-mean-square error of an estimator in closed form; NaN where there is none."""
+    point, stddev, problem = settings.point, settings.stddev, _problem(settings, stiffness)
+    if one.antithetic or one.name not in ("first_order", "zeroth_order"):
         return np.nan
     if one.name == "first_order":
         bias = problem.first_order_mean(point, stddev) - problem.gradient(point, stddev)
         return float(jnp.sqrt(bias**2 + problem.first_order_variance(point, stddev) / rollouts))
-    if one.name != "zeroth_order":
-        return np.nan
     if one.baseline in (None, "leave_one_out"):
         return float(jnp.sqrt(problem.leave_one_out_variance(point, stddev, rollouts)))
     # The baseline without noise is one rollout that is no sample.
@@ -131,42 +149,27 @@ def _exact_error(one: EstimatorSettings, problem: Textbook, settings: Settings, 
     return float(jnp.sqrt(problem.zeroth_order_variance(point, stddev, baseline) / (rollouts - is_paid)))
 
 
-def _curves(problem: Textbook, settings: Settings) -> Curves:
-    reach = max(4 * settings.stddev, 1.5 * abs(settings.point))
+def _curves(problem: Textbook, settings: Settings) -> xr.Dataset:
+    reach, stddev = max(4 * settings.stddev, 1.5 * abs(settings.point)), settings.stddev
     grid = jnp.linspace(-reach, reach, 801)
-
-    @eqx.filter_jit
-    def along(problem: Textbook, grid: Array) -> tuple[Array, ...]:
-        stddev = settings.stddev
-        return (
-            jax.vmap(lambda x: problem(x[None]))(grid),
-            jax.vmap(lambda x: problem.smoothed(x, stddev))(grid),
-            jax.vmap(lambda x: problem.gradient(x, stddev))(grid),
-            jax.vmap(lambda x: problem.first_order_mean(x, stddev))(grid),
-        )
-
-    return Curves(np.asarray(grid), *(np.asarray(values) for values in along(problem, grid)))
+    along = {
+        "cost": lambda x: problem(x[None]),
+        "smoothed": lambda x: problem.smoothed(x, stddev),
+        "gradient": lambda x: problem.gradient(x, stddev),
+        "first_order_mean": lambda x: problem.first_order_mean(x, stddev),
+    }
+    curves = {name: ("parameter", np.asarray(jax.jit(jax.vmap(function))(grid))) for name, function in along.items()}
+    return xr.Dataset(curves, coords={"parameter": np.asarray(grid)})
 
 
-def _missing(settings: Settings, key: Array) -> Missing:
-    """Estimate the chance to miss the slope from first-order samples, and count how often it is missed."""
-    counts = np.unique(np.geomspace(2, 1000, 25).astype(int))
-    exact, found, frequency = [], [], []
+def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:
+    """Estimate the chance to hit the slope from first-order samples."""
+    found, point, stddev = [], settings.point, settings.stddev
     for i, stiffness in enumerate(settings.stiffness):
-        problem = textbook.soft_heaviside(1 / stiffness)
-        samples_key, sets_key = jax.random.split(jax.random.fold_in(key, i))
-        samples = first_order_samples(
-            problem.objective(settings.stddev),
-            jnp.array([settings.point]),
-            samples_key,
-            num_samples=settings.missed_samples,
-        )
-        truth = float(problem.gradient(settings.point, settings.stddev))
-        found.append(empirical_bias(samples, reference=truth, confidence=settings.confidence))
-        exact.append(float(problem.slope_probability(settings.point, settings.stddev)))
-        noise = settings.stddev * np.asarray(jax.random.normal(sets_key, (_SETS, int(counts[-1])), jnp.float32))
-        is_hit = np.abs(settings.point + noise) < 0.5 / stiffness
-        # A set of N misses if its first hit comes later than N.
-        first_hit = np.where(is_hit.any(axis=1), is_hit.argmax(axis=1), np.iinfo(int).max)
-        frequency.append([(first_hit >= count).mean() for count in counts])
-    return Missing(counts, np.array(exact), np.array(frequency), found)
+        problem, params = textbook.soft_heaviside(1 / stiffness), jnp.array([point])
+        objective, count = problem.objective(stddev), settings.missed_samples
+        samples = first_order_samples(objective, params, jax.random.fold_in(key, i), num_samples=count)
+        truth = float(problem.gradient(point, stddev))
+        told = empirical_bias(samples, reference=truth, confidence=settings.confidence)
+        found.append((float(problem.slope_probability(point, stddev)), told))
+    return found

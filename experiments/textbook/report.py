@@ -1,10 +1,11 @@
 """The answer of an experiment on a textbook problem in words, computed from its numbers."""
 
 import numpy as np
+import xarray as xr
 
 from experiments.report import Table
 from experiments.textbook.figures import stiffness_name
-from experiments.textbook.outcome import Outcome
+from experiments.textbook.measure import Outcome
 from experiments.theme import power
 from experiments.words import joined, quantity
 
@@ -15,27 +16,34 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    return [sentence for sentence in (_agreement(outcome), _unseen(outcome), _left_out(outcome)) if sentence]
+    """Say what no table shows: agreement with closed forms, slopes that were never hit, and what was left out."""
+    hits = total = lost = 0
+    for table in outcome.sweeps:
+        exact = table.exact_rmse
+        inside = (table.rmse_low <= exact * (1 + 1e-9)) & (exact <= table.rmse_high * (1 + 1e-9))
+        hits, total = hits + int(inside.sum()), total + int(exact.notnull().sum())
+        lost += int((outcome.settings.num_repeats - table.num_finite).max("estimator").sum())
+    confidence = f"{outcome.settings.confidence:.0%}"
+    agreement = f"{hits} of {total} intervals of the error contain the closed form, at {confidence} each."
+    left_out = f"{lost} estimates were not finite and were left out." if lost else ""
+    return [sentence for sentence in (agreement, _unseen(outcome), left_out) if sentence]
 
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all estimators at the largest number of rollouts."""
-    last = outcome.by_samples[-1]
-    rows, emphasised = [], set()
-    for row, label in enumerate(outcome.labels):
-        if outcome.is_biased[-1, row]:
-            emphasised.add((row, 3))
-        exact = outcome.exact_by_samples.get(label)
+    last, rows = outcome.by_samples.isel(setting=-1), []
+    for label in last.estimator.values:
+        one = {name: value.item() for name, value in last.sel(estimator=label).data_vars.items()}
+        half = {name: (one[f"{name}_high"] - one[f"{name}_low"]) / 2 for name in ("bias", "rmse")}
         rows.append(
             [
                 label,
-                str(int(last.num_samples[row])),
-                quantity(last.mean[row, 0], _half(last.bias_interval[:, row, 0])),
-                quantity(last.bias[row, 0], _half(last.bias_interval[:, row, 0])),
-                quantity(last.rmse[row], _half(last.rmse_interval[:, row])),
-                "" if exact is None else quantity(exact[-1]),
-                quantity(float(np.sqrt(last.claimed_variance[row]))),
+                str(one["num_samples"]),
+                quantity(one["mean"], half["bias"]),
+                quantity(one["bias"], half["bias"]),
+                quantity(one["rmse"], half["rmse"]),
+                "" if np.isnan(one["exact_rmse"]) else quantity(one["exact_rmse"]),
+                quantity(one["claimed_variance"] ** 0.5),
             ]
         )
     columns = ("estimator", "samples", "mean", "bias", "error", "error, closed form", "error it claims")
@@ -45,49 +53,49 @@ def tables(outcome: Outcome) -> list[Table]:
         "over all numbers of rollouts. The last column is the root of the mean squared standard error of the estimates: "
         "an estimator that claims less than its error hides something."
     )
-    return [Table(columns, rows, caption, frozenset(emphasised))]
+    emphasised = frozenset((int(row), 3) for row in np.flatnonzero(outcome.is_biased[-1]))
+    return [Table(columns, rows, caption, emphasised)]
 
 
 def _closest(outcome: Outcome) -> str:
-    first, last = outcome.by_samples[0], outcome.by_samples[-1]
-    few, many = (_best(outcome, tables.rmse, tables.rmse_interval) for tables in (first, last))
+    few, many = (_best(outcome.by_samples.isel(setting=i)) for i in (0, -1))
     low, high = outcome.settings.num_samples[0], outcome.settings.num_samples[-1]
-    where = f" at {stiffness_name(outcome)} = {outcome.settings.shown_stiffness:g}" if outcome.by_stiffness else ""
+    shown = outcome.settings.shown_stiffness
+    where = "" if shown is None else f" at {stiffness_name(outcome)} = {shown:g}"
     if few == many:
         return f"From {low} to {high} rollouts{where} the smallest error is that of {few}."
     return f"With {low} rollouts{where} the smallest error is that of {few}, with {high} that of {many}."
 
 
-def _best(outcome: Outcome, errors: np.ndarray, intervals: np.ndarray) -> str:
+def _best(table: xr.Dataset) -> str:
     """Name the estimator of least error, with all whose intervals overlap its own."""
-    best = int(np.argmin(errors))
-    ties = [outcome.labels[row] for row in np.argsort(errors) if intervals[0, row] <= intervals[1, best]]
+    table = table.sortby("rmse")
+    ties = table.estimator.values[table.rmse_low.values <= table.rmse_high.values[0]]
     return joined(ties, "or") + (" (a tie)" if len(ties) > 1 else "")
 
 
 def _bias(outcome: Outcome) -> str:
-    if not outcome.is_biased.any():
+    biased = outcome.is_biased
+    if not biased.any():
         return "No estimator shows a bias."
-    share = np.array([table.bias[:, 0] for table in outcome.by_samples]) / abs(outcome.gradient)
-    parts = []
-    for row in np.flatnonzero(outcome.is_biased.any(axis=0)):
-        worst = int(np.argmax(np.where(outcome.is_biased[:, row], np.abs(share[:, row]), 0)))
-        size = f"{share[worst, row]:+.2g}".replace("-", "−")
-        parts.append(
-            f"{outcome.labels[row]} (by {size} of the gradient with {outcome.settings.num_samples[worst]} rollouts)"
-        )
-    others = "" if outcome.is_biased.any(axis=0).all() else "; the others show no bias"
+    share, parts = (outcome.by_samples.bias / abs(outcome.gradient)).where(biased), []
+    for label in biased.estimator.values[biased.any("setting")]:
+        worst = int(abs(share.sel(estimator=label)).argmax())
+        size = f"{share.sel(estimator=label).values[worst]:+.2g}".replace("-", "−")
+        parts.append(f"{label} (by {size} of the gradient with {outcome.settings.num_samples[worst]} rollouts)")
+    others = "" if len(parts) == biased.estimator.size else "; the others show no bias"
     return f"Biased beyond chance: {', '.join(parts)}{others}."
 
 
 def _crossing(outcome: Outcome) -> str | None:
     """Say from which stiffness on zeroth order is closer than first order."""
-    if not outcome.by_stiffness or not {"first order", "zeroth order"} <= set(outcome.labels):
+    table = outcome.by_stiffness
+    if table is None or not {"first order", "zeroth order"} <= set(table.estimator.values):
         return None
-    first, zeroth = outcome.labels.index("first order"), outcome.labels.index("zeroth order")
-    x = np.asarray(outcome.settings.stiffness)
-    ahead = np.array([t.rmse_interval[1, zeroth] < t.rmse_interval[0, first] for t in outcome.by_stiffness])
-    behind = np.array([t.rmse_interval[0, zeroth] > t.rmse_interval[1, first] for t in outcome.by_stiffness])
+    first, zeroth = table.sel(estimator="first order"), table.sel(estimator="zeroth order")
+    x = table.stiffness.values
+    ahead = (zeroth.rmse_high < first.rmse_low).values
+    behind = (zeroth.rmse_low > first.rmse_high).values
     name, count = stiffness_name(outcome), outcome.settings.samples_at_stiffness
     if not ahead.any() or not behind.any():
         winner = "zeroth" if ahead.any() else "first" if behind.any() else None
@@ -100,38 +108,18 @@ def _crossing(outcome: Outcome) -> str | None:
     return f"With {count} rollouts zeroth order is closer at {ahead.sum()} of {len(x)} values of {name}."
 
 
-def _agreement(outcome: Outcome) -> str:
-    hits, total = outcome.agreement
-    return (
-        f"{hits} of {total} intervals of the error contain the closed form, at {outcome.settings.confidence:.0%} each."
-    )
-
-
-def _unseen(outcome: Outcome) -> str | None:
-    if outcome.missing is None:
-        return None
-    x, found = np.asarray(outcome.settings.stiffness), outcome.missing.found
-    covered = [
-        one.probability_interval[0] <= min(p, 1 - p) <= one.probability_interval[1]  # of the rarer side
-        for one, p in zip(found, outcome.missing.probability, strict=True)
-    ]
-    sentence = f"The interval of β contains the closed form at {sum(covered)} of {len(x)} stiffnesses."
-    unseen = [i for i, one in enumerate(found) if one.num_outlying == 0]
-    if not unseen:
-        return sentence
-    i = unseen[0]
-    p = outcome.missing.probability[i]
-    return (
-        f"{sentence} At {stiffness_name(outcome)} = {power(x[i])} none of {found[i].num_samples} samples hit the slope "
-        f"and their variance is {found[i].variance:.3g}; the discrepancy to the gradient implies at least "
-        f"{quantity(found[i].implied_variance_bound)}, and the truth is {quantity((2 * x[i]) ** 2 * p * (1 - p))}."
-    )
-
-
-def _left_out(outcome: Outcome) -> str | None:
-    count = sum(int(t.num_repeats - t.num_finite.min()) for t in [*outcome.by_samples, *outcome.by_stiffness])
-    return f"{count} estimates were not finite and were left out." if count else None
-
-
-def _half(ends: np.ndarray) -> float:
-    return float(ends[1] - ends[0]) / 2
+def _unseen(outcome: Outcome) -> str:
+    """Say whether samples tell how rare hits of the slope are, and what the first stiffness without any implies."""
+    if not outcome.hits:
+        return ""
+    rarer = [(min(p, 1 - p), found.probability_interval) for p, found in outcome.hits]
+    covered = sum(low <= p <= high for p, (low, high) in rarer)
+    sentence = f"The interval of β contains the closed form at {covered} of {len(rarer)} stiffnesses."
+    for x, (p, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True):
+        if found.num_outlying == 0:
+            return (
+                f"{sentence} At {stiffness_name(outcome)} = {power(x)} none of {found.num_samples} samples hit the slope and "
+                f"their variance is {found.variance:.3g}; the discrepancy to the gradient implies at least "
+                f"{quantity(found.implied_variance_bound)}, and the truth is {quantity((2 * x) ** 2 * p * (1 - p))}."
+            )
+    return sentence
