@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import mjxgrad as mg
-from experiments.artificial_discontinuity.outcome import Mating
+from experiments.artificial_discontinuity.outcome import Mating, place
 from experiments.artificial_discontinuity.pushes import slopes_at
 from experiments.artificial_discontinuity.settings import Settings
 from experiments.parallel import in_threads
@@ -24,7 +24,7 @@ _NUM_STEPS = 100  # of 2 ms
 _SMALLEST = 0.02  # of the depth; smaller jumps are teeth of the time step
 
 _SCENE = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
-<default><geom condim="1" mass="0"/><default class="hole"><geom contype="{hole}" conaffinity="0"/></default>
+<default><geom condim="1" mass="0"/><default class="hole"><geom contype="1" conaffinity="0"/></default>
 <default class="rim"><geom contype="2" conaffinity="0" size="{point}"/></default>
 <default class="peg"><geom contype="0" conaffinity="{peg}"/></default>
 <default class="point"><geom contype="0" conaffinity="1" size="{point}"/></default></default>
@@ -36,15 +36,7 @@ _SCENE = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
 
 
 def measure(settings: Settings, workspace: Workspace) -> list[Mating]:
-    """Hold the peg in the hole, and drop it beside it.
-
-    Args:
-        settings: of the run.
-        workspace: for the clock, and for what the time step does not follow.
-
-    Returns:
-        One result per geometry.
-    """
+    """Hold the peg in the hole, and drop it beside it."""
     scenes = {label: mg.load_scene(_mjcf(label)) for label in settings.sizes.geometries}
     for label, scene in scenes.items():
         workspace.check(scene, name=f"mating, {label}")
@@ -62,7 +54,6 @@ def _mjcf(label: str) -> str:
     rim = [(s * (_HOLE + _POINT), -_POINT) for s in (-1, 1)]
     has_points, has_rim = label != "boxes", label == "points on both"
     return _SCENE.format(
-        hole=1,
         peg=2 if has_points else 1,
         point=_POINT,
         left=-_HOLE - 0.05,
@@ -75,12 +66,8 @@ def _mjcf(label: str) -> str:
 
 
 def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
-    def forces(offsets: np.ndarray) -> np.ndarray:
-        return np.asarray(_forces(scene, jnp.asarray(offsets)))
-
-    def simulate(offsets: np.ndarray, gradient: str) -> tuple[np.ndarray, np.ndarray]:
-        values = _depths(scene, jnp.asarray(offsets), gradient)
-        return np.asarray(values[0]), np.asarray(values[1])
+    def simulate(offsets: np.ndarray, gradient: str) -> tuple[Array, Array]:
+        return _depths(scene, jnp.asarray(offsets), gradient)
 
     depth = jumps_along(
         lambda offsets: simulate(offsets, "discrete")[0],
@@ -89,12 +76,11 @@ def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Genera
         num_refinements=2,
         smallest=_SMALLEST,
     )
-    edge = float(depth.places[depth.largest]) if len(depth.places) else float(np.mean(OFFSETS))
+    edge = place(depth, float(np.mean(OFFSETS)))
     stddev = settings.stddev * (OFFSETS[1] - OFFSETS[0])
     return Mating(
         label=label,
-        num_rows=scene.data._impl.efc_J.shape[0],
-        force=jumps_along(forces, OFFSETS, num_points=settings.sizes.num_points),
+        force=jumps_along(lambda at: _forces(scene, jnp.asarray(at)), OFFSETS, num_points=settings.sizes.num_points),
         depth=depth,
         slopes=slopes_at(settings, label, "offset", simulate, edge, stddev, rng),
     )

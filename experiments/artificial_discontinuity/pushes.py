@@ -1,6 +1,7 @@
 """What gradients say across jumps: short pushes from starts under noise."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,36 +23,23 @@ _NUM_STEPS = 15  # of 2 ms: the body is still in contact, or has just left it
 _SMALLEST = 1e-3
 
 # From starts and the name of a gradient to outcomes and derivatives.
-Simulate = Callable[[np.ndarray, str], tuple[np.ndarray, np.ndarray]]
+Simulate = Callable[[np.ndarray, str], tuple[Any, Any]]
 
 
 def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index: int) -> list[Slopes]:
-    """Let a body go where the box's force jumps, and estimate how high it is pushed, by where it was.
-
-    Args:
-        settings: of the run.
-        body: which.
-        places: mean start on each path.
-        index: of the body, for its random numbers.
-
-    Returns:
-        One result per path.
-    """
+    """Let a body go on each path from a mean start, and estimate how high it is pushed, by where it was."""
     found = []
     for number, (name, place) in enumerate(places.items()):
         path = PATHS[name]
 
-        def simulate(starts: np.ndarray, gradient: str, path=path) -> tuple[np.ndarray, np.ndarray]:
+        def simulate(starts: np.ndarray, gradient: str, path=path) -> tuple[Array, Array]:
             # Poses come from SciPy, so that their derivative along the path is a difference; they are smooth.
             little = 1e-6 * path.length
             at, ahead, behind = (path.poses(body, settings.depth, starts + s * little) for s in (0, 1, -1))
-            tangents = (ahead - behind) / (2 * little)
-            values = _pushed(body.scene, jnp.asarray(at), jnp.asarray(tangents), gradient)
-            return np.asarray(values[0]), np.asarray(values[1])
+            return _pushed(body.scene, jnp.asarray(at), jnp.asarray((ahead - behind) / (2 * little)), gradient)
 
-        stddev = settings.stddev * path.length
         rng = np.random.default_rng([settings.seed, index, number])
-        found.append(slopes_at(settings, body.label, name, simulate, place, stddev, rng))
+        found.append(slopes_at(settings, body.label, name, simulate, place, settings.stddev * path.length, rng))
     return found
 
 
@@ -74,9 +62,6 @@ def slopes_at(
         place: mean start.
         stddev: of the noise, in the start's unit.
         rng: of the samples.
-
-    Returns:
-        Estimates, reference, and what the outcome's jumps under the noise add up to.
     """
     sizes = settings.sizes
     noise = rng.normal(size=sizes.num_samples)
@@ -84,8 +69,8 @@ def slopes_at(
     shape = (sizes.num_repeats, sizes.num_strata)
     strata = norm.ppf((np.arange(sizes.num_strata) + rng.uniform(size=shape)) / sizes.num_strata)
     every = np.concatenate([noise, strata.ravel()])
-    gradients = ("discrete", "event")
-    (values, discrete), (_, event) = in_threads(lambda name: simulate(place + stddev * every, name), gradients)
+    found = in_threads(lambda name: simulate(place + stddev * every, name), ("discrete", "event"))
+    (values, discrete), (_, event) = ([np.asarray(each) for each in both] for both in found)
     own, repeats = values[: sizes.num_samples], values[sizes.num_samples :].reshape(shape)
     # Less the mean of the others, which keeps it unbiased.
     baseline = (own.sum() - own) / (len(own) - 1)
@@ -93,10 +78,9 @@ def slopes_at(
     # Each repeat less the mean of the other repeats, for the same reason.
     others = (repeats.mean(axis=1).sum() - repeats.mean(axis=1)) / (len(repeats) - 1)
     references = ((repeats - others[:, None]) * strata / stddev).mean(axis=1)
-    reach = 3 * stddev
     jumps = jumps_along(
         lambda starts: simulate(starts, "discrete")[0],
-        (place - reach, place + reach),
+        (place - 3 * stddev, place + 3 * stddev),
         num_points=sizes.num_rollouts,
         num_refinements=2,
         smallest=_SMALLEST,

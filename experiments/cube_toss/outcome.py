@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from experiments.cube_toss.settings import Settings
+from jaxtyping import Float
 
 METHODS = {
     "discrete": "discrete",
@@ -15,6 +14,7 @@ METHODS = {
     "adaptive": "adaptive, differentiated",
     "quotient": "adaptive, difference quotient",
 }
+CONTACTS = {"published": "contact whose force begins continuously", "default": "MuJoCo's default contact"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,6 @@ class Point:
         method: a key of `METHODS`.
         setting: time step in s, or tolerance.
         derivative: of each throw, in m per m/s.
-        error: derivative less reference.
         seconds: processor time of one derivative, compiled.
         first_seconds: wall time of the first call, which compiles unless an earlier setting did.
         num_steps: of one derivative.
@@ -34,8 +33,7 @@ class Point:
 
     method: str
     setting: float
-    derivative: np.ndarray
-    error: np.ndarray
+    derivative: Float[np.ndarray, " throws"]
     seconds: float
     first_seconds: float
     num_steps: float
@@ -44,18 +42,16 @@ class Point:
 
 @dataclass(frozen=True)
 class Course:
-    """All methods with one contact.
+    """All methods with one contact; errors are shares of the derivative.
 
     Attributes:
-        contact: its name.
-        speeds: of the throws, in m/s.
+        contact: a key of `CONTACTS`.
         reference: derivative of each throw.
         points: one per method and setting.
     """
 
     contact: str
-    speeds: np.ndarray
-    reference: np.ndarray
+    reference: Float[np.ndarray, " throws"]
     points: tuple[Point, ...]
 
     @property
@@ -64,40 +60,23 @@ class Course:
         return float(np.abs(self.reference).mean())
 
     def of(self, method: str) -> list[Point]:
-        """Give the points of a method."""
-        return [point for point in self.points if point.method == method]
+        """Give the points of a method, from accurate to coarse."""
+        return sorted((point for point in self.points if point.method == method), key=lambda point: point.setting)
+
+    def errors(self, point: Point) -> Float[np.ndarray, " throws"]:
+        """Give the error of every throw."""
+        return (point.derivative - self.reference) / self.scale
 
     def error(self, point: Point) -> float:
-        """Give the root-mean-square error over the throws, as a share of the derivative; infinite if it failed."""
-        share = float(np.sqrt(np.mean(point.error**2))) / self.scale
+        """Give the root-mean-square error over the throws; infinite if it failed."""
+        share = float(np.sqrt(np.mean(self.errors(point) ** 2)))
         return share if np.isfinite(share) and not point.has_failed else np.inf
-
-    def bias(self, point: Point) -> float:
-        """Give the mean error over the throws, as a share of the derivative."""
-        return float(np.mean(point.error)) / self.scale
-
-    def fastest(self, target: float) -> Point | None:
-        """Give the fastest point from which on its method stays below an error; None if there is none."""
-        found = []
-        for method in METHODS:
-            # From accurate to coarse: one lucky coarse point between bad ones does not count.
-            for point in sorted(self.of(method), key=lambda one: one.setting):
-                if self.error(point) > target:
-                    break
-                found.append(point)
-        return min(found, key=lambda one: one.seconds, default=None)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """All numbers.
+    """All numbers, one course per contact."""
 
-    Attributes:
-        settings: of the run.
-        courses: one per contact.
-    """
-
-    settings: Settings
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -110,7 +89,7 @@ class Outcome:
                 "derivative": float(point.derivative.mean()),
                 "reference": float(course.reference.mean()),
                 "relative_error": course.error(point),
-                "relative_bias": course.bias(point),
+                "relative_bias": float(course.errors(point).mean()),
                 "processor_seconds": point.seconds,
                 "first_call_seconds": point.first_seconds,
                 "num_steps": point.num_steps,

@@ -10,53 +10,44 @@ from experiments.long_horizon.settings import Settings
 from mjxgrad.diagnostics import Crossover
 
 ZEROTH = "zeroth order"
-# Standard errors of a mean. Two would do for one in twenty of normal samples; derivatives along chaotic motions have tails so
-# heavy that a few dozen repeats show too little of their spread.
-BEYOND_CHANCE = 3.0
+CUT, VALUED = "cut", "with a value function"
 
 
 @dataclass(frozen=True)
 class Errors:
-    """One estimator's over horizons.
+    """Errors of one way to estimate gradients, of some costs or by some windows, over the largest gradient's size.
 
     Attributes:
-        label: such as "first order, event".
-        error: root mean squared error of an estimate, over the size of the reference's largest; that of the cost at the
-            horizon alone.
+        error: root mean squared error of an estimate.
         interval: of it.
-        bias: distance of the mean of all estimates from the reference, likewise.
+        bias: distance of the mean of all estimates from the reference.
         bias_noise: distance up to which it can be chance.
-        variance: of one sample, summed over parameters.
+        variance: of one sample, summed over parameters, in the gradient's own units.
+        squares: of the errors, by repeat, less the reference's own.
     """
 
-    label: str
-    error: Float[np.ndarray, " times"]
-    interval: Float[np.ndarray, "2 times"]
-    bias: Float[np.ndarray, " times"]
-    bias_noise: Float[np.ndarray, " times"]
-    variance: Float[np.ndarray, " times"]
+    error: Float[np.ndarray, " kinds"]
+    interval: Float[np.ndarray, "2 kinds"]
+    bias: Float[np.ndarray, " kinds"]
+    bias_noise: Float[np.ndarray, " kinds"]
+    variance: Float[np.ndarray, " kinds"]
+    squares: Float[np.ndarray, "repeats kinds"]
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Estimates of the gradient of the mean cost over the whole horizon, cut into windows.
+    """Estimates of the gradient of the mean cost over the whole horizon, cut into windows; errors over its size.
 
     Attributes:
-        lengths: of the windows, in segments, the last one the whole horizon.
-        error: root mean squared error, plain and with a value function, over the size of the reference.
-        interval: of it.
-        bias: distance of the mean from the reference, likewise.
-        bias_noise: distance up to which it can be chance.
-        zeroth: error of zeroth order, with its interval.
+        lengths: of the windows, in s, the last one the whole horizon.
+        errors: by derivative and by `CUT` or `VALUED`.
+        zeroth: of zeroth order.
         fit: share of the variance of the costs to come that the value function explains, in the median over times.
     """
 
-    lengths: tuple[int, ...]
-    error: Float[np.ndarray, "2 windows"]
-    interval: Float[np.ndarray, "2 ends windows"]
-    bias: Float[np.ndarray, "2 windows"]
-    bias_noise: Float[np.ndarray, "2 windows"]
-    zeroth: Float[np.ndarray, " 3"]
+    lengths: Float[np.ndarray, " windows"]
+    errors: dict[tuple[str, str], Errors]
+    zeroth: Errors
     fit: float
 
 
@@ -68,30 +59,22 @@ class Found:
         title: of the problem.
         times: at which the horizon may end (s).
         costs: mean cost at these (m).
-        reference: gradient of the mean cost there.
-        reference_error: its standard error.
-        estimators: first orders, then zeroth.
+        errors: by estimator, zeroth order last, of the gradient of the mean cost at each time.
         crossovers: of each first order with zeroth.
         log_largest: of the product of Jacobians, by rollout.
         exponents: finite-time Lyapunov exponents, median over rollouts (1/s).
-        growth_rate: of the logarithm of the largest singular value over the second half of the time, with its error.
-        variance_rate: of the logarithm of each first order's variance over the same, halved.
-        windows: by first order.
+        windows: what cutting the derivative makes of it.
         finite: share of rollouts with finite derivatives.
     """
 
     title: str
     times: Float[np.ndarray, " times"]
     costs: Float[np.ndarray, " times"]
-    reference: Float[np.ndarray, "times dim"]
-    reference_error: Float[np.ndarray, "times dim"]
-    estimators: list[Errors]
+    errors: dict[str, Errors]
     crossovers: dict[str, Crossover]
     log_largest: Float[np.ndarray, "rollouts times"]
     exponents: Float[np.ndarray, "times n"]
-    growth_rate: tuple[float, float]
-    variance_rate: dict[str, float]
-    windows: dict[str, Windows]
+    windows: Windows
     finite: float
 
 
@@ -116,13 +99,7 @@ class Adaptive:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
-
-    Attributes:
-        settings: of the run.
-        found: by problem.
-        adaptive: of the pendulum; None without it.
-    """
+    """All that was measured: by problem, and the pendulum by error control if it is among them."""
 
     settings: Settings
     found: dict[str, Found]
@@ -133,7 +110,7 @@ class Outcome:
         return [
             {
                 "problem": name,
-                "estimator": each.label,
+                "estimator": label,
                 "horizon": float(time),
                 "mean_cost": float(one.costs[i]),
                 "relative_error": float(each.error[i]),
@@ -144,6 +121,6 @@ class Outcome:
                 "median_log_largest_singular_value": float(np.median(one.log_largest[:, i])),
             }
             for name, one in self.found.items()
-            for each in one.estimators
+            for label, each in one.errors.items()
             for i, time in enumerate(one.times)
         ]

@@ -4,8 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.parallel import num_cores
-from experiments.settings import Positive, RunSettings, SettingsTable
+from experiments.settings import RunSettings, SettingsTable
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
@@ -56,20 +55,11 @@ class Settings(RunSettings):
         1e-3,
     )
     """Relative errors for which a setting is recommended."""
-    threads: Annotated[int, Field(ge=1, le=256)] | None = None
-    """Of C MuJoCo's rollout; one for every core, if none is given."""
-    tight_tolerance: Positive = 1e-8
-    """Of the solver where tolerance is not what is varied; in single precision at least 1e-6, which is what it resolves."""
 
     @property
     def scene_names(self) -> tuple[SceneName, ...]:
         """Give the scenes to run."""
         return self.sizes.scenes if self.scenes is None else self.scenes
-
-    @property
-    def num_threads(self) -> int:
-        """Give the number of threads of C MuJoCo's rollout."""
-        return self.threads or num_cores()
 
     def has_asides(self, name: str) -> bool:
         """Say whether a scene is looked at in every way that the size has."""
