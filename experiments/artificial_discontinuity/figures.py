@@ -4,9 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import linregress
 
-from experiments.artificial_discontinuity.mating import TILT
 from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED, WAYS, C, Outcome, Static
-from experiments.artificial_discontinuity.paths import PATHS
+from experiments.artificial_discontinuity.pushes import TILT
+from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
 from experiments.words import quantity
 from mjxgrad.diagnostics import Jumps

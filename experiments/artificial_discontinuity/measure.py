@@ -11,12 +11,10 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
 import mjxgrad as mg
-from experiments.artificial_discontinuity import mating
-from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED, C, Judged, Outcome, Static, place
-from experiments.artificial_discontinuity.paths import PATHS
-from experiments.artificial_discontinuity.pushes import push_slopes
+from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED, C, Judged, Outcome, Static, at_largest
+from experiments.artificial_discontinuity.pushes import matings, push_slopes
 from experiments.artificial_discontinuity.settings import Settings
-from experiments.artificial_discontinuity.shapes import HALF, Shape, shape
+from experiments.artificial_discontinuity.shapes import HALF, PATHS, Shape, shape
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Jumps, jumps_along
@@ -50,7 +48,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         reference = {one.path: _overlap(settings, shapes[0], one.path, one.jumps[PLAIN].parameters) for one in box}
         judged = [found for one in box for found in _judged(settings, shapes[0], one)]
     # Bodies are let go where the box's force jumps most, or in the middle of a path.
-    places = {one.path: place(one.jumps[PLAIN], float(np.mean(PATHS[one.path].interval))) for one in box}
+    places = {one.path: at_largest(one.jumps[PLAIN], float(np.mean(PATHS[one.path].interval))) for one in box}
     pushed = [bodies[name] for name in sizes.pushed]
     for body in pushed:
         workspace.check(body.scene, name=body.label)
@@ -62,7 +60,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         judged=judged,
         reference=reference,
         slopes=[one for each in pushes for one in each],
-        matings=mating.measure(settings, workspace),
+        matings=matings(settings, workspace),
         friction=_friction(sizes.num_points),
     )
 
@@ -140,8 +138,7 @@ def _judged(settings: Settings, body: Shape, static: Static) -> list[Judged]:
                 is_geometric=bool((np.abs(static.jumps[GENTLE].places - at) < 1e-3 * path.length).any()),
                 reference_jump=_turn(near),
                 reference_change=_turn(far),
-                from_contacts=int(static.contacts[left]),
-                to_contacts=int(static.contacts[right]),
+                contacts=(int(static.contacts[left]), int(static.contacts[right])),
             )
         )
     return found

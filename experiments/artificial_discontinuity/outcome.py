@@ -20,8 +20,6 @@ class Static:
     """Force on a body held along a path: three components (N), and the torque over half an edge (N).
 
     Attributes:
-        shape: label.
-        path: key of the path.
         num_rows: constraint rows of the shape, the measure of a step's cost.
         is_lattice: whether the shape stands for a pressure field; its own contact is gentle, and it is not smoothed.
         jumps: of the force, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`.
@@ -44,17 +42,14 @@ class Static:
 
 @dataclass(frozen=True)
 class Judged:
-    """A jump of the box's force beside the gradient of the overlap volume.
+    """A jump of the box's force beside the gradient of the overlap volume, the reference.
 
     Attributes:
-        path: key of the path.
-        place: of the jump.
         relative: jump over force.
         is_geometric: whether it is there when contact begins gently, too.
         reference_jump: jump of the reference at that place, over itself.
         reference_change: change of the reference from a penetration depth before to one after, over itself.
-        from_contacts: number of contacts before.
-        to_contacts: number after.
+        contacts: their number before and after.
     """
 
     path: str
@@ -63,8 +58,7 @@ class Judged:
     is_geometric: bool
     reference_jump: float
     reference_change: float
-    from_contacts: int
-    to_contacts: int
+    contacts: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -72,16 +66,11 @@ class Slopes:
     """Estimates of the slope of a short push under noise on the start, one body on one path.
 
     Attributes:
-        shape: label.
-        path: key of the path.
         place: mean start.
-        estimates: in the order of `WAYS`, from as many rollouts each.
-        errors: their standard errors.
-        reference: slope of the mean outcome, by stratified samples.
-        reference_error: its standard error, over repeats.
+        estimates: in the order of `WAYS`, from as many rollouts each, with their standard errors.
+        reference: slope of the mean outcome, by stratified samples; its standard error is over repeats.
         jump: what the outcome jumps by in the middle of the noise, if it does: all jumps, each times the noise's density.
-        starts: under the noise, in order.
-        outcomes: of these.
+        starts: under the noise, in order, with their outcomes.
     """
 
     shape: str
@@ -112,7 +101,6 @@ class Mating:
     """A peg above a hole, by how contact is told: where it ends against where it starts.
 
     Attributes:
-        label: of the geometry.
         force: jumps of the force on the peg held half-way in, against its offset.
         depth: jumps of how deep it is in the end (m), against the offset it is dropped at.
         slopes: estimates across the edge of the hole.
@@ -129,7 +117,6 @@ class Outcome:
     """All that was measured.
 
     Attributes:
-        settings: of the run.
         statics: every shape along every path, lattices last.
         judged: the jumps of the box.
         reference: gradient of the overlap volume on the box's grid, by path.
@@ -163,7 +150,7 @@ class Outcome:
                 "largest_jump": largest(one.jumps[PLAIN]),
                 "largest_jump_over_force": one.worst(PLAIN),
                 "gentle_jump_over_force": one.worst(GENTLE),
-                "place_of_largest": place(one.jumps[PLAIN], np.nan),
+                "place_of_largest": at_largest(one.jumps[PLAIN], np.nan),
                 "share_of_variation": one.jumps[PLAIN].share,
                 "smoothed_jump_over_force": np.nan if one.is_lattice else one.worst(SMOOTHED),
                 "c_mujoco_jump_over_force": one.worst(C),
@@ -185,6 +172,6 @@ def largest(jumps: Jumps) -> float:
     return float(jumps.sizes.max(initial=0.0))
 
 
-def place(jumps: Jumps, otherwise: float) -> float:
+def at_largest(jumps: Jumps, otherwise: float) -> float:
     """Give where the largest jump is."""
     return float(jumps.places[jumps.largest]) if len(jumps.places) else otherwise

@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, WAYS, C, Judged, Outcome, largest, worst
-from experiments.artificial_discontinuity.paths import PATHS
+from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.report import Table
 from experiments.words import joined, percent, quantity
 
@@ -95,7 +95,7 @@ def _by_jump(outcome: Outcome) -> Table:
         [
             PATHS[one.path].title,
             f"{one.place:.4f} {PATHS[one.path].unit}".replace("-", "−"),
-            f"{one.from_contacts} → {one.to_contacts}",
+            " → ".join(map(str, one.contacts)),
             *(_percent(share) for share in (one.relative, one.reference_jump, one.reference_change)),
             kind(one),
         ]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.cube_toss.outcome import CONTACTS, METHODS, Course, Outcome, Point
+from experiments.cube_toss.measure import CONTACTS, METHODS, Course, Outcome, Point
 from experiments.cube_toss.report import TARGET
 from experiments.theme import FIRST, MUTED, ZEROTH, Drawings, power, subplots
 from experiments.words import capitalised

@@ -3,15 +3,16 @@
 import functools
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 import mjxgrad as mg
-from experiments.cube_toss.outcome import Course, Outcome, Point
 from experiments.cube_toss.settings import Settings
 from experiments.failure import ExperimentError
 from experiments.motion import advance, at_time_step
@@ -31,6 +32,90 @@ _NUM_SUBSTEPS = 8
 
 # From a throw, its speed and a time step or tolerance to a derivative, the number of steps, and whether it failed.
 Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]
+METHODS = {
+    "discrete": "discrete",
+    "event": "event",
+    "continuous": "contact that begins within the step",
+    "substeps": "event, short steps at events",
+    "adaptive": "adaptive, differentiated",
+    "quotient": "adaptive, difference quotient",
+}
+CONTACTS = {"published": "contact whose force begins continuously", "default": "MuJoCo's default contact"}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method, a key of `METHODS`, at one setting, a time step in s or a tolerance.
+
+    Attributes:
+        derivative: of each throw, in m per m/s.
+        seconds: processor time of one derivative, compiled.
+        first_seconds: wall time of the first call, which compiles unless an earlier setting did.
+        num_steps: of one derivative.
+        has_failed: whether the integration gave up.
+    """
+
+    method: str
+    setting: float
+    derivative: Float[np.ndarray, " throws"]
+    seconds: float
+    first_seconds: float
+    num_steps: float
+    has_failed: bool
+
+
+@dataclass(frozen=True)
+class Course:
+    """All methods with one contact, a key of `CONTACTS`; errors are shares of the derivative, whose reference is by throw."""
+
+    contact: str
+    reference: Float[np.ndarray, " throws"]
+    points: tuple[Point, ...]
+
+    @property
+    def scale(self) -> float:
+        """Give the size of the derivative."""
+        return float(np.abs(self.reference).mean())
+
+    def of(self, method: str) -> list[Point]:
+        """Give the points of a method, from accurate to coarse."""
+        return sorted((point for point in self.points if point.method == method), key=lambda point: point.setting)
+
+    def errors(self, point: Point) -> Float[np.ndarray, " throws"]:
+        """Give the error of every throw."""
+        return (point.derivative - self.reference) / self.scale
+
+    def error(self, point: Point) -> float:
+        """Give the root-mean-square error over the throws; infinite if it failed."""
+        share = float(np.sqrt(np.mean(self.errors(point) ** 2)))
+        return share if np.isfinite(share) and not point.has_failed else np.inf
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All numbers, one course per contact."""
+
+    courses: tuple[Course, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give the rows of metrics.csv."""
+        return [
+            {
+                "contact": course.contact,
+                "method": point.method,
+                "setting": point.setting,
+                "derivative": float(point.derivative.mean()),
+                "reference": float(course.reference.mean()),
+                "relative_error": course.error(point),
+                "relative_bias": float(course.errors(point).mean()),
+                "processor_seconds": point.seconds,
+                "first_call_seconds": point.first_seconds,
+                "num_steps": point.num_steps,
+                "has_failed": point.has_failed,
+            }
+            for course in self.courses
+            for point in course.points
+        ]
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -50,7 +135,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         for contact in settings.contacts:
             task = cube_toss(contact)
             workspace.check(task.scene)
-            reference, _, failed = _taken(_METHODS["quotient"], task, jnp.asarray(_TOLERANCE))
+            reference, _, failed = _taken(_DERIVATIVES["quotient"], task, jnp.asarray(_TOLERANCE))
             if bool(np.any(failed)):
                 raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")
             points = []
@@ -63,7 +148,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 def _point(name: str, task: CubeToss, setting: float) -> Point:
     def call():
-        return jax.block_until_ready(_taken(_METHODS[name], task, jnp.asarray(setting)))
+        return jax.block_until_ready(_taken(_DERIVATIVES[name], task, jnp.asarray(setting)))
 
     started = time.perf_counter()
     derivative, num_steps, failed = call()
@@ -152,7 +237,7 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
     return jnp.any((distance < 0) != (later < 0))
 
 
-_METHODS: dict[str, Derivative] = {
+_DERIVATIVES: dict[str, Derivative] = {
     "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
     "event": functools.partial(_by_steps, functools.partial(mg.step, gradient="event")),
     "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.cube_toss.outcome import CONTACTS, METHODS, Course, Outcome, Point
+from experiments.cube_toss.measure import CONTACTS, METHODS, Course, Outcome, Point
 from experiments.report import Table
 from experiments.words import joined, percent, quantity
 from mjxgrad.tasks.cube_toss import PUBLISHED_DERIVATIVE

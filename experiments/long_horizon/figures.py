@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
-from experiments.long_horizon.outcome import CUT, ZEROTH, Errors, Outcome
+from experiments.long_horizon.measure import CUT, ZEROTH, Errors, Outcome
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, subplots
 from experiments.theme import ZEROTH as BLUE
 from experiments.words import capitalised

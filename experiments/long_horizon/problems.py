@@ -21,17 +21,13 @@ class Problem(eqx.Module):
     """A motion in segments of some steps each, with a cost at the end of every segment.
 
     Attributes:
-        scene: what moves.
-        start: where it begins.
         control: from parameters and a state to controls.
         cost: from positions and velocities to a number, in m.
         observe: likewise to what a value function is fitted on.
         params: the policy's, without noise.
         stddev: of the noise on each of them.
-        title: for figures and tables.
         gradients: of the steps that differ; "onset" is the derivative of a motion whose contacts begin within the step.
         num_times: segments of the longest horizon.
-        steps_per_time: steps of a segment.
     """
 
     scene: mg.Scene

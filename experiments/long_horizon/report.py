@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.long_horizon.outcome import CUT, VALUED, ZEROTH, Found, Outcome
+from experiments.long_horizon.measure import CUT, VALUED, ZEROTH, Found, Outcome
 from experiments.report import Table
 from experiments.theme import power
 from experiments.words import capitalised, joined, percent, quantity

@@ -22,14 +22,12 @@ class Case:
     """A motion from uncertain starts.
 
     Attributes:
-        title: for headings.
         model: of C MuJoCo, with its own contact, integrator and time step.
         duration: in s.
         moved: the two velocities that are uncertain, by index: the parameters of the gradient.
         stddev: of that uncertainty (m/s or rad/s).
         outcome: what is differentiated, as weights of the final positions, by index.
-        qpos: start positions that differ from the model's, by index.
-        qvel: start velocities that differ from zero, by index.
+        qpos: start positions that differ from the model's, by index; likewise `qvel`, which is zero elsewhere.
         ctrl: constant controls; zero unless given.
     """
 

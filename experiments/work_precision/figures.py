@@ -14,6 +14,8 @@ from experiments.work_precision.outcome import (
     MJX,
     NUM_ITERATIONS,
     ONSET,
+    SINGLE_TOLERANCE,
+    TIGHT_TOLERANCE,
     C,
     Course,
     Estimate,
@@ -22,7 +24,6 @@ from experiments.work_precision.outcome import (
     pareto_front,
 )
 from experiments.work_precision.report import lines
-from experiments.work_precision.simulation import SINGLE_TOLERANCE, TIGHT_TOLERANCE
 
 _COLOURS = {MG: ZEROTH, ONSET: "#cc79a7", MJX: FIRST, C: "#009e73"}
 _ESTIMATORS = {

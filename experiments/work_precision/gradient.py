@@ -18,10 +18,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.work_precision.cases import Case
-from experiments.work_precision.outcome import MG, Estimate, GradientReference, Knobs, Variant
+from experiments.work_precision.outcome import MG, TIGHT_TOLERANCE, Estimate, GradientReference, Knobs, Variant
 from experiments.work_precision.programs import Program, repeated
 from experiments.work_precision.settings import Settings
-from experiments.work_precision.simulation import TIGHT_TOLERANCE
 from mjxgrad.objective import Differentiated, Objective
 
 # Step of the reference, as a share of the scene's own: eight times finer than the finest estimate's by default.
@@ -43,15 +42,7 @@ ESTIMATORS: dict[str, tuple[str, str | None]] = {
 
 
 class Recorded(Objective):
-    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement.
-
-    Attributes:
-        costs: of the rollouts.
-        gradients: of these, by the parameters.
-        noise: on the parameters.
-        stddev: of the noise.
-        dim: number of parameters.
-    """
+    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement."""
 
     costs: Float[Array, " rollouts"]
     gradients: Float[Array, "rollouts dim"]
@@ -81,13 +72,9 @@ class Recorded(Objective):
 
 @dataclass(frozen=True)
 class Record:
-    """Rollouts at one time step and softness with one derivative, or none.
+    """Rollouts at one time step and softness with one derivative, or none, whose gradients are then zero.
 
-    Attributes:
-        costs: of the rollouts.
-        gradients: of these, zero without a derivative.
-        seconds: of one rollout, of each repetition.
-        compile_seconds: of the program.
+    The seconds are those of one rollout, of each repetition.
     """
 
     costs: Float[np.ndarray, " rollouts"]

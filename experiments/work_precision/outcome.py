@@ -12,6 +12,8 @@ from experiments.work_precision.settings import Settings
 C, MG, MJX, ONSET = "C MuJoCo", "mg.step", "mjx.step", "mg.step, onset"
 # Of the solver, enough to converge.
 NUM_ITERATIONS = 100
+# What single precision resolves, and the tolerance of the solver where it is not what is varied.
+SINGLE_TOLERANCE, TIGHT_TOLERANCE = 1e-6, 1e-8
 
 Integrator = Literal["Euler", "implicitfast", "RK4"]
 Cone = Literal["pyramidal", "elliptic"]
@@ -22,15 +24,7 @@ Precision = Literal["float32", "float64"]
 class Variant:
     """What a program is compiled for, beside the scene, or how C MuJoCo is run.
 
-    Attributes:
-        library: whose step: `MG`, `MJX` or `C`.
-        integrator: of the step.
-        cone: of friction.
-        precision: of every array.
-        batch: starts simulated together.
-        derivative: along the uncertain velocities; None for the motion alone.
-        onset: whether contacts begin within the step.
-        iterations: of the solver, at most.
+    The library is `MG`, `MJX` or `C`; the derivative, along the uncertain velocities, is None for the motion alone.
     """
 
     library: str
@@ -45,13 +39,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Knobs:
-    """What a program is told at each call.
-
-    Attributes:
-        timestep: in s.
-        tolerance: of the solver.
-        softening: factor on the time constants of contacts.
-    """
+    """What a program is told at each call: time step (s), the solver's tolerance, a factor on contacts' time constants."""
 
     timestep: float
     tolerance: float
@@ -62,13 +50,9 @@ class Knobs:
 class Point:
     """One way of simulating a scene.
 
-    Attributes:
-        variant: of the program.
-        knobs: of the call.
-        position_error: root mean square over the states of the distance in m and rad, over that of the way gone.
-        velocity_error: likewise of velocities, over their size.
-        seconds: wall time per simulated second of one state, of each repetition.
-        compile_seconds: to trace and compile the program, which serves many points; 0 where nothing is compiled.
+    Errors are root mean squares over the states: of the distance in m and rad, over that of the way gone, and of velocities, over
+    their size. Seconds are the wall time per simulated second of one state, of each repetition; `compile_seconds`, to trace and
+    compile the program, which serves many points, is 0 where nothing is compiled.
     """
 
     variant: Variant
@@ -115,10 +99,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Reference:
-    """What motions are compared with, of C MuJoCo's contacts or of MJX's.
+    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'.
 
     Attributes:
-        error: distance between the finest run and the one at twice its step, as the points' errors are measured.
+        error: distance between the finest run and the one at twice its step.
         coarser_error: likewise between the runs at two and four times the step.
         distance: from the same engine's reference with the scene's own cone: what the cone makes of the motion.
         distance_to_c: of MJX's contacts from C MuJoCo's: after the same steps where both are the same motion, else of their
@@ -133,20 +117,15 @@ class Reference:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One way of estimating a gradient.
+    """One way of estimating a gradient: its name, with the derivative that it uses, samples, time step (s) and softening.
 
     Attributes:
-        estimator: its name, with the derivative that it uses.
-        num_samples: per estimate.
-        timestep: in s.
-        softening: factor on the contacts' time constant.
         error: root of squared bias and variance.
         spread: quartiles over repetitions of the distance to the reference, over its norm.
         bias: distance of the mean to the reference, what chance explains taken off; over the reference's norm.
         bias_error: what chance would make of a bias of zero.
         variance: of one estimate over repetitions, the trace; over the reference's squared norm.
         seconds: wall time of one estimate, by the rollouts that it takes, of each repetition.
-        compile_seconds: to trace and compile the rollouts.
     """
 
     estimator: str
@@ -181,14 +160,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class GradientReference:
-    """What gradients are compared with.
+    """What gradients are compared with: that of the smoothed outcome at the finest step, by its correlation with the noise.
 
-    Attributes:
-        value: the gradient of the smoothed outcome at the finest step, by its correlation with the noise.
-        standard_error: of its norm, relative.
-        step_error: its change when the step is halved, relative.
-        difference: the same gradient by differences of smoothed outcomes, on other samples; its distance, relative.
-        difference_error: what chance explains of that distance, relative.
+    The rest is over its norm: its standard error, its change when the step is halved, the distance to the same gradient by
+    differences of smoothed outcomes on other samples, and what chance explains of that distance.
     """
 
     value: tuple[float, ...]
@@ -200,17 +175,10 @@ class GradientReference:
 
 @dataclass(frozen=True)
 class Course:
-    """All that was measured on one scene.
+    """All that was measured on one scene: ways to simulate it, and to estimate the gradient.
 
-    Attributes:
-        name: of the scene.
-        title: of the scene.
-        timestep: the scene's own, in s.
-        cone: the scene's own.
-        points: of the motion.
-        references: of the motion, by engine, that of `MG`, which is MJX's too, or `C`, and by cone.
-        estimates: of the gradient.
-        gradient_reference: what they are compared with.
+    Time step (s) and cone are the scene's own. References of the motion are by engine, that of `MG`, which is MJX's too, or `C`,
+    and by cone.
     """
 
     name: str

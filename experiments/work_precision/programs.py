@@ -40,14 +40,9 @@ _AT_A_TIME = 128
 
 @dataclass(frozen=True)
 class Program:
-    """A compiled simulation of one scene.
+    """A compiled simulation of one scene: the model, on the device in the variant's precision, and the executable.
 
-    Attributes:
-        case: the scene.
-        variant: what it was compiled for.
-        model: on the device, in the variant's precision.
-        call: the executable.
-        compile_seconds: taken to trace and compile it, or to load it if a former run has compiled it.
+    `compile_seconds` were taken to trace and compile it, or to load it if a former run has compiled it.
     """
 
     case: Case

@@ -9,9 +9,8 @@ from scipy.stats import norm
 
 from experiments.__main__ import main
 from experiments.artificial_discontinuity.measure import overlap_force
-from experiments.artificial_discontinuity.paths import PATHS
 from experiments.artificial_discontinuity.pushes import slopes_at
-from experiments.artificial_discontinuity.shapes import shape
+from experiments.artificial_discontinuity.shapes import PATHS, shape
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
 

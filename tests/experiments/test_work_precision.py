@@ -19,7 +19,7 @@ from experiments.failure import ConfigurationError
 from experiments.work_precision import figures, report
 from experiments.work_precision.cases import case
 from experiments.work_precision.gradient import Recorded, quasi_random, smoothed_gradient
-from experiments.work_precision.measure import variants
+from experiments.work_precision.measure import Truth, differences, variants
 from experiments.work_precision.outcome import (
     MG,
     MJX,
@@ -36,7 +36,6 @@ from experiments.work_precision.outcome import (
 )
 from experiments.work_precision.programs import Native, softened
 from experiments.work_precision.report import cheapest, fastest, samples_for
-from experiments.work_precision.simulation import Truth, differences
 
 STDDEV = 0.3
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss.measure import substepped_step
-from experiments.cube_toss.outcome import Course, Outcome, Point
+from experiments.cube_toss.measure import Course, Outcome, Point, substepped_step
 from experiments.cube_toss.report import fastest, verdict
 from mjxgrad._rollout import data_of
 from mjxgrad.tasks.cube_toss import cube_toss
