@@ -65,13 +65,7 @@ def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index
 
 
 def slopes_at(
-    settings: Settings,
-    label: str,
-    path: str,
-    simulate: Simulate,
-    place: float,
-    stddev: float,
-    rng: np.random.Generator,
+    settings: Settings, label: str, path: str, simulate: Simulate, place: float, stddev: float, rng: np.random.Generator
 ) -> Slopes:
     """Estimate a slope under noise on the start by first and zeroth order, with a reference.
 
