@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy.stats import norm
 
 import mjxgrad as mg
@@ -57,7 +57,7 @@ def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index
             # Poses come from SciPy, so that their derivative along the path is a difference; they are smooth.
             little = 1e-6 * path.length
             at, ahead, behind = (path.poses(body, settings.depth, starts + s * little) for s in (0, 1, -1))
-            return _pushed(body.scene, jnp.asarray(at), jnp.asarray((ahead - behind) / (2 * little)), gradient)
+            return _ends(body.scene, jnp.asarray(at), (ahead - behind) / (2 * little), gradient, _NUM_STEPS, 2)
 
         rng = np.random.default_rng([settings.seed, index, number])
         found.append(slopes_at(settings, body.label, name, simulate, place, settings.stddev * path.length, rng))
@@ -116,30 +116,18 @@ def slopes_at(
     )
 
 
-@eqx.filter_jit
-def _pushed(
-    scene: mg.Scene, poses: Float[Array, "starts 7"], tangents: Float[Array, "starts 7"], gradient: str
-) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
-    """Return how high the body is in the end (m), and the derivative along the tangents."""
-
-    def outcome(pose: Float[Array, " 7"]) -> Float[Array, ""]:
-        state = mg.initial_state(scene, pose)
-        return mg.rollout(scene, state, horizon=_NUM_STEPS, gradient=gradient).final.qpos[2]  # pyright: ignore[reportArgumentType]
-
-    return jax.vmap(lambda pose, tangent: jax.jvp(outcome, (pose,), (tangent,)))(poses, tangents)
-
-
 def matings(settings: Settings, workspace: Workspace) -> list[Mating]:
     """Hold the peg in the hole, and drop it beside it."""
     scenes = {label: mg.load_scene(_mjcf(label)) for label in settings.sizes.geometries}
     for label, scene in scenes.items():
         workspace.check(scene, name=f"mating, {label}")
 
-    def mate(i: int, label: str) -> Mating:
-        return _mate(settings, label, scenes[label], np.random.default_rng([settings.seed, 100 + i]))
-
+    jobs = [
+        (label, scene, np.random.default_rng([settings.seed, 100 + i]))
+        for i, (label, scene) in enumerate(scenes.items())
+    ]
     with workspace.stage("mating", "geometries", len(scenes)) as advance_to:
-        return in_threads(lambda one: mate(*one), enumerate(scenes), advance_to)
+        return in_threads(lambda job: _mate(settings, *job), jobs, advance_to)
 
 
 def _mjcf(label: str) -> str:
@@ -161,7 +149,8 @@ def _mjcf(label: str) -> str:
 
 def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
     def simulate(offsets: np.ndarray, gradient: str) -> tuple[Array, Array]:
-        return _depths(scene, jnp.asarray(offsets), gradient)
+        height, slope = _ends(scene, _tilted(offsets, _ABOVE), np.eye(3)[0], gradient, _NUM_DROPPED, 1)
+        return _LENGTH - height, -slope
 
     depth = jumps_along(
         lambda offsets: simulate(offsets, "discrete")[0],
@@ -170,37 +159,40 @@ def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Genera
         num_refinements=2,
         smallest=_SMALLEST_DEPTH,
     )
-    edge = at_largest(depth, float(np.mean(OFFSETS)))
-    stddev = settings.stddev * (OFFSETS[1] - OFFSETS[0])
     return Mating(
         label=label,
-        force=jumps_along(lambda at: _forces(scene, jnp.asarray(at)), OFFSETS, num_points=settings.sizes.num_points),
+        force=jumps_along(
+            lambda at: _forces(scene, _tilted(at, -_BELOW)), OFFSETS, num_points=settings.sizes.num_points
+        ),
         depth=depth,
-        slopes=slopes_at(settings, label, "offset", simulate, edge, stddev, rng),
-    )
+        slopes=slopes_at(
+            settings, label, "offset", simulate,
+            at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0]), rng,
+        ),
+    )  # fmt: skip
 
 
-def _pose(offset: Float[Array, ""], end: float) -> Float[Array, " 3"]:
+def _tilted(offsets: Float[np.ndarray, " offsets"], end: float) -> Float[Array, "offsets 3"]:
     """Place the tilted peg so that its lower end is at a height."""
-    return jnp.stack([offset, jnp.asarray(end + _LENGTH * np.cos(TILT)), jnp.asarray(TILT)])
+    still = np.zeros_like(offsets)
+    return jnp.stack([offsets, still + end + _LENGTH * np.cos(TILT), still + TILT], axis=1)
 
 
 @eqx.filter_jit
-def _forces(scene: mg.Scene, offsets: Float[Array, " offsets"]) -> Float[Array, "offsets 3"]:
-    def one(offset: Float[Array, ""]) -> Float[Array, " 3"]:
-        data = mg.forward(scene.model, scene.data.replace(qpos=_pose(offset, -_BELOW)))
-        return data.qfrc_constraint / np.array([1.0, 1.0, _LENGTH])
-
-    return jax.vmap(one)(offsets)
+def _forces(scene: mg.Scene, poses: Float[Array, "offsets 3"]) -> Float[Array, "offsets 3"]:
+    force = jax.vmap(lambda pose: mg.forward(scene.model, scene.data.replace(qpos=pose)).qfrc_constraint)(poses)
+    return force / np.array([1.0, 1.0, _LENGTH])
 
 
 @eqx.filter_jit
-def _depths(
-    scene: mg.Scene, offsets: Float[Array, " offsets"], gradient: str
-) -> tuple[Float[Array, " offsets"], Float[Array, " offsets"]]:
-    def depth(offset: Float[Array, ""]) -> Float[Array, ""]:
-        state = mg.initial_state(scene, _pose(offset, _ABOVE))
-        end = mg.rollout(scene, state, horizon=_NUM_DROPPED, gradient=gradient).final.qpos  # pyright: ignore[reportArgumentType]
-        return _LENGTH - end[1]
+def _ends(
+    scene: mg.Scene, poses: Float[Array, "starts nq"], tangents: ArrayLike, gradient: str, horizon: int, index: int
+) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
+    """Return a position (m) after some steps from each pose, and the derivative along the tangents."""
 
-    return jax.vmap(lambda x: jax.jvp(depth, (x,), (jnp.ones_like(x),)))(offsets)
+    def outcome(pose: Float[Array, " nq"]) -> Float[Array, ""]:
+        state = mg.initial_state(scene, pose)
+        return mg.rollout(scene, state, horizon=horizon, gradient=gradient).final.qpos[index]  # pyright: ignore[reportArgumentType]
+
+    every = jnp.broadcast_to(tangents, poses.shape)
+    return jax.vmap(lambda pose, tangent: jax.jvp(outcome, (pose,), (tangent,)))(poses, every)

@@ -42,7 +42,7 @@ FEW_ITERATIONS = (1, 3)
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed."""
-    cases = {name: case(name) for name in settings.scene_names}
+    cases = {name: case(name) for name in settings.scenes or settings.sizes.scenes}
     needed = {name: variants(one, settings, settings.has_asides(name)) for name, one in cases.items()}
     courses = []
     # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.

@@ -83,19 +83,6 @@ class Point:
         """What it has in common with the points that differ in time step alone."""
         return self.variant, self.knobs.tolerance
 
-    def row(self) -> dict[str, Any]:
-        """Give what metrics.csv says of it alone."""
-        names = ("integrator", "cone", "precision", "iterations", "batch")
-        return {
-            "library": self.library,
-            **{name: getattr(self.variant, name) for name in names},
-            "timestep": self.knobs.timestep,
-            "tolerance": self.knobs.tolerance,
-            "position_error": self.position_error,
-            "velocity_error": self.velocity_error,
-            **_times("seconds_per_simulated_second", self),
-        }
-
 
 @dataclass(frozen=True)
 class Reference:
@@ -149,13 +136,6 @@ class Estimate:
     def line(self) -> tuple[Any, ...]:
         """What it has in common with the estimates that differ in the number of samples alone."""
         return self.estimator, self.timestep, self.softening
-
-    def row(self) -> dict[str, Any]:
-        """Give what metrics.csv says of it alone."""
-        values = asdict(self)
-        del values["seconds"], values["spread"]
-        quartiles = dict(zip(("error_quartile_low", "error_quartile_high"), self.spread, strict=True))
-        return {**values, **quartiles, **_times("seconds", self)}
 
 
 @dataclass(frozen=True)
@@ -214,7 +194,7 @@ class Outcome:
             for kind, measured in (("motion", course.points), ("gradient", course.estimates)):
                 on_front = pareto_front([one.cost for one in measured], [one.error for one in measured])
                 for one, is_best in zip(measured, on_front, strict=True):
-                    rows.append({"scene": course.name, "of": kind, **one.row(), "on_front": bool(is_best)})
+                    rows.append({"scene": course.name, "of": kind, **_flat(one), "on_front": bool(is_best)})
         names = list(dict.fromkeys(name for row in rows for name in row))
         return [{name: row.get(name, "") for name in names} for row in rows]
 
@@ -227,12 +207,14 @@ def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> Bool[np.nda
     return ~(no_worse & better).any(axis=1) & np.isfinite(error) & np.isfinite(cost)
 
 
-def _times(unit: str, one: Point | Estimate) -> dict[str, Any]:
-    return {
-        "error": one.error,
-        unit: one.cost,
-        f"{unit}_min": min(one.seconds),
-        f"{unit}_max": max(one.seconds),
-        "num_repeats": len(one.seconds),
-        "compile_seconds": one.compile_seconds,
-    }
+def _flat(one: Point | Estimate) -> dict[str, Any]:
+    values = asdict(one)
+    seconds = values.pop("seconds")
+    if isinstance(one, Point):
+        values = {**values.pop("variant"), **values.pop("knobs"), **values, "library": one.library}
+        unit = "seconds_per_simulated_second"
+    else:
+        values["error_quartile_low"], values["error_quartile_high"] = values.pop("spread")
+        unit = "seconds"
+    times = {unit: one.cost, f"{unit}_min": min(seconds), f"{unit}_max": max(seconds), "num_repeats": len(seconds)}
+    return {**values, "error": one.error, **times}

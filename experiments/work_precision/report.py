@@ -113,25 +113,19 @@ def findings(outcome: Outcome) -> list[str]:
             f"{medians} times the step's in the median, and larger by more than a tenth at {(every > 1.1).sum()} of "
             f"{every.size} time steps."
         )
-    loose = [course.title for course in outcome.courses if not all(map(converges, course.references.values()))]
-    if loose:
-        sentences.append(
-            "Halving the step did not bring the reference nearer, so that the dotted line is all that is known: "
-            f"{'; '.join(loose)}."
-        )
-    found = [(course.title, course.references[MG, course.cone]) for course in outcome.courses]
-    apart = [title for title, one in found if one.distance_to_c > max(1e-5, 3 * one.error)]
-    if apart:
-        sentences.append(
-            f"MJX makes other contacts than C MuJoCo, so that each has its own reference: {'; '.join(apart)}."
-        )
-    doubtful = [course.title for course in outcome.courses if not agrees(course.gradient_reference)]
-    if doubtful:
-        sentences.append(
-            "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful: "
-            f"{'; '.join(doubtful)}."
-        )
-    return sentences
+    own = {course.title: course.references[MG, course.cone] for course in outcome.courses}
+    untold = {
+        "Halving the step did not bring the reference nearer, so that the dotted line is all that is known": [
+            course.title for course in outcome.courses if not all(map(converges, course.references.values()))
+        ],
+        "MJX makes other contacts than C MuJoCo, so that each has its own reference": [
+            title for title, one in own.items() if one.distance_to_c > max(1e-5, 3 * one.error)
+        ],
+        "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful": [
+            course.title for course in outcome.courses if not agrees(course.gradient_reference)
+        ],
+    }
+    return sentences + [f"{what}: {'; '.join(titles)}." for what, titles in untold.items() if titles]
 
 
 def converges(one: Reference) -> bool:

@@ -48,18 +48,13 @@ class Settings(RunSettings):
     """How much is measured: two scenes in a minute or two, eight in a quarter of an hour on two cores, all on a GPU."""
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
-    scenes: tuple[SceneName, ...] | None = None
+    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
     """Which scenes, in place of those of the size."""
     targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (
         0.05,
         1e-3,
     )
     """Relative errors for which a setting is recommended."""
-
-    @property
-    def scene_names(self) -> tuple[SceneName, ...]:
-        """Give the scenes to run."""
-        return self.sizes.scenes if self.scenes is None else self.scenes
 
     def has_asides(self, name: str) -> bool:
         """Say whether a scene is looked at in every way that the size has."""
@@ -69,8 +64,6 @@ class Settings(RunSettings):
     def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
-        if self.scenes is not None and not self.scenes:
-            raise ValueError("scenes must name at least one scene, got none")
         if self.scenes is not None and len(set(self.scenes)) < len(self.scenes):
             raise ValueError(f"scenes must not repeat, got {list(self.scenes)}")
         return self

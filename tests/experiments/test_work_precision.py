@@ -212,7 +212,7 @@ def test_every_time_step_divides_every_motion(size):
     [
         ('precision="float32"', "precision must be float64"),
         ('scenes=["bounce", "bounce"]', "scenes must not repeat"),
-        ("scenes=[]", "scenes must name at least one scene"),
+        ("scenes=[]", "scenes: must"),
         ('size="huge"', "size"),
         ("targets=[2.0]", "targets"),
     ],
