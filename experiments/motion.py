@@ -1,4 +1,4 @@
-"""A motion sampled at a few times, in one program for every time step."""
+"""One stepping loop for all experiments, and a motion sampled at a few times in one program for every time step."""
 
 from collections.abc import Callable
 
@@ -23,6 +23,25 @@ def at_time_step(model: mjx.Model, timestep: ArrayLike) -> mjx.Model:
     return model.tree_replace({"opt.timestep": jnp.asarray(timestep, model.opt.timestep.dtype)})  # pyright: ignore[reportReturnType]
 
 
+def advance(step: Callable[[mjx.Data], mjx.Data], data: mjx.Data, num_steps: Int[ArrayLike, ""]) -> mjx.Data:
+    """Step many times, the state alone carried along. `mg.rollout` would compile anew for every number of steps.
+
+    Args:
+        step: from data to data one time step later.
+        data: the start.
+        num_steps: may be traced, and the whole is then for forward mode alone.
+
+    Returns:
+        The start's data with the last state.
+    """
+
+    def once(_: Array, state: dict[str, Array]) -> dict[str, Array]:
+        moved = step(data.replace(**state))
+        return {name: getattr(moved, name) for name in _STATE}
+
+    return data.replace(**jax.lax.fori_loop(0, num_steps, once, {name: getattr(data, name) for name in _STATE}))
+
+
 def motion(
     model: mjx.Model,
     data: mjx.Data,
@@ -33,28 +52,23 @@ def motion(
     gradient: str,
     onset: mg.Onset | None = None,
 ) -> Float[Array, "times *outcome"]:
-    """Step, and read the state at equal intervals. `mg.rollout` would compile anew for every number of steps.
+    """Read a motion at equal intervals, the first `steps_between` steps after the start.
 
     Args:
         model: of the scene, as `at_time_step` gives it.
         data: the start.
         read: from positions and velocities to what is kept.
         num_times: how often to read.
-        steps_between: steps from one reading to the next; may be traced, and the whole is then for forward mode alone.
+        steps_between: steps from one reading to the next; as for `advance`.
         gradient: which derivative the steps have.
         onset: of contacts within the step; None is MuJoCo's motion.
-
-    Returns:
-        The readings, the first `steps_between` steps after the start.
     """
 
-    def step(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        moved = mg.step(model, data.replace(**dict(zip(_STATE, state, strict=True))), gradient=gradient, onset=onset)
-        return tuple(getattr(moved, name) for name in _STATE)
+    def step(data: mjx.Data) -> mjx.Data:
+        return mg.step(model, data, gradient=gradient, onset=onset)  # pyright: ignore[reportArgumentType]
 
-    def until_next(state: tuple[Array, ...], _: None):
-        state = jax.lax.fori_loop(0, steps_between, step, state)
-        return state, read(state[0], state[1])
+    def until_next(moved: mjx.Data, _: None) -> tuple[mjx.Data, Array]:
+        moved = advance(step, moved, steps_between)
+        return moved, read(moved.qpos, moved.qvel)
 
-    start = tuple(getattr(data, name) for name in _STATE)
-    return jax.lax.scan(until_next, start, length=num_times)[1]
+    return jax.lax.scan(until_next, data, length=num_times)[1]

@@ -20,26 +20,14 @@ def num_cores() -> int:
 
 
 def num_compilers(*, besides: int = 0) -> int:
-    """Say how many programs to compile side by side: one per core, and no more than memory has room for.
-
-    Args:
-        besides: cores to leave to something else.
-    """
+    """Say how many programs to compile side by side: one per core but for some, as many as memory has room for."""
     return max(1, min(num_cores() - besides, _MOST))
 
 
 def in_threads(
-    function: Callable[[_Item], _Result], items: Iterable[_Item], advance_to: Callable[[int], None] | None = None
+    function: Callable[[_Item], _Result], items: Iterable[_Item], advance_to: Callable[[int], None] = lambda _: None
 ) -> list[_Result]:
-    """Call a function on every item, as many at a time as programs are compiled.
-
-    Args:
-        function: which spends its time compiling, or in compiled programs.
-        items: what it is called on.
-        advance_to: is told how many are done, in order.
-
-    Returns:
-        What it returned, in the order of the items.
+    """Call a function that compiles on every item; results keep the order, and `advance_to` is told how many there are.
 
     Raises:
         Exception: the first that a call raised.
@@ -48,8 +36,7 @@ def in_threads(
     with ThreadPoolExecutor(num_compilers()) as pool:
         for result in pool.map(function, items):
             done.append(result)
-            if advance_to is not None:
-                advance_to(len(done))
+            advance_to(len(done))
     return done
 
 

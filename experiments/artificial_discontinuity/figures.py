@@ -1,13 +1,25 @@
 """The pictures of an experiment on artificial discontinuities."""
 
 import numpy as np
+from matplotlib.axes import Axes
+from scipy.stats import linregress
 
-from experiments.artificial_discontinuity.mating import TILT
-from experiments.artificial_discontinuity.outcome import WAYS, Outcome, worst
+from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED, WAYS, C, Outcome, Static
+from experiments.artificial_discontinuity.pushes import TILT
+from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
+from experiments.words import quantity
+from mjxgrad.diagnostics import Jumps
 
 _EVENT = "#009e73"
 _LEAST = 1e-4
+# How the jumps of each force are drawn.
+_FORCES = {
+    PLAIN: ({"marker": "o", "color": FIRST, "ms": 6}, "MuJoCo's default contact"),
+    GENTLE: ({"marker": "D", "color": _EVENT, "ms": 7, "mfc": "none"}, "contact that begins gently"),
+    SMOOTHED: ({"marker": "s", "color": ZEROTH, "ms": 8, "mfc": "none"}, "default contact, smoothed"),
+    C: ({"marker": "x", "color": REFERENCE, "ms": 5}, "default contact in C MuJoCo"),
+}
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -17,30 +29,21 @@ def drawings(outcome: Outcome) -> Drawings:
 
 def forces(outcome: Outcome):
     """Forces of the box, of balls and of the finest lattice along every path, the reference dashed."""
-    names = list(outcome.paths)
-    figure, axes = subplots(3, len(names), height=6.2, sharex="col")
-    bodies = [outcome.shapes[0], _rounded(outcome), outcome.shapes[-1]]
-    for row, body in enumerate(bodies):
-        for column, static in enumerate(outcome.of(body)):
-            axis, path = axes[row, column], outcome.paths[static.path]
-            force = static.plain.values[:, :3] / static.plain.scale
-            for part, colour, label in zip(force.T, (FIRST, MUTED, ZEROTH), "xyz", strict=True):
-                axis.plot(static.plain.parameters, part, color=colour, lw=1.3, label=f"force along {label}")
-            if row == 0:
-                volume = outcome.reference[static.path]
-                size = max(np.abs(volume).max(), 1e-12)
-                for part, colour in zip(volume.T, (FIRST, MUTED, ZEROTH), strict=True):
-                    label = "by overlap volume" if colour == FIRST else None
-                    axis.plot(static.plain.parameters, part / size, color=colour, lw=1.0, ls=(0, (2, 2)), label=label)
-                axis.set_title(path.title)
-            for place in static.plain.places[static.plain.sizes > outcome.settings.threshold * static.plain.scale]:
-                axis.axvline(place, color=REFERENCE, lw=0.6, alpha=0.35, zorder=0)
-            if row == 2:
-                axis.set_xlabel(f"position, {path.unit}" if path.unit == "m" else f"angle, {path.unit}")
-            if column == 0:
-                axis.set_ylabel(f"{body}\nforce over its largest")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5)
+    bodies = list(outcome.by_shape)
+    figure, axes = subplots(3, len(outcome.settings.sizes.paths), height=6.2, sharex="col")
+    for row, body in zip(axes, (bodies[0], _rounded(outcome), bodies[-1]), strict=True):
+        for axis, static in zip(row, outcome.by_shape[body], strict=True):
+            found = static.jumps[PLAIN]
+            _components(axis, found.parameters, found.values[:, :3] / found.scale, "force along {}")
+            _mark(axis, found, outcome.settings.threshold * found.scale)
+        row[0].set_ylabel(f"{body}\nforce over its largest")
+    for top, bottom, (name, volume) in zip(axes[0], axes[-1], outcome.reference.items(), strict=True):
+        parameters = np.linspace(*PATHS[name].interval, len(volume))
+        _components(top, parameters, volume / max(np.abs(volume).max(), 1e-12), "", lw=1.0, ls=(0, (2, 2)))
+        top.set_title(PATHS[name].title)
+        bottom.set_xlabel(f"{'angle' if PATHS[name].axis else 'position'}, {PATHS[name].unit}")
+    axes[0, 0].plot([], [], color=FIRST, lw=1.0, ls=(0, (2, 2)), label="by overlap volume")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
         f"Force on a body held {1e3 * settings.depth:g} mm deep in a cube, over its largest. Dashed, the gradient of the "
@@ -50,41 +53,35 @@ def forces(outcome: Outcome):
     return figure, "Force along a path", caption
 
 
+def _components(axis: Axes, parameters: np.ndarray, values: np.ndarray, label: str, **look) -> None:
+    for part, colour, name in zip(values.T, (FIRST, MUTED, ZEROTH), "xyz", strict=True):
+        axis.plot(parameters, part, color=colour, label=label.format(name) or None, **{"lw": 1.3, **look})
+
+
+def _mark(axis: Axes, jumps: Jumps, smallest: float = 0.0, unit: float = 1.0) -> None:
+    """Draw lines where something jumps."""
+    for place in jumps.places[jumps.sizes > smallest]:
+        axis.axvline(unit * place, color=REFERENCE, lw=0.6, alpha=0.35, zorder=0)
+
+
 def jumps(outcome: Outcome):
     """Largest relative jump by body and path: as it is, smoothed, and in C MuJoCo."""
-    names = list(outcome.paths)
-    figure, axes = subplots(1, len(names), height=0.9 + 0.3 * len(outcome.shapes), sharey=True)
-    places = np.arange(len(outcome.shapes))[::-1]
+    names, bodies = outcome.settings.sizes.paths, list(outcome.by_shape)
+    figure, axes = subplots(1, len(names), height=0.9 + 0.3 * len(bodies), sharey=True)
+    places = np.arange(len(bodies))[::-1]
     for axis, name in zip(axes[0], names, strict=True):
         statics = [one for one in outcome.statics if one.path == name]
-        axis.plot(
-            [_shown(one.worst) for one in statics], places, "o", color=FIRST, ms=6, label="MuJoCo's default contact"
-        )
-        axis.plot(
-            [_shown(one.geometric) for one in statics],
-            places,
-            "D",
-            color=_EVENT,
-            mfc="none",
-            ms=7,
-            label="contact that begins gently",
-        )
-        axis.plot(
-            [_shown(worst(one.c_mujoco)) for one in statics],
-            places,
-            "x",
-            color=REFERENCE,
-            ms=5,
-            label="default contact in C MuJoCo",
-        )
-        smoothed = [(_shown(worst(one.smoothed)), y) for one, y in zip(statics, places, strict=True) if one.smoothed]
-        axis.plot(*zip(*smoothed, strict=True), "s", color=ZEROTH, mfc="none", ms=8, label="default contact, smoothed")
+        for force, (look, label) in _FORCES.items():
+            shown = [
+                (max(one.worst(force), _LEAST), y) for one, y in zip(statics, places, strict=True) if force in one.jumps
+            ]
+            axis.plot(*zip(*shown, strict=True), ls="", label=label, **look)
         axis.axvline(outcome.settings.threshold, color=MUTED, lw=1, ls=(0, (2, 3)))
-        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=outcome.paths[name].title)
+        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title)
         axis.set_xticks([_LEAST, 1e-3, 1e-2, 0.1, 1], labels=["none", "0.1%", "1%", "10%", "100%"], fontsize=7)
         axis.minorticks_off()
-    axes[0, 0].set_yticks(places, outcome.shapes)
-    axes[0, len(names) // 2].set_xlabel("largest jump, over the largest force on the path")
+    axes[0, 0].set_yticks(places, bodies)
+    figure.supxlabel("largest jump, over the largest force on the path", fontsize=9.5)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
@@ -99,26 +96,24 @@ def refinement(outcome: Outcome):
     """Largest jump of the lattices against points along an edge, and the force along the first path."""
     figure, axes = subplots(1, 2, height=3.7)
     left, right = axes[0]
-    colours = shades(len(outcome.paths))
-    for colour, name in zip(colours, outcome.paths, strict=True):
-        power = outcome.rate(name)[0]
-        if np.isnan(power):
-            continue
-        lattices = [one for one in outcome.statics if one.is_lattice and one.path == name]
-        count = np.sqrt([one.num_rows for one in lattices])
-        size = [max(one.worst, _LEAST) for one in lattices]
-        label = f"{outcome.paths[name].title}: power {-power:.1f}".replace("-", "−")
-        left.plot(count, size, "o-", color=colour, ms=4, label=label)
+    names = outcome.settings.sizes.paths
+    lattices = {name: [one for one in outcome.statics if one.is_lattice and one.path == name] for name in names}
+    counts = outcome.settings.sizes.lattices
+    for colour, (name, found) in zip(shades(len(names)), lattices.items(), strict=True):
+        power, error = falls_as(counts, found)
+        if np.isfinite(power):
+            label = f"{PATHS[name].title}: power {quantity(-power, error)}"
+            left.plot(counts, [max(one.worst(PLAIN), _LEAST) for one in found], "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
-    counts = sorted({round(np.sqrt(one.num_rows)) for one in outcome.statics if one.is_lattice})
     left.set_xticks(counts, [str(one) for one in counts])
     left.minorticks_off()
-    left.legend(fontsize=8)
-    first = [one for one in outcome.statics if one.is_lattice and one.path == next(iter(outcome.paths))]
+    first = lattices[names[0]]
     for colour, one in zip(shades(len(first)), first, strict=True):
-        right.plot(one.plain.parameters, one.plain.values[:, 2], color=colour, lw=1.3, label=one.shape)
+        found = one.jumps[PLAIN]
+        right.plot(found.parameters, found.values[:, 2], color=colour, lw=1.3, label=one.shape)
     right.set(xlabel="position, m", title="Force upwards as the body slides past the edge, N")
-    right.legend(fontsize=8)
+    for axis in axes[0]:
+        axis.legend(fontsize=8)
     caption = (
         "Bodies that touch by points, each a spring of its own with an equal share of the stiffness. Each point's force jumps "
         "where its nearest face changes; of a slide along the lattice a whole row does so at once, of one askew one point "
@@ -127,34 +122,37 @@ def refinement(outcome: Outcome):
     return figure, "A pressure field of ever more points", caption
 
 
+def falls_as(counts: tuple[int, ...], lattices: list[Static]) -> tuple[float, float]:
+    """Give the power of the number of points along an edge by which the largest jump falls, and its standard error.
+
+    NaN for fewer than three lattices, and where one of them does not jump or only a single point touches: there nothing is
+    refined, and without a jump there is no logarithm.
+    """
+    if len(lattices) < 3 or any(one.worst(PLAIN) == 0 or one.contacts.max() < 2 for one in lattices):
+        return np.nan, np.nan
+    fit = linregress(np.log(counts), np.log([one.worst(PLAIN) for one in lattices]))
+    return -float(fit.slope), float(fit.stderr)
+
+
 def slopes(outcome: Outcome):
     """Outcome of a push against its start for the box and for balls, and all errors of the estimates."""
     figure, axes = subplots(1, 3, height=3.9, width_ratios=(1, 1, 1.5))
     pushed = {one.shape: one for one in reversed(outcome.slopes)}
     # The box, and a body that does not jump; where none other was pushed, the box on another path.
-    shown = [pushed[outcome.shapes[0]], pushed.get(_rounded(outcome), outcome.slopes[-1])]
+    shown = [pushed[next(iter(outcome.by_shape))], pushed.get(_rounded(outcome), outcome.slopes[-1])]
+    lines = (*zip(WAYS, (FIRST, _EVENT, ZEROTH), ("-", "-", "-"), strict=True), ("reference", REFERENCE, (0, (2, 2))))
     for axis, one in zip(axes[0], shown, strict=False):
-        path = outcome.paths[one.path]
+        path = PATHS[one.path]
         axis.plot(one.starts, 1e3 * one.outcomes, ".", color=REFERENCE, ms=2.5)
         axis.set(title=f"{one.shape}, {path.title}", xlabel=f"start, {path.unit}")
         axis.locator_params(axis="x", nbins=4)
-        for estimate, colour, label in zip(
-            (*one.estimates, one.reference), (FIRST, _EVENT, ZEROTH, REFERENCE), (*WAYS, "reference"), strict=True
-        ):
-            reach = np.array([-1.0, 1.0]) * outcome.settings.stddev * path.length
-            style = {"ls": (0, (2, 2))} if label == "reference" else {}
-            axis.plot(
-                one.place + reach,
-                1e3 * (one.outcomes.mean() + estimate * reach),
-                color=colour,
-                lw=2,
-                label=label,
-                **style,
-            )
+        reach = np.array([-1.0, 1.0]) * outcome.settings.stddev * path.length
+        for estimate, (label, colour, style) in zip((*one.estimates, one.reference), lines, strict=True):
+            heights = 1e3 * (one.outcomes.mean() + estimate * reach)
+            axis.plot(one.place + reach, heights, color=colour, lw=2, ls=style, label=label)
     axes[0, 0].set_ylabel("height after 30 ms, mm")
     _errors(outcome, axes[0, 2])
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8.5)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
         f"The body is let go and pushed for 30 ms; the outcome is its height. Noise on the start of {settings.stddev:.1%} of "
@@ -164,7 +162,7 @@ def slopes(outcome: Outcome):
     return figure, "What gradients say across the jump", caption
 
 
-def _errors(outcome: Outcome, axis) -> None:
+def _errors(outcome: Outcome, axis: Axes) -> None:
     """Draw the error of each estimate over the reference, body by body."""
     bodies = list(dict.fromkeys(one.shape for one in outcome.slopes))
     looks = ((FIRST, "o", 0.0), (_EVENT, "^", -0.18), (ZEROTH, "s", -0.36))
@@ -182,14 +180,13 @@ def _errors(outcome: Outcome, axis) -> None:
 def mating(outcome: Outcome):
     """Force on the held peg and depth of the dropped one against the offset, by geometry."""
     figure, axes = subplots(2, len(outcome.matings), height=4.8, sharex=True, sharey="row")
-    for column, one in enumerate(outcome.matings):
-        upper, lower = axes[:, column]
-        for part, colour, label in zip(one.force.values.T, (FIRST, ZEROTH, DEFAULT), _PARTS, strict=True):
+    parts = ("sideways", "upwards", "torque over half the length")
+    for (upper, lower), one in zip(axes.T, outcome.matings, strict=True):
+        for part, colour, label in zip(one.force.values.T, (FIRST, ZEROTH, DEFAULT), parts, strict=True):
             upper.plot(1e3 * one.force.parameters, part, color=colour, lw=1.3, label=label)
         lower.plot(1e3 * one.depth.parameters, 1e3 * one.depth.values, ".", color=REFERENCE, ms=2)
-        for axis, found in ((upper, one.force), (lower, one.depth)):
-            for place in found.places:
-                axis.axvline(1e3 * place, color=REFERENCE, lw=0.6, alpha=0.35, zorder=0)
+        _mark(upper, one.force, unit=1e3)
+        _mark(lower, one.depth, unit=1e3)
         upper.set_title(one.label)
         lower.set_xlabel("offset, mm")
     axes[0, 0].set_ylabel("held in the hole: force, N")
@@ -203,13 +200,6 @@ def mating(outcome: Outcome):
     return figure, "A peg and a hole", caption
 
 
-_PARTS = ("sideways", "upwards", "torque over half the length")
-
-
 def _rounded(outcome: Outcome) -> str:
     """Return the body whose corners are balls."""
-    return next(one for one in outcome.shapes if "corners" in one)
-
-
-def _shown(jump: float) -> float:
-    return max(jump, _LEAST)
+    return next(one for one in outcome.by_shape if "corners" in one)

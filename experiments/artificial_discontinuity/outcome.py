@@ -1,4 +1,4 @@
-"""The numbers of an experiment on artificial discontinuities, and what follows from them."""
+"""The numbers of an experiment on artificial discontinuities."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,32 +6,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.artificial_discontinuity.paths import Path
 from experiments.artificial_discontinuity.settings import Settings
 from mjxgrad.diagnostics import Jumps
 
+# Which force jumps: under the shape's own contact, which begins with a jump of force but for lattices; with an impedance that
+# rises from zero; under the shape's own contact, smoothed; and C MuJoCo's.
+PLAIN, GENTLE, SMOOTHED, C = "plain", "gentle", "smoothed", "C MuJoCo"
 WAYS = ("first order, discrete", "first order, event", "zeroth order")
-REAL, TURN, ARTIFICIAL = "real", "real change, made sudden", "artificial"
-ONSET = "onset of a contact under load"
-# Of a jump, what the continuous reference must do nearby for it to be the same change.
-_SAME = 0.5
 
 
 @dataclass(frozen=True)
 class Static:
     """Force on a body held along a path: three components (N), and the torque over half an edge (N).
 
-    Jumps are measured over the largest force on the path.
-
     Attributes:
-        shape: label.
-        path: key of the path.
-        num_rows: constraint rows of the shape.
-        is_lattice: whether the shape stands for a pressure field.
-        plain: jumps of mjxgrad's force under the shape's own contact, which begins with a jump of force but for lattices.
-        gentle: the same with an impedance that rises from zero; None for lattices.
-        smoothed: under the shape's own contact with smoothing; None for lattices.
-        c_mujoco: jumps of C MuJoCo's force.
+        num_rows: constraint rows of the shape, the measure of a step's cost.
+        is_lattice: whether the shape stands for a pressure field; its own contact is gentle, and it is not smoothed.
+        jumps: of the force, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`.
         contacts: number of different contact points on the grid, as MJX finds them.
         copies: how many contacts there are beside these, in the same places.
     """
@@ -40,37 +31,25 @@ class Static:
     path: str
     num_rows: int
     is_lattice: bool
-    plain: Jumps
-    gentle: Jumps | None
-    smoothed: Jumps | None
-    c_mujoco: Jumps
+    jumps: dict[str, Jumps]
     contacts: Int[np.ndarray, " points"]
     copies: Int[np.ndarray, " points"]
 
-    @property
-    def worst(self) -> float:
-        """Largest jump over the largest force on the path; zero without any."""
-        return worst(self.plain)
-
-    @property
-    def geometric(self) -> float:
-        """The same of contact that begins gently: what is left is of the geometry."""
-        return worst(self.gentle or self.plain)
+    def worst(self, force: str) -> float:
+        """Give the largest jump over the largest force on the path; zero without any."""
+        return worst(self.jumps[force])
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A jump of the box's force beside the gradient of the overlap volume.
+    """A jump of the box's force beside the gradient of the overlap volume, the reference.
 
     Attributes:
-        path: key of the path.
-        place: of the jump.
         relative: jump over force.
         is_geometric: whether it is there when contact begins gently, too.
         reference_jump: jump of the reference at that place, over itself.
         reference_change: change of the reference from a penetration depth before to one after, over itself.
-        from_contacts: number of contacts before.
-        to_contacts: number after.
+        contacts: their number before and after.
     """
 
     path: str
@@ -79,17 +58,7 @@ class Judged:
     is_geometric: bool
     reference_jump: float
     reference_change: float
-    from_contacts: int
-    to_contacts: int
-
-    @property
-    def kind(self) -> str:
-        """What the jump is, by what the reference does there."""
-        if not self.is_geometric:
-            return ONSET
-        if self.reference_jump > _SAME * self.relative:
-            return REAL
-        return TURN if self.reference_change > _SAME * self.relative else ARTIFICIAL
+    contacts: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -97,16 +66,11 @@ class Slopes:
     """Estimates of the slope of a short push under noise on the start, one body on one path.
 
     Attributes:
-        shape: label.
-        path: key of the path.
         place: mean start.
-        estimates: in the order of `WAYS`, from as many rollouts each.
-        errors: their standard errors.
-        reference: slope of the mean outcome, by stratified samples.
-        reference_error: its standard error, over repeats.
+        estimates: in the order of `WAYS`, from as many rollouts each, with their standard errors.
+        reference: slope of the mean outcome, by stratified samples; its standard error is over repeats.
         jump: what the outcome jumps by in the middle of the noise, if it does: all jumps, each times the noise's density.
-        outcomes: on a grid, with the starts, for figures.
-        starts: of these.
+        starts: under the noise, in order, with their outcomes.
     """
 
     shape: str
@@ -137,15 +101,12 @@ class Mating:
     """A peg above a hole, by how contact is told: where it ends against where it starts.
 
     Attributes:
-        label: of the geometry.
-        num_rows: constraint rows.
         force: jumps of the force on the peg held half-way in, against its offset.
         depth: jumps of how deep it is in the end (m), against the offset it is dropped at.
         slopes: estimates across the edge of the hole.
     """
 
     label: str
-    num_rows: int
     force: Jumps
     depth: Jumps
     slopes: Slopes
@@ -156,9 +117,7 @@ class Outcome:
     """All that was measured.
 
     Attributes:
-        settings: of the run.
-        paths: by key.
-        statics: every shape along every path.
+        statics: every shape along every path, lattices last.
         judged: the jumps of the box.
         reference: gradient of the overlap volume on the box's grid, by path.
         slopes: of short pushes.
@@ -167,7 +126,6 @@ class Outcome:
     """
 
     settings: Settings
-    paths: dict[str, Path]
     statics: list[Static]
     judged: list[Judged]
     reference: dict[str, Float[np.ndarray, "points 3"]]
@@ -175,33 +133,11 @@ class Outcome:
     matings: list[Mating]
     friction: Jumps
 
-    def of(self, shape: str) -> list[Static]:
-        """Give one shape's measurements, in the order of the paths."""
-        return [one for one in self.statics if one.shape == shape]
-
     @property
-    def shapes(self) -> list[str]:
-        """Give the labels in order, lattices last."""
-        return list(dict.fromkeys(one.shape for one in self.statics))
-
-    def rate(self, path: str) -> tuple[float, float]:
-        """Give the power of the number of points along an edge by which a lattice's largest jump falls, and its error.
-
-        NaN for fewer than three lattices, and where one of them does not jump or only a single point touches.
-
-        Args:
-            path: key of the path.
-        """
-        lattices = [one for one in self.statics if one.is_lattice and one.path == path]
-        # Nothing is refined where a single point touches; without a jump there is no logarithm.
-        if len(lattices) < 3 or any(one.worst == 0 or one.contacts.max() < 2 for one in lattices):
-            return np.nan, np.nan
-        count = np.log([np.sqrt(one.num_rows) for one in lattices])
-        size = np.log([one.worst for one in lattices])
-        centred = count - count.mean()
-        power = centred @ size / (centred @ centred)
-        rest = size - size.mean() - power * centred
-        return -float(power), float(np.sqrt(rest @ rest / (len(rest) - 2) / (centred @ centred)))
+    def by_shape(self) -> dict[str, list[Static]]:
+        """Give each shape's measurements by its label, in the order of the paths."""
+        labels = dict.fromkeys(one.shape for one in self.statics)
+        return {label: [one for one in self.statics if one.shape == label] for label in labels}
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per body and path, for metrics.csv."""
@@ -210,15 +146,15 @@ class Outcome:
                 "shape": one.shape,
                 "path": one.path,
                 "rows": one.num_rows,
-                "num_jumps": len(one.plain.places),
-                "largest_jump": largest(one.plain),
-                "largest_jump_over_force": one.worst,
-                "gentle_jump_over_force": one.geometric,
-                "place_of_largest": _place(one.plain),
-                "share_of_variation": one.plain.share,
-                "smoothed_jump_over_force": np.nan if one.smoothed is None else worst(one.smoothed),
-                "c_mujoco_jump_over_force": worst(one.c_mujoco),
-                "c_mujoco_num_jumps": len(one.c_mujoco.places),
+                "num_jumps": len(one.jumps[PLAIN].places),
+                "largest_jump": largest(one.jumps[PLAIN]),
+                "largest_jump_over_force": one.worst(PLAIN),
+                "gentle_jump_over_force": one.worst(GENTLE),
+                "place_of_largest": at_largest(one.jumps[PLAIN], np.nan),
+                "share_of_variation": one.jumps[PLAIN].share,
+                "smoothed_jump_over_force": np.nan if one.is_lattice else one.worst(SMOOTHED),
+                "c_mujoco_jump_over_force": one.worst(C),
+                "c_mujoco_num_jumps": len(one.jumps[C].places),
                 "most_contacts": int(one.contacts.max()),
                 "most_copies": int(one.copies.max()),
             }
@@ -236,5 +172,6 @@ def largest(jumps: Jumps) -> float:
     return float(jumps.sizes.max(initial=0.0))
 
 
-def _place(jumps: Jumps) -> float:
-    return float(jumps.places[jumps.largest]) if len(jumps.places) else np.nan
+def at_largest(jumps: Jumps, otherwise: float) -> float:
+    """Give where the largest jump is."""
+    return float(jumps.places[jumps.largest]) if len(jumps.places) else otherwise

@@ -1,68 +1,71 @@
-"""What gradients say across jumps: short pushes from starts under noise."""
+"""What gradients say across jumps: short pushes from starts under noise, and a peg dropped into a hole."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy.stats import norm
 
 import mjxgrad as mg
-from experiments.artificial_discontinuity.outcome import Slopes
-from experiments.artificial_discontinuity.paths import PATHS
+from experiments.artificial_discontinuity.outcome import Mating, Slopes, at_largest
 from experiments.artificial_discontinuity.settings import Settings
-from experiments.artificial_discontinuity.shapes import Shape
+from experiments.artificial_discontinuity.shapes import PATHS, Shape
 from experiments.parallel import in_threads
+from experiments.workspace import Workspace
 from mjxgrad.diagnostics import jumps_along
 
 _NUM_STEPS = 15  # of 2 ms: the body is still in contact, or has just left it
 # Of the outcome's largest jump near the start; smaller ones are teeth of the time step.
 _SMALLEST = 1e-3
 
+# A peg and a hole, whose contact is told by boxes, by points on the peg alone, or by points on both.
+TILT = 0.1  # rad
+_HOLE, _PEG, _LENGTH = 0.022, 0.019, 0.04  # m, half widths and half length of the peg
+_POINT = 0.003  # m
+_BELOW = 0.02  # m, how deep the peg's end is where the force is read
+_ABOVE = 0.002  # m, how high above the hole it is let go
+OFFSETS = (0.0, 0.016)  # m
+_NUM_DROPPED = 100  # of 2 ms
+_SMALLEST_DEPTH = 0.02  # of the depth; smaller jumps are teeth of the time step
+
+_HOLE_AND_PEG = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
+<default><geom condim="1" mass="0"/><default class="hole"><geom contype="1" conaffinity="0"/></default>
+<default class="rim"><geom contype="2" conaffinity="0" size="{point}"/></default>
+<default class="peg"><geom contype="0" conaffinity="{peg}"/></default>
+<default class="point"><geom contype="0" conaffinity="1" size="{point}"/></default></default>
+<worldbody><geom class="hole" type="box" size=".05 .02 .05" pos="{left} 0 -.05"/>
+<geom class="hole" type="box" size=".05 .02 .05" pos="{right} 0 -.05"/>
+{rim}<body><joint type="slide" axis="1 0 0" damping=".5"/><joint type="slide" axis="0 0 1" damping=".5"/>
+<joint type="hinge" axis="0 1 0" damping="1e-4"/><inertial pos="0 0 0" mass=".1" diaginertia="1e-4 1e-4 1e-4"/>
+<geom class="peg" type="box" size="{width} .01 {length}"/>{points}</body></worldbody></mujoco>"""
+
 # From starts and the name of a gradient to outcomes and derivatives.
-Simulate = Callable[[np.ndarray, str], tuple[np.ndarray, np.ndarray]]
+Simulate = Callable[[np.ndarray, str], tuple[Any, Any]]
 
 
 def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index: int) -> list[Slopes]:
-    """Let a body go where the box's force jumps, and estimate how high it is pushed, by where it was.
-
-    Args:
-        settings: of the run.
-        body: which.
-        places: mean start on each path.
-        index: of the body, for its random numbers.
-
-    Returns:
-        One result per path.
-    """
+    """Let a body go on each path from a mean start, and estimate how high it is pushed, by where it was."""
     found = []
     for number, (name, place) in enumerate(places.items()):
         path = PATHS[name]
 
-        def simulate(starts: np.ndarray, gradient: str, path=path) -> tuple[np.ndarray, np.ndarray]:
+        def simulate(starts: np.ndarray, gradient: str, path=path) -> tuple[Array, Array]:
             # Poses come from SciPy, so that their derivative along the path is a difference; they are smooth.
             little = 1e-6 * path.length
             at, ahead, behind = (path.poses(body, settings.depth, starts + s * little) for s in (0, 1, -1))
-            tangents = (ahead - behind) / (2 * little)
-            values = _pushed(body.scene, jnp.asarray(at), jnp.asarray(tangents), gradient)
-            return np.asarray(values[0]), np.asarray(values[1])
+            return _ends(body.scene, jnp.asarray(at), (ahead - behind) / (2 * little), gradient, _NUM_STEPS, 2)
 
-        stddev = settings.stddev * path.length
         rng = np.random.default_rng([settings.seed, index, number])
-        found.append(slopes_at(settings, body.label, name, simulate, place, stddev, rng))
+        found.append(slopes_at(settings, body.label, name, simulate, place, settings.stddev * path.length, rng))
     return found
 
 
 def slopes_at(
-    settings: Settings,
-    label: str,
-    path: str,
-    simulate: Simulate,
-    place: float,
-    stddev: float,
-    rng: np.random.Generator,
+    settings: Settings, label: str, path: str, simulate: Simulate, place: float, stddev: float, rng: np.random.Generator
 ) -> Slopes:
     """Estimate a slope under noise on the start by first and zeroth order, with a reference.
 
@@ -74,9 +77,6 @@ def slopes_at(
         place: mean start.
         stddev: of the noise, in the start's unit.
         rng: of the samples.
-
-    Returns:
-        Estimates, reference, and what the outcome's jumps under the noise add up to.
     """
     sizes = settings.sizes
     noise = rng.normal(size=sizes.num_samples)
@@ -84,8 +84,8 @@ def slopes_at(
     shape = (sizes.num_repeats, sizes.num_strata)
     strata = norm.ppf((np.arange(sizes.num_strata) + rng.uniform(size=shape)) / sizes.num_strata)
     every = np.concatenate([noise, strata.ravel()])
-    gradients = ("discrete", "event")
-    (values, discrete), (_, event) = in_threads(lambda name: simulate(place + stddev * every, name), gradients)
+    found = in_threads(lambda name: simulate(place + stddev * every, name), ("discrete", "event"))
+    (values, discrete), (_, event) = ([np.asarray(each) for each in both] for both in found)
     own, repeats = values[: sizes.num_samples], values[sizes.num_samples :].reshape(shape)
     # Less the mean of the others, which keeps it unbiased.
     baseline = (own.sum() - own) / (len(own) - 1)
@@ -93,10 +93,9 @@ def slopes_at(
     # Each repeat less the mean of the other repeats, for the same reason.
     others = (repeats.mean(axis=1).sum() - repeats.mean(axis=1)) / (len(repeats) - 1)
     references = ((repeats - others[:, None]) * strata / stddev).mean(axis=1)
-    reach = 3 * stddev
     jumps = jumps_along(
         lambda starts: simulate(starts, "discrete")[0],
-        (place - reach, place + reach),
+        (place - 3 * stddev, place + 3 * stddev),
         num_points=sizes.num_rollouts,
         num_refinements=2,
         smallest=_SMALLEST,
@@ -117,14 +116,83 @@ def slopes_at(
     )
 
 
+def matings(settings: Settings, workspace: Workspace) -> list[Mating]:
+    """Hold the peg in the hole, and drop it beside it."""
+    scenes = {label: mg.load_scene(_mjcf(label)) for label in settings.sizes.geometries}
+    for label, scene in scenes.items():
+        workspace.check(scene, name=f"mating, {label}")
+
+    jobs = [
+        (label, scene, np.random.default_rng([settings.seed, 100 + i]))
+        for i, (label, scene) in enumerate(scenes.items())
+    ]
+    with workspace.stage("mating", "geometries", len(scenes)) as advance_to:
+        return in_threads(lambda job: _mate(settings, *job), jobs, advance_to)
+
+
+def _mjcf(label: str) -> str:
+    """Write a scene: points of either part meet the box of the other one, and boxes meet where there are no points."""
+    points = [(s * (_PEG - _POINT), t * (_LENGTH - _POINT)) for s in (-1, 1) for t in (-1, 1)]
+    rim = [(s * (_HOLE + _POINT), -_POINT) for s in (-1, 1)]
+    has_points, has_rim = label != "boxes", label == "points on both"
+    return _HOLE_AND_PEG.format(
+        peg=2 if has_points else 1,
+        point=_POINT,
+        left=-_HOLE - 0.05,
+        right=_HOLE + 0.05,
+        width=_PEG,
+        length=_LENGTH,
+        points="".join(f'<geom class="point" pos="{x} 0 {z}"/>' for x, z in points) if has_points else "",
+        rim="".join(f'<geom class="rim" pos="{x} 0 {z}"/>' for x, z in rim) if has_rim else "",
+    )
+
+
+def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
+    def simulate(offsets: np.ndarray, gradient: str) -> tuple[Array, Array]:
+        height, slope = _ends(scene, _tilted(offsets, _ABOVE), np.eye(3)[0], gradient, _NUM_DROPPED, 1)
+        return _LENGTH - height, -slope
+
+    depth = jumps_along(
+        lambda offsets: simulate(offsets, "discrete")[0],
+        OFFSETS,
+        num_points=settings.sizes.num_rollouts,
+        num_refinements=2,
+        smallest=_SMALLEST_DEPTH,
+    )
+    return Mating(
+        label=label,
+        force=jumps_along(
+            lambda at: _forces(scene, _tilted(at, -_BELOW)), OFFSETS, num_points=settings.sizes.num_points
+        ),
+        depth=depth,
+        slopes=slopes_at(
+            settings, label, "offset", simulate,
+            at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0]), rng,
+        ),
+    )  # fmt: skip
+
+
+def _tilted(offsets: Float[np.ndarray, " offsets"], end: float) -> Float[Array, "offsets 3"]:
+    """Place the tilted peg so that its lower end is at a height."""
+    still = np.zeros_like(offsets)
+    return jnp.stack([offsets, still + end + _LENGTH * np.cos(TILT), still + TILT], axis=1)
+
+
 @eqx.filter_jit
-def _pushed(
-    scene: mg.Scene, poses: Float[Array, "starts 7"], tangents: Float[Array, "starts 7"], gradient: str
+def _forces(scene: mg.Scene, poses: Float[Array, "offsets 3"]) -> Float[Array, "offsets 3"]:
+    force = jax.vmap(lambda pose: mg.forward(scene.model, scene.data.replace(qpos=pose)).qfrc_constraint)(poses)
+    return force / np.array([1.0, 1.0, _LENGTH])
+
+
+@eqx.filter_jit
+def _ends(
+    scene: mg.Scene, poses: Float[Array, "starts nq"], tangents: ArrayLike, gradient: str, horizon: int, index: int
 ) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
-    """Return how high the body is in the end (m), and the derivative along the tangents."""
+    """Return a position (m) after some steps from each pose, and the derivative along the tangents."""
 
-    def outcome(pose: Float[Array, " 7"]) -> Float[Array, ""]:
+    def outcome(pose: Float[Array, " nq"]) -> Float[Array, ""]:
         state = mg.initial_state(scene, pose)
-        return mg.rollout(scene, state, horizon=_NUM_STEPS, gradient=gradient).final.qpos[2]  # pyright: ignore[reportArgumentType]
+        return mg.rollout(scene, state, horizon=horizon, gradient=gradient).final.qpos[index]  # pyright: ignore[reportArgumentType]
 
-    return jax.vmap(lambda pose, tangent: jax.jvp(outcome, (pose,), (tangent,)))(poses, tangents)
+    every = jnp.broadcast_to(tangents, poses.shape)
+    return jax.vmap(lambda pose, tangent: jax.jvp(outcome, (pose,), (tangent,)))(poses, every)

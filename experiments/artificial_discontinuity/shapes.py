@@ -1,10 +1,11 @@
-"""Bodies of about the same extent, built of different geoms, over a fixed cube."""
+"""Bodies of about the same extent, built of different geoms, and one-parameter paths of them over a fixed cube."""
 
 import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 import mjxgrad as mg
 
@@ -41,22 +42,21 @@ class Shape:
     radius: float
     is_lattice: bool = False
 
-    @property
-    def num_rows(self) -> int:
-        """Constraint rows of a step, the measure of its cost."""
-        return self.scene.data._impl.efc_J.shape[0]
 
+def shape(name: str | int) -> Shape:
+    """Build a body of 0.2 m by its name in the settings; a number stands for a lattice of so many points along an edge.
 
-def shape(name: str) -> Shape:
-    """Build a body.
-
-    Args:
-        name: as in the settings.
-
-    Returns:
-        The body, 0.2 m in extent.
+    A lattice stands for a pressure field: the force is the sum of what its points carry, each in proportion to its depth and
+    with its share of the stiffness.
     """
     inner = _CORNERS * (HALF - _BALL) / HALF
+    if isinstance(name, int):
+        count, points = name**2, _grid(name, _POINT)
+        impedance = max(_LATTICE_IMPEDANCE / count, _LEAST_IMPEDANCE)
+        contact = (
+            f'solref="{-_STIFFNESS / count} {-_DAMPING / count}" solimp="{impedance} {impedance} .001" priority="1"'
+        )
+        return Shape(f"{name} × {name} points", _balls(points, _POINT, contact), points, _POINT, is_lattice=True)
     if name == "box":
         return Shape("box", _scene('<geom type="box" size=".1 .1 .1"/>'), _CORNERS, 0.0)
     if name == "mesh":
@@ -68,30 +68,10 @@ def shape(name: str) -> Shape:
         ends = [(*a, *b) for a, b in zip(low, np.roll(low, -1, axis=0), strict=True)]
         geoms = [f'<geom type="capsule" size="{_BALL}" fromto="{" ".join(f"{x:g}" for x in one)}"/>' for one in ends]
         return Shape("4 capsules", _scene("".join(geoms)), inner, _BALL)
-    if name == "balls":
-        return Shape("8 balls at corners", _scene("".join(_ball(at, _BALL) for at in inner)), inner, _BALL)
     if name == "ball":
-        return Shape("one ball", _scene(_ball(np.zeros(3), HALF)), np.zeros((1, 3)), HALF)
-    return Shape("4 × 4 balls", _scene("".join(_ball(at, _BALL) for at in _grid(4, _BALL))), _grid(4, _BALL), _BALL)
-
-
-def lattice(num_along_edge: int) -> Shape:
-    """Build a body that touches by points on its lower face, each with its share of the stiffness.
-
-    It stands for a pressure field: the force is the sum of what its points carry, each in proportion to its depth.
-
-    Args:
-        num_along_edge: points along an edge.
-
-    Returns:
-        The body.
-    """
-    count = num_along_edge**2
-    impedance = max(_LATTICE_IMPEDANCE / count, _LEAST_IMPEDANCE)
-    contact = f'solref="{-_STIFFNESS / count} {-_DAMPING / count}" solimp="{impedance} {impedance} .001" priority="1"'
-    points = _grid(num_along_edge, _POINT)
-    scene = _scene("".join(_ball(at, _POINT, contact) for at in points))
-    return Shape(f"{num_along_edge} × {num_along_edge} points", scene, points, _POINT, is_lattice=True)
+        return Shape("one ball", _balls(np.zeros((1, 3)), HALF), np.zeros((1, 3)), HALF)
+    label, at = ("8 balls at corners", inner) if name == "balls" else ("4 × 4 balls", _grid(4, _BALL))
+    return Shape(label, _balls(at, _BALL), at, _BALL)
 
 
 def _grid(num_along_edge: int, radius: float) -> Float[np.ndarray, "points 3"]:
@@ -100,9 +80,64 @@ def _grid(num_along_edge: int, radius: float) -> Float[np.ndarray, "points 3"]:
     return np.array([(x, y, radius - HALF) for x in middles for y in middles])
 
 
-def _ball(at: np.ndarray, radius: float, contact: str = "") -> str:
-    return f'<geom size="{radius}" pos="{at[0]:.10g} {at[1]:.10g} {at[2]:.10g}" {contact}/>'
+def _balls(places: np.ndarray, radius: float, contact: str = "") -> mg.Scene:
+    return _scene("".join(f'<geom size="{radius}" pos="{x:.10g} {y:.10g} {z:.10g}" {contact}/>' for x, y, z in places))
 
 
 def _scene(geoms: str, asset: str = "") -> mg.Scene:
     return mg.load_scene(_SCENE.format(geoms=geoms, asset=asset))
+
+
+# Off the planes of symmetry, where several things would happen at once.
+_ASIDE = 0.013  # m
+# One corner down: turned about the diagonal's horizontal normal until the diagonal is vertical.
+_ON_CORNER = Rotation.align_vectors([[0.0, 0.0, -1.0]], [[-1.0, -1.0, -1.0] / np.sqrt(3.0)])[0]
+
+
+@dataclass(frozen=True)
+class Path:
+    """How a body is moved: along x, or turned about an axis.
+
+    Attributes:
+        title: for figures and tables.
+        interval: of the parameter, in m or rad.
+        axis: about which it is turned; None where it slides.
+        x: where it is turned (m).
+        start: its orientation at parameter zero.
+    """
+
+    title: str
+    interval: tuple[float, float]
+    axis: tuple[float, float, float] | None = None
+    x: float = 0.0
+    start: Rotation = Rotation.identity()  # noqa: RUF009
+
+    @property
+    def unit(self) -> str:
+        """Of the parameter."""
+        return "rad" if self.axis else "m"
+
+    @property
+    def length(self) -> float:
+        """Of the interval."""
+        return self.interval[1] - self.interval[0]
+
+    def poses(
+        self, shape: Shape, depth: float, parameters: Float[np.ndarray, " points"]
+    ) -> Float[np.ndarray, "points 7"]:
+        """Give positions and quaternions; the centre's height is that at which the lowest point is as deep at parameter zero."""
+        still = np.zeros_like(parameters)
+        turns = np.multiply.outer(parameters if self.axis else still, self.axis or (0.0, 0.0, 1.0))
+        reach = shape.radius - self.start.apply(shape.hull)[:, 2].min()
+        x = still + self.x if self.axis else parameters
+        places = np.stack([x, still + _ASIDE, still + HALF + reach - depth], axis=1)
+        return np.concatenate([places, (Rotation.from_rotvec(turns) * self.start).as_quat(scalar_first=True)], axis=1)
+
+
+PATHS = {
+    "slide": Path("slide past the edge", (0.0, 0.21)),
+    "askew": Path("slide askew", (0.0, 0.25), start=Rotation.from_euler("z", 0.4)),
+    "roll": Path("roll", (-0.12, 0.12), (0.0, 1.0, 0.0), 0.03),
+    "yaw": Path("yaw", (0.0, np.pi / 2), (0.0, 0.0, 1.0), 0.05),
+    "corner": Path("corner past the edge", (0.0, 0.11), start=_ON_CORNER),
+}

@@ -3,6 +3,8 @@
 import functools
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import mjxgrad as mg
-from experiments.cube_toss.outcome import Course, Outcome, Point
 from experiments.cube_toss.settings import Settings
 from experiments.cube_toss.throw import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 from experiments.failure import ExperimentError
+from experiments.motion import advance, at_time_step
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import data_of
@@ -22,12 +24,98 @@ from mjxgrad.dynamics import Gradient, assembly
 from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration import adaptive_rollout
 
+# Throws at slightly different speed, over which the error is taken, for single derivatives depend on chance (m/s).
+_SPEEDS = PUBLISHED_SPEED + 0.005 * (np.arange(4) / 4 - 0.5)
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10
-_REPEATS = 1
+_NUM_SUBSTEPS = 8
 
-Program = Callable[..., Float[Array, " throws"]]
-_STATE = ("qpos", "qvel", "time", "qacc_warmstart")
+# From a throw, its speed and a time step or tolerance to a derivative, the number of steps, and whether it failed.
+Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]
+METHODS = {
+    "discrete": "discrete",
+    "event": "event",
+    "continuous": "contact that begins within the step",
+    "substeps": "event, short steps at events",
+    "adaptive": "adaptive, differentiated",
+    "quotient": "adaptive, difference quotient",
+}
+CONTACTS = {"published": "contact whose force begins continuously", "default": "MuJoCo's default contact"}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method, a key of `METHODS`, at one setting, a time step in s or a tolerance.
+
+    Attributes:
+        derivative: of each throw, in m per m/s.
+        seconds: processor time of one derivative, compiled.
+        first_seconds: wall time of the first call, which compiles unless an earlier setting did.
+        num_steps: of one derivative.
+        has_failed: whether the integration gave up.
+    """
+
+    method: str
+    setting: float
+    derivative: Float[np.ndarray, " throws"]
+    seconds: float
+    first_seconds: float
+    num_steps: float
+    has_failed: bool
+
+
+@dataclass(frozen=True)
+class Course:
+    """All methods with one contact, a key of `CONTACTS`; errors are shares of the derivative, whose reference is by throw."""
+
+    contact: str
+    reference: Float[np.ndarray, " throws"]
+    points: tuple[Point, ...]
+
+    @property
+    def scale(self) -> float:
+        """Give the size of the derivative."""
+        return float(np.abs(self.reference).mean())
+
+    def of(self, method: str) -> list[Point]:
+        """Give the points of a method, from accurate to coarse."""
+        return sorted((point for point in self.points if point.method == method), key=lambda point: point.setting)
+
+    def errors(self, point: Point) -> Float[np.ndarray, " throws"]:
+        """Give the error of every throw."""
+        return (point.derivative - self.reference) / self.scale
+
+    def error(self, point: Point) -> float:
+        """Give the root-mean-square error over the throws; infinite if it failed."""
+        share = float(np.sqrt(np.mean(self.errors(point) ** 2)))
+        return share if np.isfinite(share) and not point.has_failed else np.inf
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All numbers, one course per contact."""
+
+    courses: tuple[Course, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give the rows of metrics.csv."""
+        return [
+            {
+                "contact": course.contact,
+                "method": point.method,
+                "setting": point.setting,
+                "derivative": float(point.derivative.mean()),
+                "reference": float(course.reference.mean()),
+                "relative_error": course.error(point),
+                "relative_bias": float(course.errors(point).mean()),
+                "processor_seconds": point.seconds,
+                "first_call_seconds": point.first_seconds,
+                "num_steps": point.num_steps,
+                "has_failed": point.has_failed,
+            }
+            for course in self.courses
+            for point in course.points
+        ]
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -39,125 +127,78 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     for timestep in (*settings.timesteps, *settings.refined_timesteps):
         if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
             raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
-    speeds = PUBLISHED_SPEED + settings.interval * (jnp.arange(settings.num_throws) / settings.num_throws - 0.5)
-    jobs = _jobs(settings)
+    jobs = [(name, h) for name in ("discrete", "event", "continuous") for h in settings.timesteps]
+    jobs += [("substeps", h) for h in settings.refined_timesteps]
+    jobs += [(name, tolerance) for name in ("adaptive", "quotient") for tolerance in settings.tolerances]
     courses = []
     with workspace.stage("derivatives", "points", len(settings.contacts) * (1 + len(jobs))) as advance_to:
-        programs = _programs(settings)
         for contact in settings.contacts:
             task = cube_toss(contact)
             workspace.check(task.scene)
-            reference, _, failed = programs["reference"](task, speeds, jnp.asarray(_TOLERANCE))
+            reference, _, failed = _taken(_DERIVATIVES["quotient"], task, jnp.asarray(_TOLERANCE))
             if bool(np.any(failed)):
                 raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")
             points = []
             for name, setting in jobs:
-                points.append(_point(programs, name, task, setting, speeds, np.asarray(reference)))
+                points.append(_point(name, task, setting))
                 advance_to(len(courses) * (1 + len(jobs)) + 1 + len(points))
-            courses.append(Course(contact, np.asarray(speeds), np.asarray(reference), tuple(points)))
-    return Outcome(settings, tuple(courses))
+            courses.append(Course(contact, np.asarray(reference), tuple(points)))
+    return Outcome(tuple(courses))
 
 
-def _jobs(settings: Settings) -> list[tuple[str, float]]:
-    fixed = [(name, h) for name in ("discrete", "event", "continuous") for h in settings.timesteps]
-    refined = [("substeps", h) for h in settings.refined_timesteps]
-    adaptive = [(name, tol) for name in ("adaptive", "quotient") for tol in settings.tolerances]
-    return fixed + refined + adaptive
-
-
-def _point(
-    programs: dict[str, Program], name: str, task: CubeToss, setting: float, speeds: Array, reference: np.ndarray
-) -> Point:
+def _point(name: str, task: CubeToss, setting: float) -> Point:
     def call():
-        return jax.block_until_ready(programs[name](task, speeds, jnp.asarray(setting)))
+        return jax.block_until_ready(_taken(_DERIVATIVES[name], task, jnp.asarray(setting)))
 
     started = time.perf_counter()
     derivative, num_steps, failed = call()
     first = time.perf_counter() - started
     # Processor time: what else runs on the machine does not count.
-    spent = []
-    for _ in range(_REPEATS):
-        begun = time.process_time()
-        call()
-        spent.append(time.process_time() - begun)
+    begun = time.process_time()
+    call()
+    spent = time.process_time() - begun
     return Point(
         method=name,
         setting=setting,
         derivative=np.asarray(derivative),
-        error=np.asarray(derivative) - reference,
-        seconds=float(np.median(spent)) / len(speeds),
+        seconds=spent / len(_SPEEDS),
         first_seconds=first,
         num_steps=float(np.mean(num_steps)),
         has_failed=bool(np.any(failed)),
     )
 
 
-def _programs(settings: Settings) -> dict[str, Program]:
-    """One program per method, whatever the contact and the time step; each takes the throws one after the other."""
-
-    def fixed(gradient: str, onset: mg.Onset | None = None):
-        def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-            return mg.step(model, data, gradient=gradient, onset=onset)  # pyright: ignore[reportArgumentType]
-
-        return _marching(step)
-
-    def short(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        return substepped_step(model, data, num_substeps=settings.num_substeps, gradient="event")
-
-    return {
-        "discrete": fixed("discrete"),
-        "event": fixed("event"),
-        "continuous": fixed("discrete", mg.Onset()),
-        "substeps": _marching(short),
-        "adaptive": _one_by_one(_adaptive_derivative),
-        "quotient": _one_by_one(_adaptive_quotient),
-        "reference": _one_by_one(_adaptive_quotient),
-    }
+@eqx.filter_jit
+def _taken(derivative: Derivative, task: CubeToss, setting: Array):
+    """Take the throws one after the other; one program per method, whatever the contact and the time step."""
+    return jax.lax.map(lambda speed: derivative(task, speed, setting), jnp.asarray(_SPEEDS))
 
 
-def _one_by_one(derivative: Callable) -> Program:
-    @eqx.filter_jit
-    def program(task: CubeToss, speeds: Array, setting: Array):
-        return jax.lax.map(lambda speed: derivative(task, speed, setting), speeds)
-
-    return program
-
-
-def _marching(step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Program:
+def _by_steps(
+    step: Callable[[mjx.Model, mjx.Data], mjx.Data], task: CubeToss, speed: Array, timestep: Array
+) -> tuple[Array, Array, Array]:
     """Forward mode through steps whose length and number are traced."""
+    model = at_time_step(task.scene.model, timestep)
 
-    def derivative(task: CubeToss, speed: Array, timestep: Array):
-        end = functools.partial(_end, task, timestep=timestep, step=step)
-        return jax.jvp(end, (speed,), (jnp.ones_like(speed),))[1], DURATION / timestep, jnp.zeros((), bool)
+    def end(speed: Array) -> Array:
+        start = data_of(task.scene, task.start(speed), task.scene.data.ctrl)
+        count = jnp.round(DURATION / timestep).astype(int)
+        return task.outcome(advance(functools.partial(step, model), start, count).qpos)
 
-    return _one_by_one(derivative)
-
-
-def _end(task: CubeToss, speed: Array, timestep: Array, step: Callable) -> Array:
-    scene = task.scene
-    start = data_of(scene, task.start(speed), scene.data.ctrl)
-    count = jnp.round(DURATION / timestep).astype(int)
-    model = scene.model.tree_replace({"opt.timestep": timestep})
-
-    def advance(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        moved = step(model, start.replace(**dict(zip(_STATE, state, strict=True))))
-        return tuple(getattr(moved, name) for name in _STATE)
-
-    final = jax.lax.fori_loop(0, count, advance, tuple(getattr(start, name) for name in _STATE))
-    return task.outcome(final[0])
+    return jax.jvp(end, (speed,), (jnp.ones_like(speed),))[1], DURATION / timestep, jnp.zeros((), bool)
 
 
-def _adaptive_end(task: CubeToss, speed: Array, tolerance: Array):
+def _adaptive_end(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, tuple[Array, Array]]:
     found = adaptive_rollout(task.scene, task.start(speed), jnp.array([DURATION]), tolerance=tolerance, max_steps=2**16)
     return task.outcome(found.qpos[-1]), (found.num_steps, found.has_failed)
 
 
-def _adaptive_derivative(task: CubeToss, speed: Array, tolerance: Array):
+def _adaptive(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Array, Array]:
     derivative, (num_steps, failed) = jax.grad(_adaptive_end, argnums=1, has_aux=True)(task, speed, tolerance)
     return derivative, num_steps.astype(float), failed
 
 
-def _adaptive_quotient(task: CubeToss, speed: Array, tolerance: Array):
+def _quotient(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Array, Array]:
     ends, (num_steps, failed) = jax.lax.map(
         lambda at: _adaptive_end(task, at, tolerance), jnp.stack([speed - _STEP, speed + _STEP])
     )
@@ -170,19 +211,11 @@ def substepped_step(
     """Advance by one time step, in short steps if a contact or limit begins or ends in it.
 
     A step holds an event if a distance changes its sign, judged by the distances at its beginning and the velocities at its
-    end. Under `jax.vmap` every member takes the short steps in every step and throws them away.
-
-    Args:
-        model: as for `step`.
-        data: the present state.
-        num_substeps: short steps in a step that holds an event.
-        gradient: as for `step`.
-
-    Returns:
-        Data whose state is one time step later. Its other fields are those of the last step taken, long or short.
+    end. Under `jax.vmap` every member takes the short steps in every step and throws them away. Fields that are not of the
+    state are those of the last step taken, long or short.
     """
     after = mg.step(model, data, gradient=gradient)
-    short = model.tree_replace({"opt.timestep": model.opt.timestep / num_substeps})
+    short = at_time_step(model, model.opt.timestep / num_substeps)
 
     def refine(data: mjx.Data) -> mjx.Data:
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
@@ -202,3 +235,15 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
     distance, normal = contacts_of(blocks)
     later = distance + model.opt.timestep * normal @ after.qvel
     return jnp.any((distance < 0) != (later < 0))
+
+
+_DERIVATIVES: dict[str, Derivative] = {
+    "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
+    "event": functools.partial(_by_steps, functools.partial(mg.step, gradient="event")),
+    "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),
+    "substeps": functools.partial(
+        _by_steps, functools.partial(substepped_step, num_substeps=_NUM_SUBSTEPS, gradient="event")
+    ),
+    "adaptive": _adaptive,
+    "quotient": _quotient,
+}

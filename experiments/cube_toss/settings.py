@@ -18,11 +18,3 @@ class Settings(RunSettings):
     """For short steps at events, in s."""
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
     """Of the adaptive integration."""
-    num_substeps: Annotated[int, Field(ge=2)] = 8
-    """In a step that holds an event."""
-    num_throws: Annotated[int, Field(ge=3)] = 4
-    """Throws at slightly different speed, over which the error is taken; single derivatives depend on chance."""
-    interval: Positive = 0.005
-    """That the speeds of these throws span, in m/s."""
-    target_error: Positive = 0.02
-    """Share of the derivative that the verdict asks for."""

@@ -1,7 +1,6 @@
 """Two motions under a policy whose few parameters are noisy: smooth and chaotic, and with contact."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,33 +8,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 import mjxgrad as mg
+from experiments.motion import advance
+from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State, data_of, state_of
 from mjxgrad.tasks import scene_path
 from mjxgrad.tasks.hopper import hopper
 
 _START_ANGLES = (2.4, 0.5)  # rad from hanging: high enough that the elbow turns over
-# By the name of a derivative, how the steps are taken.
-_HOW: dict[str, dict[str, Any]] = {
-    "discrete": {"gradient": "discrete"},
-    "event": {"gradient": "event"},
-    "onset": {"onset": mg.Onset()},
-}
 
 
 class Problem(eqx.Module):
     """A motion in segments of some steps each, with a cost at the end of every segment.
 
     Attributes:
-        scene: what moves.
-        start: where it begins.
         control: from parameters and a state to controls.
         cost: from positions and velocities to a number, in m.
         observe: likewise to what a value function is fitted on.
         params: the policy's, without noise.
         stddev: of the noise on each of them.
-        title: for figures and tables.
         gradients: of the steps that differ; "onset" is the derivative of a motion whose contacts begin within the step.
-        steps_per_time: steps of a segment.
+        num_times: segments of the longest horizon.
     """
 
     scene: mg.Scene
@@ -47,6 +39,7 @@ class Problem(eqx.Module):
     stddev: float = eqx.field(static=True)
     title: str = eqx.field(static=True)
     gradients: tuple[str, ...] = eqx.field(static=True)
+    num_times: int = eqx.field(static=True)
     steps_per_time: int = eqx.field(static=True)
 
     @property
@@ -54,49 +47,39 @@ class Problem(eqx.Module):
         """Time from one cost to the next (s)."""
         return float(self.scene.model.opt.timestep) * self.steps_per_time
 
-    def segment(self, params: Float[Array, " dim"], state: State, gradient: str) -> State:
-        """Move on by one segment."""
+    def states(self, params: Float[Array, " dim"], window: Int[Array, ""], gradient: str) -> Float[Array, "times n"]:
+        """Give the states at the end of each segment; the derivative forgets where it came from after a window of segments."""
 
-        def step(state: State, _: None) -> tuple[State, None]:
-            data = data_of(self.scene, state, self.control(params, state))
-            return state_of(mg.step(self.scene.model, data, **_HOW[gradient])), None
-
-        return jax.lax.scan(step, state, length=self.steps_per_time)[0]
-
-    def states(
-        self, params: Float[Array, " dim"], window: Int[Array, ""], num_times: int, gradient: str
-    ) -> Float[Array, "times n"]:
-        """Give the states at the end of each segment.
-
-        Args:
-            params: of the policy, noise included.
-            window: segments after which the derivative forgets where it came from; larger than the number of segments
-                for never.
-            num_times: segments.
-            gradient: of the steps.
-        """
-
-        def advance(state: State, index: Array) -> tuple[State, Array]:
+        def next_one(state: State, index: Array) -> tuple[State, Array]:
             is_cut = index % window == 0
             state = jax.tree.map(lambda x: jnp.where(is_cut, jax.lax.stop_gradient(x), x), state)
-            state = self.segment(params, state, gradient)
+            state = self._segment(params, state, gradient)
             return state, vector(state)
 
-        return jax.lax.scan(advance, self.start, jnp.arange(num_times))[1]
+        return jax.lax.scan(next_one, self.start, jnp.arange(self.num_times))[1]
 
-    def jacobians(self, params: Float[Array, " dim"], num_times: int, gradient: str) -> Float[Array, "times n n"]:
+    def jacobians(self, params: Float[Array, " dim"], gradient: str) -> Float[Array, "times n n"]:
         """Give the derivative of each segment's end by its beginning, the policy's share included."""
 
-        def advance(state: State, _: None) -> tuple[State, Array]:
+        def next_one(state: State, _: None) -> tuple[State, Array]:
             def end(x: Float[Array, " n"]) -> tuple[Array, State]:
                 qpos, qvel = jnp.split(x, [state.qpos.shape[0]])
-                moved = self.segment(params, eqx.tree_at(lambda s: (s.qpos, s.qvel), state, (qpos, qvel)), gradient)
+                moved = self._segment(params, eqx.tree_at(lambda s: (s.qpos, s.qvel), state, (qpos, qvel)), gradient)
                 return vector(moved), moved
 
             jacobian, moved = jax.jacfwd(end, has_aux=True)(vector(state))
             return moved, jacobian
 
-        return jax.lax.scan(advance, self.start, length=num_times)[1]
+        return jax.lax.scan(next_one, self.start, length=self.num_times)[1]
+
+    def _segment(self, params: Float[Array, " dim"], state: State, gradient: str) -> State:
+        onset, derivative = (mg.Onset(), "discrete") if gradient == "onset" else (None, gradient)
+
+        def step(data: mjx.Data) -> mjx.Data:
+            data = data.replace(ctrl=self.control(params, state_of(data)))
+            return mg.step(self.scene.model, data, gradient=derivative, onset=onset)  # pyright: ignore[reportArgumentType]
+
+        return state_of(advance(step, data_of(self.scene, state, self.scene.data.ctrl), self.steps_per_time))
 
 
 def vector(state: State) -> Float[Array, " n"]:
@@ -105,15 +88,7 @@ def vector(state: State) -> Float[Array, " n"]:
 
 
 def problem(name: str, num_times: int) -> Problem:
-    """Build a problem.
-
-    Args:
-        name: as in the settings.
-        num_times: segments into which its longest horizon is divided.
-
-    Returns:
-        The problem.
-    """
+    """Build a problem whose longest horizon is divided into segments."""
     return _pendulum(num_times) if name == "double_pendulum" else _hopper(num_times)
 
 
@@ -129,6 +104,7 @@ def _pendulum(num_times: int) -> Problem:
         stddev=0.05,
         title="double pendulum",
         gradients=("discrete",),
+        num_times=num_times,
         steps_per_time=768 // num_times,
     )
 
@@ -160,6 +136,7 @@ def _hopper(num_times: int) -> Problem:
         stddev=0.05,
         title="hopper",
         gradients=("discrete", "event", "onset"),
+        num_times=num_times,
         steps_per_time=288 // num_times,
     )
 

@@ -1,6 +1,6 @@
 """The scenes: where they start, which velocities are uncertain, and what is asked of the end."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import mujoco
@@ -8,7 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.sawtooth.cases import case as landing_case
+from experiments.work_precision.outcome import Cone
 from mjxgrad.tasks import scene_path
+
+CONES: dict[Cone, mujoco.mjtCone] = {
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+}
 
 
 @dataclass(frozen=True)
@@ -16,14 +22,12 @@ class Case:
     """A motion from uncertain starts.
 
     Attributes:
-        title: for headings.
         model: of C MuJoCo, with its own contact, integrator and time step.
         duration: in s.
         moved: the two velocities that are uncertain, by index: the parameters of the gradient.
         stddev: of that uncertainty (m/s or rad/s).
         outcome: what is differentiated, as weights of the final positions, by index.
-        qpos: start positions that differ from the model's, by index.
-        qvel: start velocities that differ from zero, by index.
+        qpos: start positions that differ from the model's, by index; likewise `qvel`, which is zero elsewhere.
         ctrl: constant controls; zero unless given.
     """
 
@@ -40,12 +44,7 @@ class Case:
     @property
     def start(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]:
         """Positions and velocities in the middle of the uncertainty."""
-        qpos, qvel = self.model.qpos0.copy(), np.zeros(self.model.nv)
-        for index, value in self.qpos.items():
-            qpos[index] = value
-        for index, value in self.qvel.items():
-            qvel[index] = value
-        return qpos, qvel
+        return _filled(self.model.qpos0, self.qpos), _filled(np.zeros(self.model.nv), self.qvel)
 
     @property
     def controls(self) -> Float[np.ndarray, " nu"]:
@@ -55,26 +54,32 @@ class Case:
     @property
     def weights(self) -> Float[np.ndarray, " nq"]:
         """Weights of the final positions in the outcome."""
-        weights = np.zeros(self.model.nq)
-        for index, value in self.outcome.items():
-            weights[index] = value
-        return weights
+        return _filled(np.zeros(self.model.nq), self.outcome)
 
     @property
     def directions(self) -> Float[np.ndarray, "2 nv"]:
         """Unit vectors of the uncertain velocities."""
         return np.eye(self.model.nv)[list(self.moved)]
 
+    @property
+    def timestep(self) -> float:
+        """The scene's own, in s."""
+        return self.model.opt.timestep
+
+    @property
+    def cone(self) -> Cone:
+        """The scene's own."""
+        return next(name for name, cone in CONES.items() if cone == self.model.opt.cone)
+
+
+def _filled(base: np.ndarray, values: Mapping[int, float]) -> np.ndarray:
+    filled = base.copy()
+    filled[list(values)] = list(values.values())
+    return filled
+
 
 def case(name: str) -> Case:
-    """Build a motion.
-
-    Args:
-        name: one of `experiments.work_precision.settings.SceneName`.
-
-    Returns:
-        The motion.
-    """
+    """Build a motion by its name in the settings."""
     return _BUILDERS[name]()
 
 
@@ -95,72 +100,18 @@ _PENDULUM = """
 </mujoco>
 """
 
-
-def _pendulum() -> Case:
-    return Case(
-        "Double pendulum, no contact",
-        mujoco.MjModel.from_xml_string(_PENDULUM),
-        duration=0.8,
-        moved=(0, 1),
-        stddev=0.3,
-        outcome={0: 1.0, 1: 0.5},
-        qpos={0: 1.5, 1: 1.0},
-    )
-
-
 _BALL = """
 <mujoco model="ball">
   <option timestep="0.002"/>
   <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1" condim="{condim}" friction="{friction} 0.005 0.0001"/>
+    <geom name="floor" type="plane" size="5 5 0.1" condim="3" friction="{friction} 0.005 0.0001"/>
     <body name="ball" pos="0 0 {height}">
       <freejoint/>
-      <geom name="ball" type="sphere" size="0.05" condim="{condim}" friction="{friction} 0.005 0.0001"/>
+      <geom name="ball" type="sphere" size="0.05" condim="3" friction="{friction} 0.005 0.0001"/>
     </body>
   </worldbody>
 </mujoco>
 """
-
-
-def _bounce() -> Case:
-    """Thrown down obliquely without spin: it bounces once, under the default contact."""
-    return Case(
-        "Bouncing ball, one contact",
-        mujoco.MjModel.from_xml_string(_BALL.format(condim=3, friction=0.5, height=0.15)),
-        duration=0.16,
-        moved=(0, 2),
-        stddev=0.1,
-        outcome={0: 1.0, 2: 1.0},
-        qvel={0: 1.0, 2: -1.5},
-    )
-
-
-def _slide() -> Case:
-    """Slides without spin, askew to the axes of the friction pyramid, until it rolls."""
-    return Case(
-        "Sliding ball, friction",
-        mujoco.MjModel.from_xml_string(_BALL.format(condim=3, friction=0.3, height=0.0499)),
-        duration=0.2,
-        moved=(0, 1),
-        stddev=0.1,
-        outcome={0: 1.0, 1: 1.0},
-        qvel={0: 1.0, 1: 0.4},
-    )
-
-
-def _cube() -> Case:
-    """The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands."""
-    return Case(
-        "Tumbling cube",
-        mujoco.MjModel.from_xml_path(str(scene_path("cube_toss"))),
-        duration=0.3,
-        moved=(1, 2),
-        stddev=0.05,
-        outcome={1: 1.0, 2: 1.0},
-        qpos={2: 0.12},
-        qvel={1: 0.3, 2: -0.5},
-    )
-
 
 _ARM = """
 <mujoco model="arm">
@@ -193,37 +144,29 @@ _ARM = """
 </mujoco>
 """
 
-
-def _arm() -> Case:
-    """Three links under position servos with damping, which a coarse Euler step does not survive; the hand strikes the floor.
-
-    Later the servos hold the arm wherever it came from, and no gradient is left.
-    """
-    return Case(
-        "Servo arm on the floor, articulated",
-        mujoco.MjModel.from_xml_string(_ARM),
-        duration=0.16,
-        moved=(0, 1),
-        stddev=0.3,
-        outcome={0: 1.0, 1: 0.5},
-        qpos={0: 0.1, 1: 0.5, 2: 0.2},
-        ctrl=(0.7, 0.4, 0.0),
-    )
+_HEAP = """
+<mujoco model="heap">
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    {balls}
+  </worldbody>
+</mujoco>
+"""
+_HEAP_BALL = '<body pos="{} {} {}"><freejoint/><geom type="sphere" size="0.05"/></body>'
+# A column that leans, so that each ball rolls off the one below.
+_HEAP_PLACES = ((0.0, 0.0, 0.06), (0.03, 0.01, 0.17), (0.0, 0.03, 0.28), (-0.02, 0.01, 0.39))
 
 
-def _landing(name: str, title: str, duration: float, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
+def _ball(friction: float, height: float) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(_BALL.format(friction=friction, height=height))
+
+
+def _landing(name: str, title: str, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
     """One of gymnasium's bodies landing, as in the experiment on the sawtooth, but thrown down so that it lands sooner."""
     given = landing_case(name)
-    return Case(
-        title,
-        given.model,
-        duration=duration,
-        moved=moved,
-        stddev=0.1,
-        outcome=outcome,
-        qpos=given.qpos,
-        qvel={**given.qvel, given.moved: -1.0},
-    )
+    qvel = {**given.qvel, given.moved: -1.0}
+    return Case(title, given.model, duration=0.24, moved=moved, stddev=0.1, outcome=outcome, qpos=given.qpos, qvel=qvel)
 
 
 def _push() -> Case:
@@ -243,42 +186,70 @@ def _push() -> Case:
     )
 
 
-_HEAP = """
-<mujoco model="heap">
-  <option timestep="0.004"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1"/>
-    {balls}
-  </worldbody>
-</mujoco>
-"""
-_HEAP_BALL = '<body pos="{} {} {}"><freejoint/><geom type="sphere" size="0.05"/></body>'
-# A column that leans, so that each ball rolls off the one below.
-_HEAP_PLACES = ((0.0, 0.0, 0.06), (0.03, 0.01, 0.17), (0.0, 0.03, 0.28), (-0.02, 0.01, 0.39))
-
-
-def _heap() -> Case:
-    balls = "\n    ".join(_HEAP_BALL.format(*place) for place in _HEAP_PLACES)
-    return Case(
+_BUILDERS: dict[str, Callable[[], Case]] = {
+    "pendulum": lambda: Case(
+        "Double pendulum, no contact",
+        mujoco.MjModel.from_xml_string(_PENDULUM),
+        duration=0.8,
+        moved=(0, 1),
+        stddev=0.3,
+        outcome={0: 1.0, 1: 0.5},
+        qpos={0: 1.5, 1: 1.0},
+    ),
+    # Thrown down obliquely without spin: it bounces once, under the default contact.
+    "bounce": lambda: Case(
+        "Bouncing ball, one contact",
+        _ball(friction=0.5, height=0.15),
+        duration=0.16,
+        moved=(0, 2),
+        stddev=0.1,
+        outcome={0: 1.0, 2: 1.0},
+        qvel={0: 1.0, 2: -1.5},
+    ),
+    # Slides without spin, askew to the axes of the friction pyramid, until it rolls.
+    "slide": lambda: Case(
+        "Sliding ball, friction",
+        _ball(friction=0.3, height=0.0499),
+        duration=0.2,
+        moved=(0, 1),
+        stddev=0.1,
+        outcome={0: 1.0, 1: 1.0},
+        qvel={0: 1.0, 1: 0.4},
+    ),
+    # The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands.
+    "cube": lambda: Case(
+        "Tumbling cube",
+        mujoco.MjModel.from_xml_path(str(scene_path("cube_toss"))),
+        duration=0.3,
+        moved=(1, 2),
+        stddev=0.05,
+        outcome={1: 1.0, 2: 1.0},
+        qpos={2: 0.12},
+        qvel={1: 0.3, 2: -0.5},
+    ),
+    # Three links under position servos with damping, which a coarse Euler step does not survive; the hand strikes the floor.
+    # Later the servos hold the arm wherever it came from, and no gradient is left.
+    "arm": lambda: Case(
+        "Servo arm on the floor, articulated",
+        mujoco.MjModel.from_xml_string(_ARM),
+        duration=0.16,
+        moved=(0, 1),
+        stddev=0.3,
+        outcome={0: 1.0, 1: 0.5},
+        qpos={0: 0.1, 1: 0.5, 2: 0.2},
+        ctrl=(0.7, 0.4, 0.0),
+    ),
+    "hopper": lambda: _landing("hopper", "Hopper landing", (0, 1), {0: 1.0, 1: 1.0}),
+    "half_cheetah": lambda: _landing("half_cheetah", "Half cheetah landing", (0, 1), {0: 1.0, 1: 1.0, 2: 0.3}),
+    "push": _push,
+    "heap": lambda: Case(
         "Four falling balls, many bodies",
-        mujoco.MjModel.from_xml_string(_HEAP.format(balls=balls)),
+        mujoco.MjModel.from_xml_string(_HEAP.format(balls="".join(_HEAP_BALL.format(*at) for at in _HEAP_PLACES))),
         duration=0.24,
         moved=(6, 8),
         stddev=0.1,
         outcome={7: 1.0, 9: 1.0, 16: 0.5},
-    )
-
-
-_BUILDERS = {
-    "pendulum": _pendulum,
-    "bounce": _bounce,
-    "slide": _slide,
-    "cube": _cube,
-    "arm": _arm,
-    "hopper": lambda: _landing("hopper", "Hopper landing", 0.24, (0, 1), {0: 1.0, 1: 1.0}),
-    "half_cheetah": lambda: _landing("half_cheetah", "Half cheetah landing", 0.24, (0, 1), {0: 1.0, 1: 1.0, 2: 0.3}),
-    "push": _push,
-    "heap": _heap,
-    "walker2d": lambda: _landing("walker2d", "Walker2d landing", 0.24, (0, 1), {0: 1.0, 1: 1.0}),
-    "ant": lambda: _landing("ant", "Ant landing", 0.24, (0, 2), {0: 1.0, 2: 1.0}),
+    ),
+    "walker2d": lambda: _landing("walker2d", "Walker2d landing", (0, 1), {0: 1.0, 1: 1.0}),
+    "ant": lambda: _landing("ant", "Ant landing", (0, 2), {0: 1.0, 2: 1.0}),
 }

@@ -18,19 +18,20 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.work_precision.cases import Case
-from experiments.work_precision.outcome import Estimate, GradientReference
-from experiments.work_precision.programs import Knobs, Program, Variant, timed
+from experiments.work_precision.outcome import MG, TIGHT_TOLERANCE, Estimate, GradientReference, Knobs, Variant
+from experiments.work_precision.programs import Program, repeated
 from experiments.work_precision.settings import Settings
 from mjxgrad.objective import Differentiated, Objective
 
 # Step of the reference, as a share of the scene's own: eight times finer than the finest estimate's by default.
-_FINEST = 8
+_FINEST, _REFERENCE_TOLERANCE = 8, 1e-10
 _SCRAMBLES = 8
 _REPEATS = 64
 # Half the interval of the difference quotients, in standard deviations: of a Gaussian average it is off by a sixth of its square,
 # a per cent, where the third derivative is as large as the first.
 _REACH = 0.25
 
+# By name, the library's estimator and the derivative that it uses.
 ESTIMATORS: dict[str, tuple[str, str | None]] = {
     "zeroth order": ("zeroth_order", None),
     "first order, discrete": ("first_order", "discrete"),
@@ -41,15 +42,7 @@ ESTIMATORS: dict[str, tuple[str, str | None]] = {
 
 
 class Recorded(Objective):
-    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement.
-
-    Attributes:
-        costs: of the rollouts.
-        gradients: of these, by the parameters.
-        noise: on the parameters.
-        stddev: of the noise.
-        dim: number of parameters.
-    """
+    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement."""
 
     costs: Float[Array, " rollouts"]
     gradients: Float[Array, "rollouts dim"]
@@ -78,63 +71,45 @@ class Recorded(Objective):
 
 
 @dataclass(frozen=True)
-class Records:
-    """Rollouts at one time step and softness.
+class Record:
+    """Rollouts at one time step and softness with one derivative, or none, whose gradients are then zero.
 
-    Attributes:
-        noise: on the parameters, in their units.
-        costs: of the rollouts, by the name of the derivative or None.
-        gradients: by the name of the derivative.
-        seconds: of one rollout, of each repetition, by the name of the derivative or None.
-        compile_seconds: likewise.
+    The seconds are those of one rollout, of each repetition.
     """
 
-    noise: Float[np.ndarray, "rollouts dim"]
-    costs: dict[str | None, Float[np.ndarray, " rollouts"]]
-    gradients: dict[str, Float[np.ndarray, "rollouts dim"]]
-    seconds: dict[str | None, tuple[float, ...]]
-    compile_seconds: dict[str | None, float]
+    costs: Float[np.ndarray, " rollouts"]
+    gradients: Float[np.ndarray, "rollouts dim"]
+    seconds: tuple[float, ...]
+    compile_seconds: float
 
 
 def measured(
     case: Case, programs: dict[Variant, Program], settings: Settings
 ) -> tuple[GradientReference, list[Estimate]]:
-    """Estimate the gradient in every way.
-
-    Args:
-        case: the scene.
-        programs: of the scene.
-        settings: of the run.
-
-    Returns:
-        The reference, and the estimates.
-    """
-    sizes, own = settings.sizes, case.model.opt.timestep
-    simulate = next(p for v, p in programs.items() if v == Variant("mg", cone=p.variant.cone, batch=sizes.batch))
+    """Estimate the gradient in every way, and a reference."""
+    sizes = settings.sizes
+    simulate = programs[Variant(MG, cone=case.cone, batch=sizes.batch)]
+    derivatives = {"onset" if v.onset else v.derivative: p for v, p in programs.items() if v.derivative is not None}
     noise = quasi_random(sizes.num_rollouts, len(case.moved), settings.seed) * case.stddev
-    reference = _reference(case, simulate, noise, settings)
-    ways = [(own / refinement, 1.0) for refinement in sizes.gradient_refinements]
-    if any(variant.onset for variant in programs):  # there is a contact to soften
-        ways += [(own, softening) for softening in sizes.softenings]
+    reference = _reference(simulate, noise, settings.seed)
+    ways = [(case.timestep / refinement, 1.0) for refinement in sizes.gradient_refinements]
+    if "onset" in derivatives:  # there is a contact to soften
+        ways += [(case.timestep, softening) for softening in sizes.softenings]
     estimates = []
     for timestep, softening in ways:
-        knobs = Knobs(timestep, settings.tight_tolerance, softening)
-        estimates += _estimates(
-            case, _record(case, programs, simulate, noise, knobs, settings), knobs, reference, settings
-        )
+        knobs = Knobs(timestep, TIGHT_TOLERANCE, softening)
+        every = {name: _record(one, noise, knobs, settings) for name, one in {None: simulate, **derivatives}.items()}
+        for name, (function, derivative) in ESTIMATORS.items():
+            if derivative in every:
+                about = {"estimator": name, "timestep": timestep, "softening": softening}
+                estimates += _estimates(case, function, every[derivative], noise, reference, settings, about)
     return reference, estimates
 
 
 def quasi_random(count: int, dim: int, seed: int) -> Float[np.ndarray, "count dim"]:
     """Draw standard normal points more evenly than chance does: eight scrambles of Sobol's sequence, one after the other.
 
-    Args:
-        count: of points, a multiple of 8.
-        dim: of each.
-        seed: of the scrambles.
-
-    Returns:
-        The points; consecutive eighths are independent.
+    The count is a multiple of 8; consecutive eighths are independent.
     """
     seeds = np.random.SeedSequence(seed).spawn(_SCRAMBLES)
     parts = [scipy.stats.qmc.Sobol(dim, rng=np.random.default_rng(one)).random(count // _SCRAMBLES) for one in seeds]
@@ -146,151 +121,108 @@ def smoothed_gradient(
 ) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
     r"""Give the gradient of the average of a cost over Gaussian noise, without differentiating it.
 
-    $\nabla F = \mathbb{E}[f w]/\sigma^2$, where the part of $f$ that is linear in $w$ is put back exactly.
-
-    Args:
-        costs: at the noise.
-        noise: from `quasi_random`.
-        stddev: of the noise.
-
-    Returns:
-        The gradient, and its standard error from the scrambles.
+    $\nabla F = \mathbb{E}[f w]/\sigma^2$, where the part of $f$ that is linear in $w$ is put back exactly. The noise is
+    `quasi_random`; its scrambles give the standard error, which goes with the gradient.
     """
     columns = np.column_stack([np.ones(len(noise)), noise])
     linear = np.linalg.lstsq(columns, costs, rcond=None)[0]
     rest = costs - columns @ linear
-    parts = (rest[:, None] * noise / stddev**2).reshape(_SCRAMBLES, -1, noise.shape[1]).mean(axis=1)
-    return linear[1:] + parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)
+    mean, error = _over_scrambles(rest[:, None] * noise / stddev**2)
+    return linear[1:] + mean, error
 
 
-def _reference(
-    case: Case, simulate: Program, noise: Float[np.ndarray, "rollouts dim"], settings: Settings
-) -> GradientReference:
-    own = case.model.opt.timestep
-    fine, coarse = (Knobs(own * factor / _FINEST, 1e-10) for factor in (1, 2))
-    value, error = smoothed_gradient(_costs(case, simulate, noise, fine), noise, case.stddev)
-    halved, _ = smoothed_gradient(_costs(case, simulate, noise, coarse), noise, case.stddev)
-    size = np.linalg.norm(value)
-    other, other_error = _differences(case, simulate, len(noise), fine, settings)
-    return GradientReference(
-        tuple(value.tolist()),
-        float(np.linalg.norm(error) / size),
-        float(np.linalg.norm(halved - value) / size),
-        float(np.linalg.norm(other - value) / size),
-        float(np.linalg.norm(np.hypot(error, other_error)) / size),
-        fine.timestep,
-    )
+def _over_scrambles(samples: Float[np.ndarray, "rollouts dim"]) -> tuple[np.ndarray, np.ndarray]:
+    """Give the mean and its standard error."""
+    parts = samples.reshape(_SCRAMBLES, -1, samples.shape[1]).mean(axis=1)
+    return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)
 
 
-def _differences(
-    case: Case, simulate: Program, num_rollouts: int, knobs: Knobs, settings: Settings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Give the slope of the smoothed outcome along each parameter, on samples of its own."""
-    dim = len(case.moved)
-    noise = quasi_random(num_rollouts // 2, dim, settings.seed + 1) * case.stddev
+def _reference(simulate: Program, noise: Float[np.ndarray, "rollouts dim"], seed: int) -> GradientReference:
+    case = simulate.case
+    fine, coarse = (Knobs(case.timestep * factor / _FINEST, _REFERENCE_TOLERANCE) for factor in (1, 2))
+    value, error = smoothed_gradient(_costs(simulate, noise, fine), noise, case.stddev)
+    halved, _ = smoothed_gradient(_costs(simulate, noise, coarse), noise, case.stddev)
+    # The same by the slope of the smoothed outcome along each parameter, on samples of its own.
+    others = quasi_random(len(noise) // 2, len(case.moved), seed + 1) * case.stddev
     reach = _REACH * case.stddev
-    slopes, errors = [], []
-    for axis in np.eye(dim):
-        ends = [_costs(case, simulate, noise + sign * reach * axis, knobs) for sign in (1, -1)]
-        parts = ((ends[0] - ends[1]) / (2 * reach)).reshape(_SCRAMBLES, -1).mean(axis=1)
-        slopes.append(parts.mean())
-        errors.append(parts.std(ddof=1) / np.sqrt(_SCRAMBLES))
-    return np.array(slopes), np.array(errors)
+    ends = [
+        [_costs(simulate, others + sign * reach * axis, fine) for axis in np.eye(len(case.moved))] for sign in (1, -1)
+    ]
+    other, other_error = _over_scrambles((np.array(ends[0]) - np.array(ends[1])).T / (2 * reach))
+    size = np.linalg.norm(value)
+    offsets = (error, halved - value, other - value, np.hypot(error, other_error))
+    return GradientReference(tuple(value.tolist()), *(float(np.linalg.norm(one) / size) for one in offsets))
 
 
-def _costs(case: Case, simulate: Program, noise: np.ndarray, knobs: Knobs) -> Float[np.ndarray, " rollouts"]:
-    run = functools.partial(simulate.run, knobs=knobs)
-    return _in_chunks(case, lambda qvel: run(qvel)[0] @ case.weights, noise, simulate.variant.batch)
+def _costs(simulate: Program, noise: np.ndarray, knobs: Knobs) -> Float[np.ndarray, " rollouts"]:
+    weights = simulate.case.weights
+    return _in_chunks(simulate, lambda qvel: simulate.timed(qvel, knobs)[0][0] @ weights, noise)
 
 
-def _in_chunks(case: Case, run: Callable, noise: np.ndarray, batch: int) -> np.ndarray:
+def _in_chunks(program: Program, run: Callable, noise: np.ndarray) -> np.ndarray:
     """Run all, a batch at a time; what fills up the last one is cut off."""
+    case, batch = program.case, program.variant.batch
     filled = np.concatenate([noise, np.zeros((-len(noise) % batch, noise.shape[1]))])
     starts = (case.start[1] + filled @ case.directions).reshape(-1, batch, case.model.nv)
     return np.concatenate([run(qvel) for qvel in starts])[: len(noise)]
 
 
-def _record(
-    case: Case,
-    programs: dict[Variant, Program],
-    simulate: Program,
-    noise: np.ndarray,
-    knobs: Knobs,
-    settings: Settings,
-) -> Records:
-    sizes = settings.sizes
-    batch = simulate.variant.batch
+def _record(program: Program, noise: np.ndarray, knobs: Knobs, settings: Settings) -> Record:
+    case, batch = program.case, program.variant.batch
     first = case.start[1] + np.resize(noise, (batch, noise.shape[1])) @ case.directions
-    derivatives = {"onset" if v.onset else v.derivative: p for v, p in programs.items() if v.derivative is not None}
-    seconds, gradients, costs = {}, {}, {}
-    for name, program in {None: simulate, **derivatives}.items():
-        _, taken = timed(lambda p=program: p.run(first, knobs), repeats=sizes.repeats, seconds=sizes.seconds)
-        seconds[name] = tuple(one / batch for one in taken)
-        if name is None:
-            costs[name] = _costs(case, simulate, noise, knobs)
-            continue
-        both = _in_chunks(case, lambda qvel, p=program: np.column_stack(p.run(qvel, knobs)), noise, batch)
-        costs[name], gradients[name] = both[:, 0], both[:, 1:]
-    compiling = {name: p.trace_seconds + p.compile_seconds for name, p in {None: simulate, **derivatives}.items()}
-    return Records(noise, costs, gradients, seconds, compiling)
+    _, taken = repeated(program, first, knobs, settings.sizes)
+    if program.variant.derivative is None:
+        costs, gradients = _costs(program, noise, knobs), np.zeros_like(noise)
+    else:
+        both = _in_chunks(program, lambda qvel: np.column_stack(program.timed(qvel, knobs)[0]), noise)
+        costs, gradients = both[:, 0], both[:, 1:]
+    return Record(costs, gradients, tuple(one / batch for one in taken), program.compile_seconds)
 
 
 def _estimates(
-    case: Case, records: Records, knobs: Knobs, reference: GradientReference, settings: Settings
+    case: Case,
+    function: str,
+    record: Record,
+    noise: np.ndarray,
+    reference: GradientReference,
+    settings: Settings,
+    about: dict,
 ) -> list[Estimate]:
     right = np.array(reference.value)
     size = float(np.linalg.norm(right))
     keys = jax.random.split(jax.random.key(settings.seed), _REPEATS)
+    dim = noise.shape[1]
+    arrays = (jnp.asarray(each) for each in (record.costs, record.gradients, noise))
+    objective = Recorded(*arrays, jnp.full(dim, case.stddev), dim)
     found = []
-    for name, (function, derivative) in ESTIMATORS.items():
-        if derivative is not None and derivative not in records.gradients:
-            continue
-        gradients = np.zeros_like(records.noise) if derivative is None else records.gradients[derivative]
-        dim = records.noise.shape[1]
-        objective = Recorded(
-            costs=jnp.asarray(records.costs[derivative]),
-            gradients=jnp.asarray(gradients),
-            noise=jnp.asarray(records.noise),
-            stddev=jnp.full(dim, case.stddev),
-            dim=dim,
-        )
-        for num_samples in settings.sizes.num_samples:
-            values = np.asarray(_repeated(objective, keys, function, num_samples))
-            centre, chance = _expectation(function, records, gradients, values, case.stddev)
-            offset = float(np.linalg.norm(centre - right) / size)
-            chance = float(np.linalg.norm(chance) / size)
-            variance = float(values.var(axis=0, ddof=1).sum() / size**2)
-            is_finite = np.isfinite([offset, chance, variance]).all()
-            bias = float(np.sqrt(max(0.0, offset**2 - chance**2))) if is_finite else np.inf
-            low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
-            found.append(
-                Estimate(
-                    estimator=name,
-                    num_samples=num_samples,
-                    timestep=knobs.timestep,
-                    softening=knobs.softening,
-                    error=float(np.hypot(bias, np.sqrt(variance))) if is_finite else np.inf,
-                    spread=(low, high),
-                    bias=bias,
-                    bias_error=chance,
-                    variance=variance,
-                    seconds=tuple(num_samples * one for one in records.seconds[derivative]),
-                    compile_seconds=records.compile_seconds[derivative],
-                )
+    for num_samples in settings.sizes.num_samples:
+        values = np.asarray(_repeated(objective, keys, function, num_samples))
+        # What it has in the mean, and the error of that, from all rollouts where it is linear in them.
+        if function == "zeroth_order":
+            centre, chance = smoothed_gradient(record.costs, noise, case.stddev)
+        elif function == "first_order":
+            centre, chance = _over_scrambles(record.gradients)
+        else:
+            centre, chance = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+        offset, chance = (float(np.linalg.norm(each) / size) for each in (centre - right, chance))
+        variance = float(values.var(axis=0, ddof=1).sum() / size**2)
+        is_finite = np.isfinite([offset, chance, variance]).all()
+        bias = float(np.sqrt(max(0.0, offset**2 - chance**2))) if is_finite else np.inf
+        low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
+        found.append(
+            Estimate(
+                **about,
+                num_samples=num_samples,
+                error=float(np.hypot(bias, np.sqrt(variance))) if is_finite else np.inf,
+                spread=(low, high),
+                bias=bias,
+                bias_error=chance,
+                variance=variance,
+                seconds=tuple(num_samples * one for one in record.seconds),
+                compile_seconds=record.compile_seconds,
             )
+        )
     return found
-
-
-def _expectation(
-    function: str, records: Records, gradients: np.ndarray, values: Float[np.ndarray, "repeats dim"], stddev: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Give what an estimator has in the mean, and the standard error of that, from all rollouts where it is linear in them."""
-    if function == "zeroth_order":
-        return smoothed_gradient(records.costs[None], records.noise, stddev)
-    if function == "first_order":
-        parts = gradients.reshape(_SCRAMBLES, -1, gradients.shape[1]).mean(axis=1)
-        return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)
-    return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

@@ -1,51 +1,71 @@
-"""The numbers of an experiment on error against run time, and what follows from them."""
+"""The numbers of an experiment on error against run time."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool
 
-from experiments.work_precision.front import pareto_front
 from experiments.work_precision.settings import Settings
 
-C = "C MuJoCo"
-MG, MJX, ONSET = "mg.step", "mjx.step", "mg.step, onset"
+C, MG, MJX, ONSET = "C MuJoCo", "mg.step", "mjx.step", "mg.step, onset"
 # Of the solver, enough to converge.
 NUM_ITERATIONS = 100
+# What single precision resolves, and the tolerance of the solver where it is not what is varied.
+SINGLE_TOLERANCE, TIGHT_TOLERANCE = 1e-6, 1e-8
+
+Integrator = Literal["Euler", "implicitfast", "RK4"]
+Cone = Literal["pyramidal", "elliptic"]
+Precision = Literal["float32", "float64"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What a program is compiled for, beside the scene, or how C MuJoCo is run.
+
+    The library is `MG`, `MJX` or `C`; the derivative, along the uncertain velocities, is None for the motion alone.
+    """
+
+    library: str
+    integrator: Integrator = "Euler"
+    cone: Cone = "pyramidal"
+    precision: Precision = "float64"
+    batch: int = 1
+    derivative: Literal["discrete", "event"] | None = None
+    onset: bool = False
+    iterations: int = NUM_ITERATIONS
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """What a program is told at each call: time step (s), the solver's tolerance, a factor on contacts' time constants."""
+
+    timestep: float
+    tolerance: float
+    softening: float = 1.0
 
 
 @dataclass(frozen=True)
 class Point:
     """One way of simulating a scene.
 
-    Attributes:
-        library: `mg.step`, with an onset or without, `mjx.step` or C MuJoCo.
-        integrator: its name.
-        cone: of friction.
-        precision: of the numbers.
-        timestep: in s.
-        tolerance: of the solver.
-        iterations: of the solver, at most.
-        batch: states simulated together.
-        position_error: root mean square over the states of the distance in m and rad, over that of the way gone.
-        velocity_error: likewise of velocities, over their size.
-        seconds: wall time per simulated second of one state, of each repetition.
-        compile_seconds: to trace and compile the program, which serves many points; 0 where nothing is compiled.
+    Errors are root mean squares over the states: of the distance in m and rad, over that of the way gone, and of velocities, over
+    their size. Seconds are the wall time per simulated second of one state, of each repetition; `compile_seconds`, to trace and
+    compile the program, which serves many points, is 0 where nothing is compiled.
     """
 
-    library: str
-    integrator: str
-    cone: str
-    precision: str
-    timestep: float
-    tolerance: float
-    iterations: int
-    batch: int
+    variant: Variant
+    knobs: Knobs
     position_error: float
     velocity_error: float
     seconds: tuple[float, ...]
     compile_seconds: float = 0.0
+
+    @property
+    def library(self) -> str:
+        """`mg.step`, with an onset or without, `mjx.step` or C MuJoCo."""
+        return ONSET if self.variant.onset else self.variant.library
 
     @property
     def error(self) -> float:
@@ -61,63 +81,38 @@ class Point:
     @property
     def line(self) -> tuple[Any, ...]:
         """What it has in common with the points that differ in time step alone."""
-        return (
-            self.library, self.integrator, self.cone, self.precision, self.tolerance, self.iterations, self.batch
-        )  # fmt: skip
-
-    @property
-    def knob(self) -> float:
-        """What gets smaller along a line."""
-        return self.timestep
+        return self.variant, self.knobs.tolerance
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What motions are compared with.
+    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'.
 
     Attributes:
-        engine: whose contacts: MJX's, simulated by `mg.step`, or C MuJoCo's.
-        cone: of friction.
-        integrator: by which it was made.
-        timestep: the finest, in s.
-        error: distance between the finest run and the one at twice its step, as the points' errors are measured.
+        error: distance between the finest run and the one at twice its step.
         coarser_error: likewise between the runs at two and four times the step.
         distance: from the same engine's reference with the scene's own cone: what the cone makes of the motion.
         distance_to_c: of MJX's contacts from C MuJoCo's: after the same steps where both are the same motion, else of their
             references.
     """
 
-    engine: str
-    cone: str
-    integrator: str
-    timestep: float
     error: float
     coarser_error: float
     distance: float
     distance_to_c: float = 0.0
 
-    @property
-    def converges(self) -> bool:
-        """Whether halving the step still brought it nearer, or there is nothing left but rounding."""
-        return self.error < 0.75 * self.coarser_error or self.error < 1e-9
-
 
 @dataclass(frozen=True)
 class Estimate:
-    """One way of estimating a gradient.
+    """One way of estimating a gradient: its name, with the derivative that it uses, samples, time step (s) and softening.
 
     Attributes:
-        estimator: its name, with the derivative that it uses.
-        num_samples: per estimate.
-        timestep: in s.
-        softening: factor on the contacts' time constant.
         error: root of squared bias and variance.
         spread: quartiles over repetitions of the distance to the reference, over its norm.
         bias: distance of the mean to the reference, what chance explains taken off; over the reference's norm.
         bias_error: what chance would make of a bias of zero.
         variance: of one estimate over repetitions, the trace; over the reference's squared norm.
         seconds: wall time of one estimate, by the rollouts that it takes, of each repetition.
-        compile_seconds: to trace and compile the rollouts.
     """
 
     estimator: str
@@ -142,23 +137,13 @@ class Estimate:
         """What it has in common with the estimates that differ in the number of samples alone."""
         return self.estimator, self.timestep, self.softening
 
-    def samples_for(self, target: float) -> float:
-        """Give how many samples bring the error to a target, were bias and variance per sample to stay; or infinity."""
-        room = target**2 - self.bias**2
-        return max(2.0, np.ceil(self.variance * self.num_samples / room)) if room > 0 else np.inf
-
 
 @dataclass(frozen=True)
 class GradientReference:
-    """What gradients are compared with.
+    """What gradients are compared with: that of the smoothed outcome at the finest step, by its correlation with the noise.
 
-    Attributes:
-        value: the gradient of the smoothed outcome at the finest step, by its correlation with the noise.
-        standard_error: of its norm, relative.
-        step_error: its change when the step is halved, relative.
-        difference: the same gradient by differences of smoothed outcomes, on other samples; its distance, relative.
-        difference_error: what chance explains of that distance, relative.
-        timestep: the finest, in s.
+    The rest is over its norm: its standard error, its change when the step is halved, the distance to the same gradient by
+    differences of smoothed outcomes on other samples, and what chance explains of that distance.
     """
 
     value: tuple[float, ...]
@@ -166,65 +151,38 @@ class GradientReference:
     step_error: float
     difference: float
     difference_error: float
-    timestep: float
-
-    @property
-    def error(self) -> float:
-        """Give what the reference itself may be off by, relative."""
-        return float(np.hypot(self.standard_error, self.step_error))
-
-    @property
-    def agrees(self) -> bool:
-        """Whether both ways agree within three standard errors; the difference's own bias, a per cent, granted."""
-        return self.difference < 3 * self.difference_error + 0.02
 
 
 @dataclass(frozen=True)
 class Course:
-    """All that was measured on one scene.
+    """All that was measured on one scene: ways to simulate it, and to estimate the gradient.
 
-    Attributes:
-        name: of the scene.
-        title: of the scene.
-        timestep: the scene's own, in s.
-        cone: the scene's own.
-        points: of the motion.
-        references: of the motion.
-        estimates: of the gradient.
-        gradient_reference: what they are compared with.
+    Time step (s) and cone are the scene's own. References of the motion are by engine, that of `MG`, which is MJX's too, or `C`,
+    and by cone.
     """
 
     name: str
     title: str
     timestep: float
-    cone: str
+    cone: Cone
     points: tuple[Point, ...]
-    references: tuple[Reference, ...]
+    references: dict[tuple[str, Cone], Reference]
     estimates: tuple[Estimate, ...]
     gradient_reference: GradientReference
 
-    def reference(self, engine: str, cone: str) -> Reference:
-        """Give the reference of an engine with a cone."""
-        return next(one for one in self.references if (one.engine, one.cone) == (engine, cone))
-
-    def floor(self, library: str, cone: str | None = None) -> float:
+    def floor(self, library: str) -> float:
         """Give the error below which a library's errors are not known."""
-        return self.reference(C if library == C else MG, cone or self.cone).error
+        return self.references[C if library == C else MG, self.cone].error
 
-    def in_batch(self, cone: str | None = None) -> list[Point]:
-        """Give the points on the main axis: whole batches, with the scene's own cone or another."""
-        largest = max(point.batch for point in self.points)
-        return [point for point in self.points if point.batch == largest and point.cone == (cone or self.cone)]
+    def in_batch(self) -> list[Point]:
+        """Give the points on the main axis: whole batches, with the scene's own cone."""
+        largest = max(point.variant.batch for point in self.points)
+        return [one for one in self.points if one.variant.batch == largest and one.variant.cone == self.cone]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """All numbers.
-
-    Attributes:
-        settings: of the run.
-        courses: one per scene.
-    """
+    """All numbers: one course per scene."""
 
     settings: Settings
     courses: tuple[Course, ...]
@@ -241,41 +199,22 @@ class Outcome:
         return [{name: row.get(name, "") for name in names} for row in rows]
 
 
-def relative_errors(
-    positions: Float[np.ndarray, "batch nv"],
-    velocities: Float[np.ndarray, "batch nv"],
-    scales: tuple[float, float],
-) -> tuple[float, float]:
-    """Give root-mean-square distances over states, relative; NaN if one is not finite.
-
-    Args:
-        positions: differences.
-        velocities: differences.
-        scales: of positions and velocities.
-
-    Returns:
-        Both errors.
-    """
-    return tuple(rms(one) / scale for one, scale in zip((positions, velocities), scales, strict=True))  # pyright: ignore[reportReturnType]
-
-
-def rms(differences: Float[np.ndarray, "batch nv"]) -> float:
-    """Give the root mean square over states of the Euclidean norm."""
-    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))
+def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> Bool[np.ndarray, " points"]:
+    """Say which points no other beats in cost and error at once; of equal ones all, of those that are not finite none."""
+    cost, error = np.asarray(costs, float), np.asarray(errors, float)
+    no_worse = (cost <= cost[:, None]) & (error <= error[:, None])
+    better = (cost < cost[:, None]) | (error < error[:, None])
+    return ~(no_worse & better).any(axis=1) & np.isfinite(error) & np.isfinite(cost)
 
 
 def _flat(one: Point | Estimate) -> dict[str, Any]:
     values = asdict(one)
     seconds = values.pop("seconds")
-    spread = values.pop("spread", None)
-    if spread is not None:
-        values |= {"error_quartile_low": spread[0], "error_quartile_high": spread[1]}
-    unit = "seconds" if isinstance(one, Estimate) else "seconds_per_simulated_second"
-    return {
-        **values,
-        "error": one.error,
-        unit: one.cost,
-        f"{unit}_min": min(seconds),
-        f"{unit}_max": max(seconds),
-        "num_repeats": len(seconds),
-    }
+    if isinstance(one, Point):
+        values = {**values.pop("variant"), **values.pop("knobs"), **values, "library": one.library}
+        unit = "seconds_per_simulated_second"
+    else:
+        values["error_quartile_low"], values["error_quartile_high"] = values.pop("spread")
+        unit = "seconds"
+    times = {unit: one.cost, f"{unit}_min": min(seconds), f"{unit}_max": max(seconds), "num_repeats": len(seconds)}
+    return {**values, "error": one.error, **times}

@@ -1,7 +1,7 @@
-"""Programs that simulate a batch: few, for what compiles is each scene with each integrator, cone, precision and library.
+"""What simulates a batch: few compiled programs, for each takes long, and C MuJoCo beside them.
 
-Time step, number of steps and solver tolerance are arguments. A program is traced in the main thread, where the precision is
-set, and compiled in another, several at a time.
+What compiles is each scene with each integrator, cone, precision and library; time step, number of steps and solver tolerance
+are arguments.
 """
 
 import contextlib
@@ -9,112 +9,55 @@ import copy
 import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
 
 import mjxgrad as mg
-from experiments.parallel import num_compilers
-from experiments.work_precision.cases import Case
-from experiments.work_precision.outcome import NUM_ITERATIONS
+from experiments.motion import advance
+from experiments.parallel import in_threads, num_cores
+from experiments.work_precision.cases import CONES, Case
+from experiments.work_precision.outcome import MJX, C, Integrator, Knobs, Variant
+from experiments.work_precision.settings import Sizes
 from mjxgrad._mjx import mjx
 
-Library = Literal["mg", "mjx"]
-Integrator = Literal["Euler", "implicitfast", "RK4"]
-Cone = Literal["pyramidal", "elliptic"]
-Precision = Literal["float32", "float64"]
 Ends = tuple[Float[np.ndarray, "batch nq"], Float[np.ndarray, "batch nv"]]
 
-INTEGRATORS: dict[Integrator, mujoco.mjtIntegrator] = {
+_INTEGRATORS: dict[Integrator, mujoco.mjtIntegrator] = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
 }
-CONES: dict[Cone, mujoco.mjtCone] = {
-    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-}
-_STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
-# And too few, to see what they cost in error.
-FEW_ITERATIONS = (1, 3)
-
-
-@dataclass(frozen=True)
-class Variant:
-    """What a program is compiled for, beside the scene.
-
-    Attributes:
-        library: whose step.
-        integrator: of the step.
-        cone: of friction.
-        precision: of every array.
-        batch: starts simulated together.
-        derivative: along the uncertain velocities; None for the motion alone.
-        onset: whether contacts begin within the step.
-        iterations: of the solver, at most.
-    """
-
-    library: Library
-    integrator: Integrator = "Euler"
-    cone: Cone = "pyramidal"
-    precision: Precision = "float64"
-    batch: int = 1
-    derivative: Literal["discrete", "event"] | None = None
-    onset: bool = False
-    iterations: int = NUM_ITERATIONS
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """What a program is told at each call.
-
-    Attributes:
-        timestep: in s.
-        tolerance: of the solver.
-        softening: factor on the time constants of contacts.
-    """
-
-    timestep: float
-    tolerance: float
-    softening: float = 1.0
+# C MuJoCo's rollouts keep every state on the way: this many at once stay within some hundred megabytes.
+_AT_A_TIME = 128
 
 
 @dataclass(frozen=True)
 class Program:
-    """A compiled simulation of one scene.
+    """A compiled simulation of one scene: the model, on the device in the variant's precision, and the executable.
 
-    Attributes:
-        case: the scene.
-        variant: what it was compiled for.
-        model: on the device, in the variant's precision.
-        call: the executable.
-        trace_seconds: taken to trace it.
-        compile_seconds: taken to compile it, or to load it if a former run has compiled it.
+    `compile_seconds` were taken to trace and compile it, or to load it if a former run has compiled it.
     """
 
     case: Case
     variant: Variant
     model: mjx.Model
     call: Callable[..., Any]
-    trace_seconds: float
     compile_seconds: float
 
-    def run(self, qvel: Float[np.ndarray, "batch nv"], knobs: Knobs) -> Any:
-        """Simulate from these velocities.
-
-        Args:
-            qvel: in place of the start's.
-            knobs: of this call.
+    def timed(self, qvel: Float[np.ndarray, "batch nv"], knobs: Knobs) -> tuple[Any, float]:
+        """Simulate from these velocities, and tell the wall time.
 
         Returns:
             Final positions and velocities; with a derivative, outcomes and their slopes along the uncertain velocities.
         """
+        begun = time.perf_counter()
         dtype = np.dtype(self.variant.precision)
         model = softened(self.model, knobs.softening).tree_replace(
             {
@@ -122,50 +65,62 @@ class Program:
                 "opt.tolerance": jnp.asarray(np.asarray(knobs.tolerance, dtype)),
             }
         )
-        num_steps = np.int32(steps(self.case, knobs.timestep))
-        return jax.tree.map(np.asarray, self.call(model, np.asarray(qvel, dtype), num_steps))
+        num_steps = np.int32(round(self.case.duration / knobs.timestep))
+        found = jax.tree.map(np.asarray, self.call(model, np.asarray(qvel, dtype), num_steps))
+        return found, time.perf_counter() - begun
 
 
-def steps(case: Case, timestep: float) -> int:
-    """Give the number of steps of a motion."""
-    return round(case.duration / timestep)
+@dataclass(frozen=True)
+class Native:
+    """C MuJoCo on the same starts, a batch on every core; the same two calls as a program's."""
+
+    case: Case
+    variant: Variant
+    compile_seconds = 0.0
+
+    def timed(self, qvel: Float[np.ndarray, "batch nv"], knobs: Knobs) -> tuple[Ends, float]:
+        """Simulate from these velocities, softening left aside, and tell the wall time."""
+        case, model = self.case, _c_model(self.case, self.variant)
+        model.opt.timestep, model.opt.tolerance = knobs.timestep, knobs.tolerance
+        # What diverges shall end as no number, not at a new start.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        num_steps, batch = round(case.duration / knobs.timestep), len(qvel)
+        initial = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
+        initial[:, 1 : 1 + model.nq], initial[:, velocities] = case.start[0], qvel
+        threads = num_cores() if batch > 1 else 1
+        workers, seconds, finals = [mujoco.MjData(model) for _ in range(threads)], 0.0, []
+        with _unsaid(), mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
+            for part in np.array_split(initial, -(-batch // _AT_A_TIME)):
+                control = np.tile(case.controls, (len(part), num_steps, 1)) if model.nu else None
+                begun = time.perf_counter()
+                states, _ = pool.rollout([model] * len(part), workers, part, control, nstep=num_steps)
+                seconds += time.perf_counter() - begun
+                finals.append(np.asarray(states)[:, -1])
+        final = np.concatenate(finals)
+        return (final[:, 1 : 1 + model.nq], final[:, velocities]), seconds
+
+
+def repeated(
+    program: Program | Native, qvel: Float[np.ndarray, "batch nv"], knobs: Knobs, sizes: Sizes
+) -> tuple[Any, tuple[float, ...]]:
+    """Simulate at least twice, and again while it takes little time; a short first time only warms up."""
+    result, first = program.timed(qvel, knobs)
+    taken = [first] if first > sizes.seconds else []
+    while len(taken) < 2 or (len(taken) < sizes.repeats and sum(taken) < sizes.seconds):
+        result, seconds = program.timed(qvel, knobs)
+        taken.append(seconds)
+    return result, tuple(taken)
 
 
 def compiled(case: Case, variants: Sequence[Variant], on_each: Callable[[], None]) -> dict[Variant, Program]:
-    """Compile the programs of a scene.
-
-    Args:
-        case: the scene.
-        variants: what to compile it for.
-        on_each: called as each is done, in their order.
-
-    Returns:
-        By variant.
-    """
-    waiting: dict[Variant, tuple[mjx.Model, float, Future]] = {}
-    with ThreadPoolExecutor(num_compilers()) as pool:
-        for variant in variants:
-            begun = time.perf_counter()
-            model, lowered = _lowered(case, variant)
-            waiting[variant] = model, time.perf_counter() - begun, pool.submit(_compile, lowered)
-        programs = {}
-        for variant, (model, traced, result) in waiting.items():
-            call, seconds = result.result()
-            programs[variant] = Program(case, variant, model, call, traced, seconds)
-            on_each()
-    return programs
+    """Compile the programs of a scene, several at a time; `on_each` is called as each is done, in their order."""
+    found = in_threads(functools.partial(_compiled, case), variants, lambda _: on_each())
+    return dict(zip(variants, found, strict=True))
 
 
 def softened(model: mjx.Model, factor: float) -> mjx.Model:
-    """Multiply the time constants of all contacts, the damping ratio kept.
-
-    Args:
-        model: of MJX.
-        factor: on the time constants; stiffness falls with its square.
-
-    Returns:
-        A model with softer contacts.
-    """
+    """Multiply the time constants of all contacts, the damping ratio kept; stiffness falls with the factor's square."""
     if factor == 1.0:
         return model
 
@@ -178,93 +133,59 @@ def softened(model: mjx.Model, factor: float) -> mjx.Model:
     return model.replace(geom_solref=changed(model.geom_solref), pair_solref=changed(model.pair_solref))
 
 
-def c_model(case: Case, integrator: Integrator, cone: Cone, iterations: int = NUM_ITERATIONS) -> mujoco.MjModel:
-    """Give the C model of a scene with another integrator and cone, its solver run to convergence unless told otherwise.
+def has_own_implicit(case: Case) -> bool:
+    """Say whether implicitfast does anything that Euler, with its implicit joint damping, does not, but for rounding."""
+    knobs, velocity = Knobs(case.timestep, 1e-10), case.start[1][None]
+    explicit, implicit = (
+        Native(case, Variant(C, integrator)).timed(velocity, knobs)[0][0] for integrator in ("Euler", "implicitfast")
+    )
+    return not np.allclose(explicit, implicit, rtol=0, atol=1e-7)
 
-    Args:
-        case: the scene.
-        integrator: its name.
-        cone: its name.
-        iterations: of the solver, at most.
 
-    Returns:
-        A copy.
-    """
+def _c_model(case: Case, variant: Variant) -> mujoco.MjModel:
     model = copy.deepcopy(case.model)
-    model.opt.integrator, model.opt.cone = INTEGRATORS[integrator], CONES[cone]
-    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, iterations
+    model.opt.integrator, model.opt.cone = _INTEGRATORS[variant.integrator], CONES[variant.cone]
+    model.opt.solver, model.opt.iterations = mujoco.mjtSolver.mjSOL_NEWTON, variant.iterations
     return model
 
 
-def timed(function: Callable[[], Any], *, repeats: int, seconds: float) -> tuple[Any, tuple[float, ...]]:
-    """Call what is compiled, at least twice.
-
-    Args:
-        function: blocks until it is done.
-        repeats: at most.
-        seconds: after which, twice done, it is not called again. A first call shorter than this only warms up.
-
-    Returns:
-        What it returned last, and the wall time of each call that counts.
-    """
-    begun = time.perf_counter()
-    result = function()
-    first = time.perf_counter() - begun
-    taken = [first] if first > seconds else []
-    while len(taken) < 2 or (len(taken) < repeats and sum(taken) < seconds):
-        begun = time.perf_counter()
-        result = function()
-        taken.append(time.perf_counter() - begun)
-    return result, tuple(taken)
+@contextlib.contextmanager
+def _unsaid() -> Iterator[None]:
+    """Keep C MuJoCo from writing a warning, to the terminal and to a file, for each state that diverges: the error says it."""
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
-def own_cone(case: Case) -> Cone:
-    """Give the name of the cone in the scene's file."""
-    return next(name for name, cone in CONES.items() if cone == case.model.opt.cone)
-
-
-def _compile(lowered: jax.stages.Lowered) -> tuple[Callable[..., Any], float]:
-    begun = time.perf_counter()
-    executable = lowered.compile()
-    return executable, time.perf_counter() - begun
-
-
-def _lowered(case: Case, variant: Variant) -> tuple[mjx.Model, jax.stages.Lowered]:
-    with _in_precision(variant.precision):
-        scene = mg.load_scene(c_model(case, variant.integrator, variant.cone, variant.iterations))
-        dtype = np.dtype(variant.precision)
-        template = scene.data.replace(
+def _compiled(case: Case, variant: Variant) -> Program:
+    begun, dtype = time.perf_counter(), np.dtype(variant.precision)
+    with jax.enable_x64(variant.precision == "float64"):
+        scene = mg.load_scene(_c_model(case, variant))
+        start = scene.data.replace(
             qpos=jnp.asarray(case.start[0], dtype), ctrl=jnp.asarray(case.controls, dtype), time=jnp.zeros((), dtype)
         )
-        simulate = functools.partial(_simulate, _step(variant), template)
+        simulate = functools.partial(_simulate, variant, start)
         if variant.derivative is not None:
             simulate = functools.partial(_differentiate, simulate, case)
-        batched = jax.vmap(simulate, in_axes=(None, 0, None))
-        qvel = np.zeros((variant.batch, case.model.nv), dtype)
-        return scene.model, jax.jit(batched).lower(scene.model, qvel, np.int32(1))
-
-
-def _step(variant: Variant) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
-    if variant.library == "mjx":
-        return mjx.step
-    onset = mg.Onset() if variant.onset else None
-    return functools.partial(mg.step, gradient=variant.derivative or "discrete", onset=onset)
+        batched = jax.jit(jax.vmap(simulate, in_axes=(None, 0, None)))
+        call = batched.lower(scene.model, np.zeros((variant.batch, case.model.nv), dtype), np.int32(1)).compile()
+    return Program(case, variant, scene.model, call, time.perf_counter() - begun)
 
 
 def _simulate(
-    step: Callable[[mjx.Model, mjx.Data], mjx.Data],
-    template: mjx.Data,
-    model: mjx.Model,
-    qvel: Float[Array, " nv"],
-    num_steps: Array,
+    variant: Variant, start: mjx.Data, model: mjx.Model, qvel: Float[Array, " nv"], num_steps: Array
 ) -> tuple[Array, Array]:
-    def advance(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        moved = step(model, template.replace(**dict(zip(_STATE, state, strict=True))))
-        return tuple(getattr(moved, name) for name in _STATE)
+    onset = mg.Onset() if variant.onset else None
 
-    start = tuple(getattr(template.replace(qvel=qvel), name) for name in _STATE)
-    final = jax.lax.fori_loop(0, num_steps, advance, start)
-    return final[0], final[1]
+    def step(data: mjx.Data) -> mjx.Data:
+        if variant.library == MJX:
+            return mjx.step(model, data)
+        return mg.step(model, data, gradient=variant.derivative or "discrete", onset=onset)
+
+    final = advance(step, start.replace(qvel=qvel), num_steps)
+    return final.qpos, final.qvel
 
 
 def _differentiate(
@@ -273,20 +194,7 @@ def _differentiate(
     """Forward mode, which the library takes for so few parameters too, and which a loop of any length has."""
     weights = jnp.asarray(case.weights, qvel.dtype)
 
-    def outcome(velocity: Array) -> Array:
-        return weights @ simulate(model, velocity, num_steps)[0]
-
     def along(direction: Array) -> tuple[Array, Array]:
-        return jax.jvp(outcome, (qvel,), (direction,))
+        return jax.jvp(lambda at: weights @ simulate(model, at, num_steps)[0], (qvel,), (direction,))
 
     return jax.vmap(along, out_axes=(None, 0))(jnp.asarray(case.directions, qvel.dtype))
-
-
-@contextlib.contextmanager
-def _in_precision(precision: Precision) -> Iterator[None]:
-    before = jax.config.read("jax_enable_x64")
-    jax.config.update("jax_enable_x64", precision == "float64")
-    try:
-        yield
-    finally:
-        jax.config.update("jax_enable_x64", before)

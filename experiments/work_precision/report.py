@@ -1,129 +1,202 @@
 """The answer in words, computed from the numbers."""
 
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
 import numpy as np
 
-from experiments.parallel import num_compilers
+from experiments.parallel import num_compilers, num_cores
 from experiments.report import Table
-from experiments.words import quantity
-from experiments.work_precision.choice import Choice, cheapest, fastest
-from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Outcome, Point
+from experiments.words import joined, percent, quantity
+from experiments.work_precision.outcome import (
+    MG,
+    MJX,
+    NUM_ITERATIONS,
+    ONSET,
+    C,
+    Course,
+    Estimate,
+    GradientReference,
+    Outcome,
+    Point,
+    Reference,
+)  # fmt: skip
+
+_One = TypeVar("_One", Point, Estimate)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to take for a gradient: the way, the samples that it needs, and the time that one estimate then takes (s)."""
+
+    estimate: Estimate
+    num_samples: float
+    seconds: float
+
+
+def lines(measured: Iterable[_One]) -> dict[tuple[Any, ...], list[_One]]:
+    """Gather what differs in time step, or in the number of samples, alone."""
+    found: dict[tuple[Any, ...], list[_One]] = {}
+    for one in measured:
+        found.setdefault(one.line, []).append(one)
+    return found
+
+
+def fastest(points: Iterable[Point], target: float) -> Point | None:
+    """Give the fastest point from which on its line stays below an error; None if there is none.
+
+    One coarse point that is right by luck, between finer ones that are not, does not count.
+    """
+    found = []
+    for line in lines(points).values():
+        for point in sorted(line, key=lambda one: one.knobs.timestep):
+            if not point.error <= target:
+                break
+            found.append(point)
+    return min(found, key=lambda one: one.cost, default=None)
+
+
+def samples_for(one: Estimate, target: float) -> float:
+    """Give how many samples bring the error to a target, were bias and variance per sample to stay; or infinity."""
+    room = target**2 - one.bias**2
+    return max(2.0, np.ceil(one.variance * one.num_samples / room)) if room > 0 else np.inf
+
+
+def cheapest(estimates: Iterable[Estimate], target: float) -> Choice | None:
+    """Give the estimate that reaches an error in the least time, its samples made as many as that takes; or None.
+
+    Of those that differ in the number of samples alone the largest speaks, for it knows its bias best.
+    """
+    choices = []
+    for line in lines(estimates).values():
+        one = max(line, key=lambda each: each.num_samples)
+        count = samples_for(one, target)
+        # A bias is not known better than this: what chance could hide of it has to fit as well.
+        if np.isfinite(count) and one.bias_error <= target:
+            choices.append(Choice(one, count, one.cost * count / one.num_samples))
+    return min(choices, key=lambda one: one.seconds, default=None)
 
 
 def verdict(outcome: Outcome) -> str:
     """Say how the libraries stand at the largest target, over all scenes."""
     target = max(outcome.settings.targets)
+    times = []
+    for other, name in ((MJX, "of mjx.step"), (C, f"of C MuJoCo on {_threads()}")):
+        pairs = [(_best(course, MG, target), _best(course, other, target)) for course in outcome.courses]
+        if ratios := [one.cost / two.cost for one, two in pairs if one is not None and two is not None]:
+            reach = f" ({min(ratios):.2g} to {max(ratios):.2g} on {len(ratios)} scenes)" if len(ratios) > 1 else ""
+            times.append(f"{np.median(ratios):.2g} times that {name}{reach}")
+    found = [cheapest(course.estimates, target) for course in outcome.courses]
+    counts = Counter(choice.estimate.estimator for choice in found if choice is not None)
+    ways = [f"{name} (on {count} {'scene' if count == 1 else 'scenes'})" for name, count in counts.most_common()]
+    lost = found.count(None)
     sentences = []
-    for other, name in ((MJX, "mjx.step"), (C, f"C MuJoCo on {_threads(outcome)}")):
-        ratios = _ratios(outcome, other, target)
-        if ratios:
-            sentences.append(
-                f"For {_percent(target)} error of the motion mg.step takes {np.median(ratios):.2g} times the time of {name} "
-                f"{_over(ratios, outcome)}."
-            )
-    chosen = [cheapest(course.estimates, target) for course in outcome.courses]
-    names = [choice.estimate.estimator for choice in chosen if choice is not None]
-    if names:
-        counts = {name: names.count(name) for name in dict.fromkeys(names)}
-        ranked = sorted(counts.items(), key=lambda item: -item[1])
-        listed = "; ".join(f"{name} (on {count} {'scene' if count == 1 else 'scenes'})" for name, count in ranked)
-        sentences.append(f"{_percent(target)} error of the gradient is soonest reached by {listed}.")
-    lost = len(outcome.courses) - len(names)
-    if lost:
-        sentences.append(f"On {lost} of {len(outcome.courses)} scenes no way of estimating it is known to get there.")
+    if times:
+        sentences.append(f"For {percent(target)} error of the motion mg.step takes a time of {joined(times)}.")
+    if ways:
+        sentences.append(f"{percent(target)} error of the gradient is soonest reached by {'; '.join(ways)}.")
+    if lost and sentences:
+        sentences.append(f"On {lost} of {len(found)} scenes no way of estimating it is known to get there.")
     return " ".join(sentences) or "No setting reached a target on any scene."
 
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what an onset makes of the error, and what is not known."""
-    sentences = _onset_against_step(outcome)
-    loose = [course.title for course in outcome.courses if not all(one.converges for one in course.references)]
-    if loose:
+    sentences = []
+    if ratios := {course.title: found for course in outcome.courses if (found := _onset_ratios(course))}:
+        every = np.concatenate([*ratios.values()])
+        medians = ", ".join(f"{np.median(found):.2g} ({title})" for title, found in ratios.items())
         sentences.append(
-            "Halving the step did not bring the reference nearer, so that the dotted line is all that is known: "
-            f"{'; '.join(loose)}."
+            f"With contact that begins within the step the error of the motion, at the same integrator and time step, is "
+            f"{medians} times the step's in the median, and larger by more than a tenth at {(every > 1.1).sum()} of "
+            f"{every.size} time steps."
         )
-    apart = [(c.title, c.reference(MG, c.cone)) for c in outcome.courses]
-    apart = [(title, one) for title, one in apart if one.distance_to_c > max(1e-5, 3 * one.error)]
-    if apart:
-        listed = "; ".join(f"{title}, {_percent(one.distance_to_c)} apart" for title, one in apart)
-        sentences.append(f"MJX makes other contacts than C MuJoCo, so that each has its own reference: {listed}.")
-    doubtful = [course.title for course in outcome.courses if not course.gradient_reference.agrees]
-    if doubtful:
-        sentences.append(
-            "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful: "
-            f"{'; '.join(doubtful)}."
-        )
-    return sentences
+    own = {course.title: course.references[MG, course.cone] for course in outcome.courses}
+    untold = {
+        "Halving the step did not bring the reference nearer, so that the dotted line is all that is known": [
+            course.title for course in outcome.courses if not all(map(converges, course.references.values()))
+        ],
+        "MJX makes other contacts than C MuJoCo, so that each has its own reference": [
+            title for title, one in own.items() if one.distance_to_c > max(1e-5, 3 * one.error)
+        ],
+        "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful": [
+            course.title for course in outcome.courses if not agrees(course.gradient_reference)
+        ],
+    }
+    return sentences + [f"{what}: {'; '.join(titles)}." for what, titles in untold.items() if titles]
 
 
-def _onset_against_step(outcome: Outcome) -> list[str]:
-    """Say what contact that begins within the step makes of the error; nothing if it was nowhere tried."""
-    ratios = {course.title: found for course in outcome.courses if (found := _onset_ratios(course))}
-    if not ratios:
-        return []
-    every = np.concatenate([*ratios.values()])
-    listed = ", ".join(f"{np.median(found):.2g} ({title})" for title, found in ratios.items())
-    return [
-        f"With contact that begins within the step the error of the motion, at the same integrator and time step, is {listed} "
-        f"times the step's in the median, and larger by more than a tenth at {(every > 1.1).sum()} of {every.size} time steps."
-    ]
+def converges(one: Reference) -> bool:
+    """Whether halving the step still brought it nearer, or there is nothing left but rounding."""
+    return one.error < 0.75 * one.coarser_error or one.error < 1e-9
+
+
+def agrees(one: GradientReference) -> bool:
+    """Whether both ways agree within three standard errors; the difference's own bias, a per cent, granted."""
+    return one.difference < 3 * one.difference_error + 0.02
 
 
 def _onset_ratios(course: Course) -> list[float]:
     """Give the error of the motion with an onset over that without, step by step, where the reference can tell."""
     tight = {
-        (p.library, p.timestep): p.error
+        (p.library, p.knobs.timestep): p.error
         for p in course.in_batch()
-        if p.integrator == "Euler"
-        and p.precision == "float64"
-        and p.iterations == NUM_ITERATIONS
-        and p.tolerance <= 1e-7
+        if (p.variant.integrator, p.variant.precision, p.variant.iterations) == ("Euler", "float64", NUM_ITERATIONS)
+        and p.knobs.tolerance <= 1e-7
     }
-    plain = {timestep: error for (library, timestep), error in tight.items() if library == MG}
-    found = {timestep: error for (library, timestep), error in tight.items() if library == ONSET}
-    floor = course.floor(MG)
-    return [
-        found[h] / plain[h] for h in found if np.isfinite(found[h]) and np.isfinite(plain[h]) and plain[h] > 3 * floor
-    ]
+    pairs = [(error, tight[MG, timestep]) for (library, timestep), error in tight.items() if library == ONSET]
+    floor = 3 * course.floor(MG)
+    return [one / plain for one, plain in pairs if np.isfinite(one) and np.isfinite(plain) and plain > floor]
 
 
 def summary(outcome: Outcome) -> Table:
     """Tabulate what to take for which error, scene by scene."""
     targets = sorted(outcome.settings.targets, reverse=True)
     columns = ["scene", "reference known to"]
-    for percent in map(_percent, targets):
-        columns += [f"motion to {percent}", "ms per s; mjx.step; C MuJoCo", f"gradient to {percent}"]
+    for share in map(percent, targets):
+        columns += [f"motion to {share}", "ms per s; mjx.step; C MuJoCo", f"gradient to {share}"]
     rows = []
     for course in outcome.courses:
-        row = [course.title, _percent(course.floor(MG))]
+        row = [course.title, _share(course.floor(MG))]
         for target in targets:
-            best = {name: _best(course, name, target) for name in (MG, MJX, C)}
-            costs = "; ".join(_milliseconds(best[name]) for name in (MG, MJX, C))
-            row += [_way(best[MG], course, target), costs, _choice(cheapest(course.estimates, target))]
+            best = [_best(course, name, target) for name in (MG, MJX, C)]
+            nothing = "?" if course.floor(MG) > target else "–"
+            costs = "; ".join("–" if one is None else _milliseconds(one.cost) for one in best)
+            row += [nothing if best[0] is None else _way(best[0]), costs, _choice(cheapest(course.estimates, target))]
         rows.append(row)
     caption = (
         "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one "
         f"state in a batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
-        f"{_threads(outcome)}; of the gradient with its rollouts, as many as bias and variance call for, and the time they "
+        f"{_threads()}; of the gradient with its rollouts, as many as bias and variance call for, and the time they "
         "take. A dash: no setting that was tried gets there; a question mark: the reference is not known so well."
     )
     return Table(columns, rows, caption)
 
 
-def batches(outcome: Outcome) -> Table:
+def tables(outcome: Outcome) -> list[Table]:
     """Tabulate time for one state and for a batch, compilation, and what cone and contact model make of the motion."""
     rows = []
     for course in outcome.courses:
-        row = [course.title, *(_alone_and_together(course, name) for name in (MG, MJX, C))]
-        for library in (MG, MJX):
-            seconds = [p.compile_seconds for p in course.points if p.library == library and p.integrator == "Euler"]
-            row.append(f"{np.median(seconds):.1f}")
-        others = [one for one in course.references if one.cone != course.cone and one.engine == MG]
-        row.append(_percent(others[0].distance) if others else "–")
-        row.append(_percent(course.reference(MG, course.cone).distance_to_c))
+        compiling = [
+            np.median(
+                [p.compile_seconds for p in course.points if (p.library, p.variant.integrator) == (name, "Euler")]
+            )
+            for name in (MG, MJX)
+        ]
+        others = [one for (engine, cone), one in course.references.items() if engine == MG and cone != course.cone]
         found = course.gradient_reference
-        row.append(f"{_percent(found.standard_error)}; {_percent(found.step_error)}; {_percent(found.difference)}")
-        rows.append(row)
+        rows.append(
+            [
+                course.title,
+                *(_alone_and_together(course, name) for name in (MG, MJX, C)),
+                *(f"{seconds:.1f}" for seconds in compiling),
+                _share(others[0].distance) if others else "–",
+                _share(course.references[MG, course.cone].distance_to_c),
+                "; ".join(map(_share, (found.standard_error, found.step_error, found.difference))),
+            ]
+        )
     columns = (
         "scene", "mg.step: alone; in batch", "mjx.step: alone; in batch", "C MuJoCo: alone; in batch",
         "to compile mg.step, s", "mjx.step, s", "cone changes the motion by", "MJX from C MuJoCo",
@@ -131,23 +204,24 @@ def batches(outcome: Outcome) -> Table:
     )  # fmt: skip
     caption = (
         "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
-        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads(outcome)}). A "
+        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads()}). A "
         "dash: not tried on this scene. The figures are about batches, which MJX is made for, and so are estimators. "
         f"Seconds to trace and compile one program, {num_compilers()} at a time. Then how far the other cone's motion ends, "
         "and MJX's from C MuJoCo's; last what is known of the reference gradient: standard error, change with the last "
         "halving of the step, distance to the same gradient by differences of smoothed outcomes."
     )
-    return Table(columns, rows, caption)
+    return [Table(columns, rows, caption)]
 
 
 def _alone_and_together(course: Course, library: str) -> str:
     """Give milliseconds per simulated second of a state at the scene's own step."""
     costs: dict[bool, float] = {}
     for one in course.points:
-        is_plain = one.integrator == "Euler" and one.cone == course.cone and one.timestep == course.timestep
-        is_converged = one.iterations >= NUM_ITERATIONS and one.tolerance <= 1e-6
-        if one.library == library and is_plain and is_converged and (library == C or one.precision == "float32"):
-            costs[one.batch > 1] = 1e3 * one.cost
+        variant, knobs = one.variant, one.knobs
+        is_plain = (variant.integrator, variant.cone, knobs.timestep) == ("Euler", course.cone, course.timestep)
+        is_converged = variant.iterations >= NUM_ITERATIONS and knobs.tolerance <= 1e-6
+        if one.library == library and is_plain and is_converged and (library == C or variant.precision == "float32"):
+            costs[variant.batch > 1] = 1e3 * one.cost
     return "; ".join(f"{costs[together]:.3g}" if together in costs else "–" for together in (False, True))
 
 
@@ -158,20 +232,9 @@ def _best(course: Course, library: str, target: float) -> Point | None:
     return fastest((point for point in course.in_batch() if point.library == library), target)
 
 
-def _ratios(outcome: Outcome, other: str, target: float) -> list[float]:
-    pairs = [(_best(course, MG, target), _best(course, other, target)) for course in outcome.courses]
-    return [one.cost / two.cost for one, two in pairs if one is not None and two is not None]
-
-
-def _way(point: Point | None, course: Course, target: float) -> str:
-    if point is None:
-        return "?" if course.floor(MG) > target else "–"
-    return _setting(point)
-
-
-def _setting(point: Point) -> str:
-    tolerance = f", tolerance {point.tolerance:g}" if point.tolerance > 1e-6 else ""
-    return f"{point.integrator}, {point.precision}, {1e3 * point.timestep:g} ms{tolerance}"
+def _way(point: Point) -> str:
+    tolerance = f", tolerance {point.knobs.tolerance:g}" if point.knobs.tolerance > 1e-6 else ""
+    return f"{point.variant.integrator}, {point.variant.precision}, {1e3 * point.knobs.timestep:g} ms{tolerance}"
 
 
 def _choice(choice: Choice | None) -> str:
@@ -180,32 +243,20 @@ def _choice(choice: Choice | None) -> str:
     one = choice.estimate
     soft = f", contact {one.softening:g} times softer" if one.softening != 1 else ""
     count = f"{choice.num_samples:.0f}" if choice.num_samples < 1e4 else quantity(choice.num_samples)
-    seconds = f"{_milliseconds_of(choice.seconds)} ms" if choice.seconds < 10 else f"{choice.seconds:.0f} s"
+    seconds = f"{_milliseconds(choice.seconds)} ms" if choice.seconds < 10 else f"{choice.seconds:.0f} s"
     return f"{one.estimator}, {1e3 * one.timestep:g} ms{soft}, {count} rollouts, {seconds}"
 
 
-def _milliseconds(point: Point | None) -> str:
-    return "–" if point is None else _milliseconds_of(point.cost)
-
-
-def _milliseconds_of(seconds: float) -> str:
+def _milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.2g}" if seconds < 1e-2 else f"{1e3 * seconds:.0f}"
 
 
-def _over(ratios: list[float], outcome: Outcome) -> str:
-    if len(ratios) == 1:
-        return "on the one scene where both reach it" if len(outcome.courses) > 1 else "on this scene"
-    return f"in the median of {len(ratios)} scenes ({min(ratios):.2g} to {max(ratios):.2g} times)"
+def _threads() -> str:
+    return f"{num_cores()} threads" if num_cores() > 1 else "one thread"
 
 
-def _threads(outcome: Outcome) -> str:
-    count = outcome.settings.num_threads
-    return f"{count} threads" if count > 1 else "one thread"
-
-
-def _percent(share: float) -> str:
+def _share(share: float) -> str:
+    """Write what smooth motions in double precision bring close to rounding."""
     if not np.isfinite(share):
         return "not finite"
-    if share == 0 or share >= 1e-5:
-        return f"{100 * share:.2g} %"
-    return f"{100 * share:.0e} %".replace("e-0", "e-").replace("-", "−")
+    return "< 0.001%" if 0 < share < 1e-5 else percent(share)

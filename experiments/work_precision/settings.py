@@ -4,8 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.parallel import num_cores
-from experiments.settings import Positive, RunSettings, SettingsTable
+from experiments.settings import RunSettings, SettingsTable
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
@@ -49,27 +48,13 @@ class Settings(RunSettings):
     """How much is measured: two scenes in a minute or two, eight in a quarter of an hour on two cores, all on a GPU."""
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
-    scenes: tuple[SceneName, ...] | None = None
+    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
     """Which scenes, in place of those of the size."""
     targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (
         0.05,
         1e-3,
     )
     """Relative errors for which a setting is recommended."""
-    threads: Annotated[int, Field(ge=1, le=256)] | None = None
-    """Of C MuJoCo's rollout; one for every core, if none is given."""
-    tight_tolerance: Positive = 1e-8
-    """Of the solver where tolerance is not what is varied; in single precision at least 1e-6, which is what it resolves."""
-
-    @property
-    def scene_names(self) -> tuple[SceneName, ...]:
-        """Give the scenes to run."""
-        return self.sizes.scenes if self.scenes is None else self.scenes
-
-    @property
-    def num_threads(self) -> int:
-        """Give the number of threads of C MuJoCo's rollout."""
-        return self.threads or num_cores()
 
     def has_asides(self, name: str) -> bool:
         """Say whether a scene is looked at in every way that the size has."""
@@ -79,8 +64,6 @@ class Settings(RunSettings):
     def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
-        if self.scenes is not None and not self.scenes:
-            raise ValueError("scenes must name at least one scene, got none")
         if self.scenes is not None and len(set(self.scenes)) < len(self.scenes):
             raise ValueError(f"scenes must not repeat, got {list(self.scenes)}")
         return self

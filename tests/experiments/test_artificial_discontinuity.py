@@ -8,10 +8,9 @@ import pytest
 from scipy.stats import norm
 
 from experiments.__main__ import main
-from experiments.artificial_discontinuity.paths import PATHS
+from experiments.artificial_discontinuity.measure import overlap_force
 from experiments.artificial_discontinuity.pushes import slopes_at
-from experiments.artificial_discontinuity.reference import overlap_force
-from experiments.artificial_discontinuity.shapes import lattice, shape
+from experiments.artificial_discontinuity.shapes import PATHS, shape
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
 
@@ -20,7 +19,7 @@ DEPTH = 0.005
 
 @pytest.fixture(scope="module")
 def bodies():
-    return {"box": shape("box"), "balls": shape("balls"), "points": lattice(4)}
+    return {"box": shape("box"), "balls": shape("balls"), "points": shape(4)}
 
 
 def held(body, pose):

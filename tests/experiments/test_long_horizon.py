@@ -10,21 +10,10 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.long_horizon.estimates import reference_gradient, zeroth
+from experiments.long_horizon.measure import reference_gradient, zeroth
 from experiments.long_horizon.problems import problem
-from experiments.long_horizon.settings import Sizes
 
 STDDEV = 0.3
-SIZES = Sizes(
-    problems=(),
-    num_times=2,
-    num_repeats=400,
-    num_samples=16,
-    num_reference=0,
-    num_jacobians=0,
-    num_adaptive=0,
-    batch=16,
-)
 
 
 def costs(noise):
@@ -49,7 +38,7 @@ def test_the_reference_is_the_gradient_and_knows_its_error(noise):
 
 
 def test_the_zeroth_order_estimate_is_unbiased_whatever_is_added_to_the_costs(noise):
-    samples = zeroth(STDDEV, noise, 1e3 + costs(noise), SIZES)
+    samples = zeroth(STDDEV, noise, 1e3 + costs(noise), 16)
     repeats = samples.reshape(400, 16, 2, 2).mean(axis=1)
     error = repeats.std(axis=0, ddof=1) / np.sqrt(400)
     assert (np.abs(repeats.mean(axis=0) - EXACT) < 4 * error).all()
@@ -65,10 +54,10 @@ def test_windows_are_the_terms_of_the_chain_rule():
     @jax.jit
     @jax.vmap
     def tangents(window):
-        return jax.jvp(lambda p: pendulum.states(p, window, 4, "discrete"), (params,), (direction,))[1]
+        return jax.jvp(lambda p: pendulum.states(p, window, "discrete"), (params,), (direction,))[1]
 
     single, pairs, whole = tangents(jnp.array([1, 2, 4]))
-    jacobians = jax.jit(lambda p: pendulum.jacobians(p, 4, "discrete"))(params)
+    jacobians = jax.jit(lambda p: pendulum.jacobians(p, "discrete"))(params)
     expected = [single[0]]
     for time in range(1, 4):
         expected.append(jacobians[time] @ expected[-1] + single[time])
