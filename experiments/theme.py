@@ -57,33 +57,14 @@ RULES: dict[Any, Any] = {
 
 
 def subplots(rows: int, columns: int, *, height: float, **settings):
-    """Make a figure in the theme.
-
-    Args:
-        rows: of axes.
-        columns: of axes.
-        height: of the figure, in inches.
-        **settings: as for `matplotlib.pyplot.subplots`.
-
-    Returns:
-        The figure, and an array (rows, columns) of axes.
-    """
+    """Make a figure in the theme, of a height in inches, and an array (rows, columns) of axes."""
     # Titles, ticks and legends read the rules when they are made, so a context around this call would not reach them.
     plt.rcParams.update(RULES)
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 
 def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
-    """Draw figures, write them, and let go of them.
-
-    Args:
-        drawings: pictures made by `subplots`.
-        outcome: the numbers.
-        folder: of the run.
-
-    Returns:
-        The figures of the report.
-    """
+    """Draw the figures of a report into a run's folder, and let go of them."""
     (folder / "figures").mkdir(exist_ok=True)
     figures = []
     for name, drawing in drawings.items():

@@ -1,9 +1,10 @@
 """The pictures of an experiment on policy gradients."""
 
 import numpy as np
+from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
@@ -49,8 +50,7 @@ def summary(outcome: Outcome):
     axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
     axes[0, 1].set(title="Weight of the first order", xlabel="α")
     axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    _legend(figure, axes, 2)
     caption = (
         "Left, norm of the bias over the norm of the gradient, noise taken off, with two standard errors; where the interval "
         "reaches the edge no bias was found. Middle, mean weight of the first order. Right, root-mean-square error of one "
@@ -90,13 +90,11 @@ def throw(outcome: Outcome):
         right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
     for axis in axes[-1]:
         axis.set_xlabel("angle, rad")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    settings = outcome.settings
+    _legend(figure, axes, 3)
     caption = (
-        f"Left, gradient of the cost under noise of {settings.angle_stddev:g} rad; error bars are two standard errors. Right, "
-        "weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the last "
-        "that do not; there neither derivative sees the jump."
+        f"Left, gradient of the cost under noise of {outcome.settings.angle_stddev:g} rad; error bars are two standard errors. "
+        "Right, weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the "
+        "last that do not; there neither derivative sees the jump."
     )
     return figure, "Throws over the wall", caption
 
@@ -119,12 +117,10 @@ def push(outcome: Outcome):
         axis.set(title=cell.title, xlabel="step")
         axis.yaxis.set_major_formatter(FuncFormatter(_plain))
     axes[0, 0].set_ylabel("gradient, 1/N")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    settings = outcome.settings
+    _legend(figure, axes, 3)
     caption = (
-        f"Components of the gradient by the force at each moment: {settings.num_references} unbiased estimates with a band of "
-        "two standard errors, first-order means before it."
+        f"Components of the gradient by the force at each moment: {outcome.settings.num_references} unbiased estimates with a "
+        "band of two standard errors, first-order means before it."
     )
     return figure, "Control gradient of the push", caption
 
@@ -151,8 +147,7 @@ def hopper(outcome: Outcome):
         axis.grid(axis="x", visible=False)
     axes[0, 0].yaxis.set_major_formatter(FuncFormatter(_plain))
     axes[0, 0].set_ylabel("gradient, m per unit of gain")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    _legend(figure, axes, 3)
     caption = (
         "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
         "are two standard errors."
@@ -174,20 +169,22 @@ def descent(outcome: Outcome):
             for axis, values in ((above, course.costs), (below, course.alphas)):
                 axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)
                 axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
-            title = course.title.replace("Throw, ", "Throw\n")
-            above.set_title(f"{title}\n{'first order' if kind[1] == 'first' else 'α-order'}".replace("\n", ", ", 1))
+            title = course.title.replace("Throw, ", "Throw,\n")
+            above.set_title(f"{title}, {ESTIMATORS[kind[1]]}")
         above.yaxis.set_major_formatter(FuncFormatter(_plain))
         below.set(ylim=(-0.05, 1.05), xlabel="step")
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("α")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    settings = outcome.settings
+    _legend(figure, axes, 2)
     caption = (
-        f"Adam from the same start, {settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of each "
-        "step; below, weight of the first order."
+        f"Adam from the same start, {outcome.settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of "
+        "each step; below, weight of the first order."
     )
     return figure, "Descents", caption
+
+
+def _legend(figure: Picture, axes: np.ndarray, columns: int) -> None:
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
 def _by_motor(flat: np.ndarray) -> np.ndarray:

@@ -52,15 +52,6 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
 
     The public estimators give the same numbers one by one. To compile takes longer than all rollouts, so bias, reference, α
     and descents share this one program.
-
-    Args:
-        objective: with either gradient.
-        params: the point.
-        key: consumed here.
-        num_samples: rollouts.
-
-    Returns:
-        What each estimator makes of them.
     """
     objective = objective.sized_for(params)
     parts = stream_parts(objective, params, key, plan_by_noise(objective, num_samples, None), control_variate=True)
@@ -76,7 +67,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         for number, name in enumerate(settings.tasks):
             key, descent_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), number))
             one = problem(name, settings)
-            workspace.check(one.scene)
+            workspace.check(one.task.scene)
             cells += [_cell(one, i, k, settings) for i, k in enumerate(jax.random.split(key, len(one.points)))]
             courses += _courses(one, descent_key, settings.num_seeds)
             advance_to(number + 1)
@@ -96,14 +87,14 @@ def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Ce
 
 
 def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: Key[Array, " count"]) -> Estimates:
-    objective = one.objective(gradient, jnp.asarray(one.stddev))
+    objective = one.objective(gradient, one.stddev)
     found = [estimated(objective, params, key, one.num_samples) for key in keys]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
     return Estimates(stacked.first, stacked.unbiased, stacked.alpha, stacked.reason)
 
 
 def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:
-    if one.descent is None:
+    if one.descent is None or not one.descent.num_steps:
         return []
     seeds = jax.random.split(key, num_seeds)
     return [
@@ -115,7 +106,7 @@ def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:
 
 def _course(one: Problem, descent: Descent, estimator: str, gradient: str, seeds: Key[Array, " seeds"]) -> Course:
     started = time.perf_counter()
-    objective = one.objective(gradient, jnp.asarray(descent.stddev))
+    objective = one.objective(gradient, descent.stddev)
     histories = [_descend(one, descent, objective, estimator, seed) for seed in seeds]
     seconds = time.perf_counter() - started
     costs = np.array([[step.cost for step in history] for history in histories])

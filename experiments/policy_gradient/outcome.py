@@ -1,7 +1,7 @@
 """The numbers of an experiment on policy gradients."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,16 +9,59 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from experiments.policy_gradient.settings import Settings
-from experiments.policy_gradient.statistics import (
-    Vectors,
-    cosine,
-    jackknife_error,
-    relative_squared_distance,
-    share_along,
-    squared_norm,
-)
 
 DISCRETE, ONSET = GRADIENTS = ("discrete", "onset")
+ESTIMATORS = {"first": "first order", "alpha": "α-order"}
+Vectors = Float[np.ndarray, "estimates dim"]
+
+
+def squared_norm(vectors: Vectors) -> float:
+    r"""Give the squared norm of the mean without bias.
+
+    That of the average holds the noise, too: with 200 coordinates more noise than signal. The mean of $x_i \cdot x_j$ over
+    different $i$ and $j$ does not.
+    It is below zero if noise is all there is.
+    """
+    count = len(vectors)
+    return float((np.sum(vectors.sum(axis=0) ** 2) - np.sum(vectors**2)) / (count * (count - 1)))
+
+
+def squared_distance(first: Vectors, reference: Vectors) -> float:
+    """Give the squared distance of two means, of independent estimates, without bias."""
+    return squared_norm(first) + squared_norm(reference) - 2 * float(first.mean(axis=0) @ reference.mean(axis=0))
+
+
+def share_along(first: Vectors, reference: Vectors) -> float:
+    """Give the component of a mean along another, as a share of that one's length; NaN where that is not known from zero."""
+    square = squared_norm(reference)
+    return float(first.mean(axis=0) @ reference.mean(axis=0)) / square if square > 0 else np.nan
+
+
+def cosine(first: Vectors, reference: Vectors) -> float:
+    """Give the cosine of the angle between two means; NaN where one of them is not known from zero."""
+    squares = squared_norm(first) * squared_norm(reference)
+    inner = float(first.mean(axis=0) @ reference.mean(axis=0))
+    return inner / np.sqrt(squares) if squares > 0 else np.nan
+
+
+def relative_squared_distance(first: Vectors, reference: Vectors) -> float:
+    """Give the squared distance of two means over the squared norm of the second; NaN where that is not known from zero."""
+    square = squared_norm(reference)
+    return squared_distance(first, reference) / square if square > 0 else np.nan
+
+
+def jackknife_error(function: Callable[..., float], *sets: Vectors) -> float:
+    """Give the standard error of a function of several sets of independent estimates: each is left out once.
+
+    References:
+        Efron, Tibshirani. An Introduction to the Bootstrap. Chapman & Hall 1993, section 11.5.
+    """
+    variance = 0.0
+    for i, vectors in enumerate(sets):
+        count = len(vectors)
+        without = [function(*sets[:i], np.delete(vectors, j, axis=0), *sets[i + 1 :]) for j in range(count)]
+        variance += (count - 1) * float(np.var(without))
+    return variance**0.5
 
 
 @dataclass(frozen=True)
@@ -70,11 +113,6 @@ class Cell:
         """Task and point."""
         return self.title if self.point == "start" else f"{self.title}, {self.point}"
 
-    @property
-    def dim(self) -> int:
-        """Number of parameters."""
-        return self.reference.shape[1]
-
     @functools.cached_property
     def norm(self) -> float:
         """Norm of the reference; NaN where it is not known from zero, as everything measured by it."""
@@ -103,17 +141,8 @@ class Cell:
         sets = self.estimates[gradient].first, self.reference
         return share_along(*sets), jackknife_error(share_along, *sets)
 
-    def cosine(self, gradient: str) -> float:
-        """Cosine between the first-order mean and the reference."""
-        return cosine(self.estimates[gradient].first, self.reference)
-
     def error(self, gradient: str, kind: str) -> float:
-        """Root-mean-square error of one estimate over the gradient's norm.
-
-        Args:
-            gradient: "discrete" or "onset".
-            kind: "first", "unbiased" or "mixed".
-        """
+        """Root-mean-square error of one estimate ("first", "unbiased" or "mixed") over the gradient's norm."""
         estimates, (reference, noise) = getattr(self.estimates[gradient], kind), self.reference_mean()
         return _root(float(np.mean(np.sum((estimates - reference) ** 2, axis=1)) - np.sum(noise**2))) / self.norm
 
@@ -146,10 +175,10 @@ class Course:
     seconds: float
 
     @property
-    def final(self) -> tuple[float, float]:
-        """Mean final cost, with its standard deviation over seeds (NaN for one)."""
+    def final(self) -> tuple[float, float | None]:
+        """Mean final cost, with its standard deviation over seeds (none of one)."""
         final = self.costs[:, -1]
-        return float(final.mean()), float(final.std(ddof=1)) if len(final) > 1 else np.nan
+        return float(final.mean()), float(final.std(ddof=1)) if len(final) > 1 else None
 
 
 @dataclass(frozen=True)
@@ -187,7 +216,7 @@ class Outcome:
                         "relative_bias_high": high,
                         "along": along,
                         "along_error": along_error,
-                        "cosine": cell.cosine(gradient),
+                        "cosine": cosine(cell.estimates[gradient].first, cell.reference),
                         "alpha": cell.alpha(gradient)[0],
                         **{f"error_{kind}": cell.error(gradient, kind) for kind in ("first", "unbiased", "mixed")},
                     }
@@ -200,13 +229,11 @@ class Outcome:
                     "point": f"descent by {course.estimator}",
                     "gradient": course.gradient,
                     "final_cost": final,
-                    "final_cost_stddev": spread,
+                    "final_cost_stddev": "" if spread is None else spread,
                     "alpha": float(course.alphas.mean()),
                 }
             )
-        # One table holds both: what a row has nothing to say about is empty.
-        columns = dict.fromkeys(key for row in rows for key in row)
-        return [{column: row.get(column, "") for column in columns} for row in rows]
+        return rows
 
 
 def _mean(vectors: Vectors) -> tuple[np.ndarray, np.ndarray]:

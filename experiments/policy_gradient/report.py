@@ -1,10 +1,12 @@
 """The answer of the experiment on policy gradients in words, computed from its numbers."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
-from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome
 from experiments.report import Table
-from experiments.words import joined, quantity
+from experiments.words import joined, percent, quantity
 from mjxgrad.estimators import Reason
 
 NEGLIGIBLE = 0.05
@@ -20,7 +22,7 @@ def verdict(outcome: Outcome) -> str:
         discrete, onset = ([cell.bias(gradient)[0] for cell in repaired] for gradient in GRADIENTS)
         sentences.append(
             f"The discrete first-order gradient is biased at {len(repaired)} of {len(smooth)} points without a jump of the cost, "
-            f"by {_range(discrete)} of the gradient's norm, where contact that begins within the step leaves {_range(onset)}."
+            f"by {_span(discrete)} of the gradient's norm, where contact that begins within the step leaves {_span(onset)}."
         )
     worse = [cell for cell in smooth if _is_biased(cell, ONSET) and cell.bias(ONSET)[1] > cell.bias(DISCRETE)[2]]
     sentences.append(
@@ -31,10 +33,10 @@ def verdict(outcome: Outcome) -> str:
     jumps = [cell for cell in outcome.cells if cell.hits_and_misses]
     missed = [cell for cell in jumps if _is_biased(cell, ONSET)]
     if missed:
-        alphas = [cell.alpha(ONSET)[0] for cell in missed]
+        biases, alphas = zip(*((cell.bias(ONSET)[0], cell.alpha(ONSET)[0]) for cell in missed), strict=True)
         sentences.append(
             f"Hit or miss it does not see: at {len(missed)} of {len(jumps)} points where the noise covers a jump it is biased by "
-            f"{_range([cell.bias(ONSET)[0] for cell in missed])}, and α-order gives it a weight of {_span(alphas)}."
+            f"{_span(biases)}, and α-order gives it a weight of {_span(alphas, '{:.2f}'.format)}."
         )
     return " ".join(sentences)
 
@@ -80,20 +82,18 @@ def tables(outcome: Outcome) -> list[Table]:
         "to either side; bold where it is not chance and above five per cent. Component along the reference: 1 is right. Errors: "
         "root mean square of one estimate."
     )
-    found = [Table(columns, rows, caption, frozenset(emphasised))]
-    if outcome.courses:
-        found.append(_descents(outcome))
-    return found
+    found = [Table(columns, rows, caption, frozenset(emphasised)), _descents(outcome)]
+    return [table for table in found if table.rows]
 
 
 def _descents(outcome: Outcome) -> Table:
     rows = [
         [
             course.title,
-            "first order" if course.estimator == "first" else "α-order",
+            ESTIMATORS[course.estimator],
             course.gradient,
             f"{course.costs[:, 0].mean():.4g}".replace("-", "−"),
-            quantity(course.final[0], _error(course.final[1])),
+            quantity(*course.final),
             f"{course.alphas[:, :-1].mean():.2f}",
             f"{course.seconds:.1f}",
         ]
@@ -138,15 +138,5 @@ def _reasons(cell: Cell, gradient: str) -> str:
     return ", ".join(f"{word} {share:.0%}" for word, share in shares.items() if share > 0)
 
 
-def _error(spread: float) -> float | None:
-    return None if np.isnan(spread) else spread
-
-
-def _range(values: list[float]) -> str:
-    low, high = (f"{100 * value:.0f}" if value > 0.1 else f"{100 * value:.2g}" for value in (min(values), max(values)))
-    return f"{low} %" if low == high else f"{low} to {high} %"
-
-
-def _span(values: list[float]) -> str:
-    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
-    return low if low == high else f"{low} to {high}"
+def _span(values: Sequence[float], write: Callable[[float], str] = percent) -> str:
+    return " to ".join(dict.fromkeys(map(write, (min(values), max(values)))))

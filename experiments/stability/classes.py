@@ -34,24 +34,8 @@ class Motion(enum.IntEnum):
     @property
     def label(self) -> str:
         """In words."""
-        return _MOTIONS[self]
-
-    @property
-    def rank(self) -> int:
-        """For comparing: all that are fine have rank 0."""
-        return max(0, int(self) - int(Motion.BOUNCES_RIGHT))
-
-
-_MOTIONS = {
-    Motion.SETTLES: "settles",
-    Motion.MOVES: "moves on",
-    Motion.BOUNCES_RIGHT: "bounces right",
-    Motion.BOUNCES_OTHERWISE: "bounces otherwise",
-    Motion.GAINS_ENERGY: "gains energy",
-    Motion.TUNNELS: "tunnels",
-    Motion.UNSOLVED: "not solved",
-    Motion.DIVERGES: "diverges",
-}
+        others = {Motion.MOVES: "moves on", Motion.UNSOLVED: "not solved"}
+        return others.get(self, self.name.lower().replace("_", " "))
 
 
 class Derivative(enum.IntEnum):
@@ -98,14 +82,7 @@ class MotionRecord(eqx.Module):
 
 
 def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:
-    """Say of each rollout what it did; of several failures the worst.
-
-    Args:
-        record: of the rollouts.
-
-    Returns:
-        Values of `Motion`.
-    """
+    """Say of each rollout what it did, by values of `Motion`; of several failures the worst."""
     knows = np.isfinite(record.restitution) & np.isfinite(record.expected)
     with np.errstate(invalid="ignore"):
         is_right = np.abs(record.restitution - record.expected) <= BOUNCE

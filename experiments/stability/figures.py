@@ -3,16 +3,18 @@
 import functools
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
 from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
-from experiments.stability.grid import AXES
-from experiments.stability.limits import limit_curve
+from experiments.stability.grid import AXES, Points, load
 from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
+from experiments.stability.scenes import RADIUS, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
+from mjxgrad.tasks.textbook import Bounce
 
 _LIMITS = {
     "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",
@@ -75,7 +77,7 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     for i, (across, up) in enumerate(one.points.planes):
         for j, (name, what) in enumerate(columns):
             axis = axes[i, j]
-            values = one.plane(i, getattr(one.behaviour[name], what))
+            values = one.points.plane(i, one.found[what].sel(simulator=name).values)
             _image(axis, values, MOTION_COLOURS if what == "motion" else DERIVATIVE_COLOURS)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
@@ -118,17 +120,35 @@ def _short(value: float) -> str:
 
 
 def _limit(axis: Axes, one: SceneOutcome, index: int) -> None:
-    """Draw the analytic limit, in the coordinates of the squares."""
-    curve = limit_curve(one.scene, one.points, index)
-    if curve is not None:
-        axis.contour(curve, levels=[0.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+    """Draw the analytic limit, if one passes through the plane: where a logarithm is 0, in the coordinates of the squares."""
+    names = set(one.points.planes[index])
+    if one.scene.family == "two balls" and "speed" in names:
+        values = _crossing(one.scene, one.points)
+    elif names & {"timestep", "time_constant", "damping_ratio", "stiffness"}:
+        values = load(one.scene, one.points)
+    else:
+        return
+    image = one.points.plane(index, np.log(values))
+    if image.min() < 0 < image.max():
+        axis.contour(image, levels=[0.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+
+
+def _crossing(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give how far two balls go into each other, over the distance at which their centres meet: beyond 1 they pass.
+
+    One step carries them $v h$, unseen; a bounce goes $v \sqrt e / \omega_0$ deep.
+    """
+    springs = np.array([effective(scene, points[i]) for i in range(len(points))])
+    frequency, damping = np.sqrt(springs[:, 0]), springs[:, 1]
+    restitution = np.asarray(Bounce(2 / damping, damping / (2 * frequency)).restitution)
+    time = np.maximum(points.values["timestep"], np.sqrt(restitution) / frequency)
+    return points.values["speed"] * time / (2 * RADIUS)
 
 
 def _legend(figure: Picture, one: SceneOutcome) -> None:
-    shown = one.points.family >= 0
-    kinds = np.unique(np.concatenate([behaviour.motion[shown] for behaviour in one.behaviour.values()]))
-    ours = [behaviour for name, behaviour in one.behaviour.items() if name != C_MUJOCO]
-    slopes = np.unique(np.concatenate([behaviour.derivative[shown] for behaviour in ours]))
+    shown = one.found.isel(point=one.points.family >= 0)
+    kinds = np.unique(shown.motion)
+    slopes = np.unique(shown.derivative.drop_sel(simulator=C_MUJOCO))
     handles = [Patch(color=MOTION_COLOURS[Motion(k)], label=Motion(k).label) for k in kinds]
     handles += [
         Patch(color=DERIVATIVE_COLOURS[Derivative(k)], label=f"gradient {Derivative(k).label}")

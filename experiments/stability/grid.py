@@ -3,14 +3,15 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from experiments.stability.scenes import DEFAULTS, StabilityScene
+from experiments.stability.scenes import DEFAULTS, StabilityScene, effective
+from mjxgrad.scene.contact_check import largest_stable_step, steepest
 
 Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 """From places in [0, 1] to values."""
-RANDOM = "random"
 
 # In the planes of a single bounce the impedance is constant, for a restitution in closed form.
 CONSTANT = {"impedance_first": 0.9, "impedance_last": 0.9}
@@ -36,15 +37,8 @@ PLANES: dict[str, tuple[tuple[str, str, dict[str, float]], ...]] = {
 }
 """By scene, or by its family: the parameter across, the one up, and what else differs from the default."""
 _CONTACT = (
-    "timestep",
-    "time_constant",
-    "damping_ratio",
-    "stiffness",
-    "impedance_first",
-    "impedance_last",
-    "width",
-    "speed",
-)
+    "timestep", "time_constant", "damping_ratio", "stiffness", "impedance_first", "impedance_last", "width", "speed"
+)  # fmt: skip
 _RANDOM = {
     "ball": (*_CONTACT, "margin"),
     "sphere": (*_CONTACT, "margin", "friction", "depth"),
@@ -75,19 +69,19 @@ class Points:
     def __getitem__(self, index: int) -> dict[str, float]:
         return {name: float(value[index]) for name, value in self.values.items()}
 
+    @property
+    def flown(self) -> Float[np.ndarray, " points"]:
+        """What a body flies in one step (m)."""
+        return self.values["speed"] * self.values["timestep"]
+
+    def plane(self, index: int, values: np.ndarray) -> np.ndarray:
+        """Arrange what belongs to one plane, of one value per point, as an image, the parameter across along columns."""
+        chosen = values[self.family == index]
+        return chosen.reshape(round(np.sqrt(len(chosen))), -1)
+
 
 def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -> Points:
-    """List the points of a scene.
-
-    Args:
-        scene: of the catalogue.
-        resolution: points along each side of a plane.
-        num_random: points of the hypercube.
-        seed: of the hypercube.
-
-    Returns:
-        The points, plane by plane, the parameter across changing fastest, then the random ones.
-    """
+    """List the points of a scene: plane by plane, the parameter across changing fastest, then the random ones."""
     planes = PLANES.get(scene.name, PLANES[scene.family])
     places = np.linspace(0, 1, resolution)
     blocks = []
@@ -107,6 +101,22 @@ def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -
     family = np.repeat([*range(len(planes)), -1], [len(block["timestep"]) for block in blocks])
     values = {name: np.concatenate([block[name] for block in blocks]) for name in DEFAULTS}
     return Points(values, family, tuple((across, up) for across, up, _ in planes))
+
+
+def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give the time step over the largest at which one spring gains no energy: unstable from 1 on.
+
+    $h \omega_0 / (2 (\sqrt{1 + \zeta^2} - \zeta))$, in the standard format $h / t_c$ over $2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$.
+    """
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        point = points[i]
+        impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
+        frequency = np.sqrt(stiffness)
+        limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
+        found[i] = point["timestep"] * frequency / limit
+    return found
 
 
 def _block(count: int, given: Mapping[str, np.ndarray | float]) -> dict[str, Float[np.ndarray, " n"]]:

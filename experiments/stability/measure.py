@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
+import xarray as xr
 from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
 from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import Points, points
-from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
@@ -26,7 +27,11 @@ _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
 _PARAMETER_WIDTHS = (1e-6, 2e-7)
 _TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
 _EVENT_TOLERANCE = 0.1
-
+# What C MuJoCo is not asked for.
+_NOTHING = {
+    "derivative_by_parameters": NOT_ASKED, "event_derivative": NOT_ASKED, "silent": False, "untold": False,
+    "gradient_unflagged_by_rollout": False, "missed": False, "apart_from_c": 0.0,
+}  # fmt: skip
 
 _Case = tuple[StabilityScene, Points, Reference, np.ndarray]
 
@@ -49,9 +54,8 @@ class _Runs:
 def largest(num_steps: int) -> float:
     """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
 
-    Args:
-        num_steps: of the rollout. A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of
-            the steps that follow adds to the position.
+    A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of the steps that follow adds to the
+    position.
     """
     return 100.0 * 2 * num_steps
 
@@ -68,8 +72,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             advance_to(len(references))
     expected = [_expected(scene, grid) for scene, grid in zip(scenes, grids, strict=True)]
     cases = list(zip(scenes, grids, references, expected, strict=True))
-    behaviours = [{C_MUJOCO: _of_c(*case, settings)} for case in cases]
-    apart: list[dict[str, np.ndarray]] = [{} for _ in cases]
+    found = [{C_MUJOCO: _of_c(*case, settings)} for case in cases]
     truths: list[np.ndarray] = []
     for precision in settings.precisions:
         with _precision(precision):
@@ -79,10 +82,21 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         else:
             runs = _judge_solves(cases, runs, size.chunk, workspace)
         for i, (case, run) in enumerate(zip(cases, runs, strict=True)):
-            behaviours[i][precision] = _of_mjxgrad(*case, run, truths[i], precision, settings)
-            apart[i][precision] = _apart(case[1], run.discrete.course, case[2].course, settings.num_steps)
-    found = zip(scenes, grids, behaviours, apart, strict=True)
-    return Outcome(settings, [SceneOutcome(*one) for one in found])
+            found[i][precision] = _of_mjxgrad(*case, run, truths[i], precision, settings)
+    datasets = [_labelled(one, len(grid)) for one, grid in zip(found, grids, strict=True)]
+    return Outcome(settings, [SceneOutcome(*one) for one in zip(scenes, grids, datasets, strict=True)])
+
+
+def _labelled(found: dict[str, dict[str, np.ndarray]], count: int) -> xr.Dataset:
+    """Label what each simulator did on the points of a scene."""
+    keys = list(found["float64"])
+    stacks = {
+        key: np.stack([np.broadcast_to(one.get(key, _NOTHING.get(key)), count) for one in found.values()])
+        for key in keys
+    }
+    return xr.Dataset(
+        {key: (("simulator", "point"), stack) for key, stack in stacks.items()}, {"simulator": list(found)}
+    )
 
 
 @contextmanager
@@ -137,27 +151,21 @@ def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: 
 
 def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):
     """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
-    flown = _flown_in_step(grid)
     shift, push = direction(scene, num_steps, grid.values["timestep"])
     changes = _changes(reference)
-    quotients = []
-    for width in WIDTHS:
-        ends = []
-        for side in (1, -1):
-            step = (side * width * flown)[:, None]
-            start = (reference.qpos + step * shift, reference.qvel + step * push)
-            ends.append(program.values(reference.fields, *start))
-        quotients.append((ends[0] - ends[1]) / (2 * width * flown))
-    for width in _PARAMETER_WIDTHS:
-        ends = []
-        for side in (1, -1):
-            fields = {
-                name: value + side * width * changes.get(name, np.zeros_like(value))
-                for name, value in reference.fields.items()
-            }
-            ends.append(program.values(fields, reference.qpos, reference.qvel))
-        quotients.append((ends[0] - ends[1]) / (2 * width * flown * num_steps))
-    return np.array(quotients).reshape(2, 2, -1)
+
+    def from_start(width: float) -> np.ndarray:
+        step = (width * grid.flown)[:, None]
+        return program.values(reference.fields, reference.qpos + step * shift, reference.qvel + step * push)
+
+    def by_parameters(width: float) -> np.ndarray:
+        fields = {name: value + width * changes.get(name, 0.0) for name, value in reference.fields.items()}
+        return program.values(fields, reference.qpos, reference.qvel)
+
+    kinds = ((from_start, WIDTHS, grid.flown), (by_parameters, _PARAMETER_WIDTHS, grid.flown * num_steps))
+    return np.array(
+        [[(end(width) - end(-width)) / (2 * width * unit) for width in widths] for end, widths, unit in kinds]
+    )
 
 
 def _changes(reference: Reference) -> dict[str, np.ndarray]:
@@ -167,10 +175,6 @@ def _changes(reference: Reference) -> dict[str, np.ndarray]:
         for name, value in reference.fields.items()
         if name in _RELATIVE
     }
-
-
-def _flown_in_step(grid: Points) -> Float[np.ndarray, " points"]:
-    return grid.values["speed"] * grid.values["timestep"]
 
 
 def _expected(scene: StabilityScene, grid: Points) -> Float[np.ndarray, " points"]:
@@ -221,21 +225,14 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(scene: StabilityScene, grid: Points, reference: Reference, expected, settings: Settings) -> Behaviour:
+def _of_c(
+    scene: StabilityScene, grid: Points, reference: Reference, expected: np.ndarray, settings: Settings
+) -> dict[str, np.ndarray]:
     record = _record(scene, grid, reference.qpos, reference.course, expected)
     coarse, fine = reference.differences
-    is_finite = np.isfinite(fine)
-    derivative = classify_derivative(
-        fine,
-        is_finite,
-        record.is_sound,
-        fine,
-        np.abs(fine - coarse),
-        largest=largest(settings.num_steps),
-        tolerance=_TOLERANCE["float64"],
-    )
-    none = np.zeros(len(grid), bool)
-    return Behaviour(classify_motion(record), derivative, None, None, none, none, none, none, record.gain)
+    bounds = {"largest": largest(settings.num_steps), "tolerance": _TOLERANCE["float64"]}
+    derivative = classify_derivative(fine, np.isfinite(fine), record.is_sound, fine, np.abs(fine - coarse), **bounds)
+    return {"motion": classify_motion(record), "derivative": derivative, "energy": record.gain}
 
 
 def _of_mjxgrad(
@@ -247,55 +244,55 @@ def _of_mjxgrad(
     truth: np.ndarray,
     precision: str,
     settings: Settings,
-) -> Behaviour:
+) -> dict[str, np.ndarray]:
     run, event = runs.discrete, runs.event
     record = _record(scene, grid, reference.qpos, run.course, expected)
+    motion = classify_motion(record)
     shift, push = direction(scene, settings.num_steps, grid.values["timestep"])
-    flown = _flown_in_step(grid) * settings.num_steps
-    bound, tolerance = largest(settings.num_steps), _TOLERANCE[precision]
-    along_start = along(run, {"qpos": shift, "qvel": push})
-    along_parameters = along(run, _changes(reference)) / flown
+    flown = grid.flown * settings.num_steps
+    bound = largest(settings.num_steps)
+    slopes = [along(run, {"qpos": shift, "qvel": push}), along(run, _changes(reference)) / flown]
     kinds = [
         classify_derivative(
-            value,
+            slope,
             run.is_gradient_finite,
             record.is_sound,
             fine,
             np.abs(fine - coarse),
             largest=bound,
-            tolerance=tolerance,
+            tolerance=_TOLERANCE[precision],
         )
-        for value, (coarse, fine) in zip((along_start, along_parameters), truth, strict=True)
+        for slope, (coarse, fine) in zip(slopes, truth, strict=True)
     ]
-    is_wild = ~run.is_gradient_finite | ~(np.abs(along_start) <= bound) | ~(np.abs(along_parameters) <= bound)
-    is_sound = np.asarray(
-        jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
-            (run.gradient[0], along_start, along_parameters),
-            ~record.is_sound,
-        )
+    is_wild = ~run.is_gradient_finite | ~(np.abs(slopes) <= bound).all(axis=0)
+    judged = jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
+        (run.gradient[0], *slopes), ~record.is_sound
     )
-    return Behaviour(
-        classify_motion(record),
-        kinds[0],
-        kinds[1],
-        None if event is None else _judge_event(record, event, bound),
-        run.is_silent | (False if event is None else event.is_silent),
-        (classify_motion(record) == Motion.UNSOLVED) & ~run.is_unsolved,
-        is_wild & record.is_sound,
-        is_wild & record.is_sound & is_sound,
-        record.gain,
-    )
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(run.course.qpos - reference.course.qpos).max(axis=1) / flown
+    return {
+        "motion": motion,
+        "derivative": kinds[0],
+        "derivative_by_parameters": kinds[1],
+        "event_derivative": np.array(NOT_ASKED) if event is None else _judge_event(record, event, bound),
+        "silent": run.is_silent if event is None else run.is_silent | event.is_silent,
+        "untold": (motion == Motion.UNSOLVED) & ~run.is_unsolved,
+        "gradient_unflagged_by_rollout": is_wild & record.is_sound,
+        "missed": is_wild & record.is_sound & np.asarray(judged),
+        "apart_from_c": apart,
+        "energy": record.gain,
+    }
 
 
 def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
     """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
-    derivative = run.gradient[1][:, 0]
     truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
     return classify_derivative(
-        derivative, run.is_gradient_finite, record.is_sound, truth, 0 * truth, largest=bound, tolerance=_EVENT_TOLERANCE
+        run.gradient[1][:, 0],
+        run.is_gradient_finite,
+        record.is_sound,
+        truth,
+        0 * truth,
+        largest=bound,
+        tolerance=_EVENT_TOLERANCE,
     )
-
-
-def _apart(grid: Points, ours: Course, theirs: Course, num_steps: int) -> Float[np.ndarray, " points"]:
-    with np.errstate(invalid="ignore"):
-        return np.abs(ours.qpos - theirs.qpos).max(axis=1) / (_flown_in_step(grid) * num_steps)
