@@ -101,12 +101,7 @@ def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
 
 @eqx.filter_jit
 def _optimised(
-    task: PlanarPusher,
-    settings: Settings,
-    controls: jax.Array,
-    smoother: Smoother,
-    schedule: np.ndarray,
-    seed: int,
+    task: PlanarPusher, settings: Settings, controls: jax.Array, smoother: Smoother, schedule: np.ndarray, seed: int
 ) -> Plan:
     limit, weight = task.speed_limit, jnp.array(_ROD)
     return optimise_trajectory(

@@ -39,10 +39,7 @@ class Settings(RunSettings):
     """Trajectory optimisation from resting controls, or a search tree."""
     models: Annotated[
         tuple[Literal["analytic", "mean_jacobian", "least_squares", "none"], ...], Field(min_length=1)
-    ] = (
-        "analytic",
-        "none",
-    )
+    ] = ("analytic", "none")
     """Which linear models to compare; the first is the one that figures and video show."""
     finger: tuple[Finite, Finite] = (0.0, -0.15)
     """Where the finger starts (m)."""

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome, mean_and_error
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
@@ -29,12 +29,13 @@ def summary(outcome: Outcome):
     rows = np.arange(len(cells))
     for gradient, shift in ((DISCRETE, -0.14), (ONSET, 0.14)):
         look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ls": "", "ms": 5}
-        bias, low, high = np.maximum(np.array([cell.bias(gradient) for cell in cells]).T, _SMALLEST)
+        judged = [cell.judged[gradient] for cell in cells]
+        bias, low, high = np.maximum(np.array([one[:3] for one in judged]).T, _SMALLEST)
         spread = np.abs(np.stack([bias - low, high - bias]))
         axes[0, 0].errorbar(bias, rows + shift, xerr=spread, label=f"{gradient} gradient", elinewidth=1, **look)
-        alpha, alpha_error = np.array([cell.alpha(gradient) for cell in cells]).T
+        alpha, alpha_error = np.array([(one.alpha, one.alpha_error) for one in judged]).T
         axes[0, 1].errorbar(alpha, rows + shift, xerr=2 * alpha_error, elinewidth=1, **look)
-        axes[0, 2].plot([cell.error(gradient, "mixed") for cell in cells], rows + shift, **look)
+        axes[0, 2].plot([one.error_mixed for one in judged], rows + shift, **look)
     for axis in axes[0]:
         for row in rows[[cell.hits_and_misses for cell in cells]]:
             axis.axhspan(row - 0.5, row + 0.5, color=MUTED, alpha=0.18, lw=0)
@@ -68,18 +69,19 @@ def throw(outcome: Outcome):
     for (left, right), name in zip(axes, names, strict=True):
         shown = [cell for cell in cells if cell.name == name]
         angle = np.array([float(cell.point.split()[0]) for cell in shown])
-        reference = np.array([cell.reference_mean() for cell in shown])[:, :, 0]
+        reference = np.array([mean_and_error(cell.reference) for cell in shown])[:, :, 0]
         left.errorbar(
             angle, reference[:, 0], 2 * reference[:, 1], color=REFERENCE, lw=2.2, capsize=3, label="unbiased reference"
         )
         for gradient, shift in ((DISCRETE, -0.006), (ONSET, 0.006)):
             look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ms": 5, "lw": 1, "ls": (0, (4, 2))}
-            first = np.array([cell.first_mean(gradient) for cell in shown])[:, :, 0]
+            first = np.array([mean_and_error(cell.estimates[gradient].first) for cell in shown])[:, :, 0]
             left.errorbar(
                 angle + shift, first[:, 0], 2 * first[:, 1], label=f"first order, {gradient} gradient", **look
             )
-            alpha = np.array([cell.alpha(gradient) for cell in shown])
-            right.errorbar(angle + shift, alpha[:, 0], 2 * alpha[:, 1], **look)
+            judged = [cell.judged[gradient] for cell in shown]
+            spread = [2 * one.alpha_error for one in judged]
+            right.errorbar(angle + shift, [one.alpha for one in judged], spread, **look)
         for axis in (left, right):
             for cell, place in zip(shown, angle, strict=True):
                 if cell.hits_and_misses:
@@ -104,16 +106,15 @@ def push(outcome: Outcome):
     cells = outcome.of(*_PUSHES)
     figure, axes = subplots(1, len(cells), height=3.4)
     for axis, cell in zip(axes[0], cells, strict=True):
-        mean, error = cell.reference_mean()
+        mean, error = mean_and_error(cell.reference)
         step = np.arange(len(mean))
         axis.fill_between(
             step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
         )
         for gradient in GRADIENTS:
             style = {"ls": (0, (4, 2))} if gradient == ONSET else {"lw": 2.4}
-            axis.plot(
-                step, cell.first_mean(gradient)[0], color=_COLOURS[gradient], label=f"{gradient} gradient", **style
-            )
+            first = cell.estimates[gradient].first.mean(axis=0)
+            axis.plot(step, first, color=_COLOURS[gradient], label=f"{gradient} gradient", **style)
         axis.set(title=cell.title, xlabel="step")
         axis.yaxis.set_major_formatter(FuncFormatter(_plain))
     axes[0, 0].set_ylabel("gradient, 1/N")
@@ -129,16 +130,15 @@ def hopper(outcome: Outcome):
     """A panel per motor: components of the policy gradient by what is observed."""
     (cell,) = outcome.of("hopper")
     figure, axes = subplots(1, 3, height=3.8, sharey=True)
-    looks = [(REFERENCE, "D", "unbiased reference", cell.reference_mean(), 0.0)]
-    looks += [
-        (_COLOURS[gradient], _MARKERS[gradient], f"first order, {gradient} gradient", cell.first_mean(gradient), shift)
-        for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True)
-    ]
+    looks = [(REFERENCE, "D", "unbiased reference", cell.reference, 0.0)]
+    for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True):
+        label, first = f"first order, {gradient} gradient", cell.estimates[gradient].first
+        looks.append((_COLOURS[gradient], _MARKERS[gradient], label, first, shift))
     places = np.arange(len(_OBSERVED))
     for motor, axis in enumerate(axes[0]):
         axis.axhline(0, color=MUTED, lw=0.8)
-        for colour, marker, label, (mean, error), shift in looks:
-            values, errors = _by_motor(mean)[motor], _by_motor(error)[motor]
+        for colour, marker, label, vectors, shift in looks:
+            values, errors = (_by_motor(flat)[motor] for flat in mean_and_error(vectors))
             axis.errorbar(
                 places + shift, values, 2 * errors, color=colour, marker=marker, ms=5, ls="", elinewidth=1, label=label
             )

@@ -97,9 +97,7 @@ def _throw(name: str, settings: Settings) -> Problem:
     softness = DEFAULT_CONTACT if is_default else mg.tasks.wall_softness(WALL_STIFFNESS)
     points = [
         Point(
-            f"{angle:g} rad",
-            jnp.array([angle]),
-            any(abs(angle - jump) < 3 * settings.angle_stddev for jump in _JUMPS),
+            f"{angle:g} rad", jnp.array([angle]), any(abs(angle - jump) < 3 * settings.angle_stddev for jump in _JUMPS)
         )
         for angle in settings.angles
     ]

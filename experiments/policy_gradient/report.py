@@ -16,15 +16,15 @@ NEGLIGIBLE = 0.05
 def verdict(outcome: Outcome) -> str:
     """Say where which first-order estimate is right."""
     smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]
-    repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_better(cell)]
+    repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_beyond(cell, DISCRETE, ONSET)]
     sentences = []
     if repaired:
-        discrete, onset = ([cell.bias(gradient)[0] for cell in repaired] for gradient in GRADIENTS)
+        discrete, onset = ([cell.judged[gradient].bias for cell in repaired] for gradient in GRADIENTS)
         sentences.append(
             f"The discrete first-order gradient is biased at {len(repaired)} of {len(smooth)} points without a jump of the cost, "
             f"by {_span(discrete)} of the gradient's norm, where contact that begins within the step leaves {_span(onset)}."
         )
-    worse = [cell for cell in smooth if _is_biased(cell, ONSET) and cell.bias(ONSET)[1] > cell.bias(DISCRETE)[2]]
+    worse = [cell for cell in smooth if _is_biased(cell, ONSET) and _is_beyond(cell, ONSET, DISCRETE)]
     sentences.append(
         f"Contact that begins within the step is worse in {joined([cell.label for cell in worse])}."
         if worse
@@ -33,7 +33,7 @@ def verdict(outcome: Outcome) -> str:
     jumps = [cell for cell in outcome.cells if cell.hits_and_misses]
     missed = [cell for cell in jumps if _is_biased(cell, ONSET)]
     if missed:
-        biases, alphas = zip(*((cell.bias(ONSET)[0], cell.alpha(ONSET)[0]) for cell in missed), strict=True)
+        biases, alphas = zip(*((cell.judged[ONSET].bias, cell.judged[ONSET].alpha) for cell in missed), strict=True)
         sentences.append(
             f"Hit or miss it does not see: at {len(missed)} of {len(jumps)} points where the noise covers a jump it is biased by "
             f"{_span(biases)}, and α-order gives it a weight of {_span(alphas, '{:.2f}'.format)}."
@@ -60,17 +60,17 @@ def tables(outcome: Outcome) -> list[Table]:
         for gradient in GRADIENTS:
             if _is_biased(cell, gradient):
                 emphasised.add((len(rows), 3))
-            alpha, alpha_error = cell.alpha(gradient)
+            one = cell.judged[gradient]
             rows.append(
                 [
                     cell.label if gradient == DISCRETE else "",
                     f"{cell.norm:.3g}" if gradient == DISCRETE else "",
                     gradient,
-                    _bias(cell, gradient),
-                    quantity(*cell.along(gradient)),
-                    quantity(alpha, alpha_error),
+                    f"{one.bias:.1%} ({one.low:.1%} to {one.high:.1%})",
+                    quantity(one.along, one.along_error),
+                    quantity(one.alpha, one.alpha_error),
                     _reasons(cell, gradient),
-                    *(f"{cell.error(gradient, kind):.1%}" for kind in ("first", "unbiased", "mixed")),
+                    *(f"{error:.1%}" for error in one[-3:]),
                 ]
             )
     columns = (
@@ -107,22 +107,17 @@ def _descents(outcome: Outcome) -> Table:
 
 def _is_biased(cell: Cell, gradient: str) -> bool:
     """Say whether a bias is beyond chance, and worth speaking of."""
-    bias, low, _ = cell.bias(gradient)
-    return low > 0 and bias > NEGLIGIBLE
+    return cell.judged[gradient].low > 0 and cell.judged[gradient].bias > NEGLIGIBLE
 
 
-def _is_better(cell: Cell) -> bool:
-    return cell.bias(ONSET)[2] < cell.bias(DISCRETE)[1]
+def _is_beyond(cell: Cell, larger: str, smaller: str) -> bool:
+    return cell.judged[larger].low > cell.judged[smaller].high
 
 
 def _change(cell: Cell) -> float:
     """How far apart both first-order means are, over the norm of the gradient; from the same rollouts."""
-    return float(np.linalg.norm(cell.first_mean(ONSET)[0] - cell.first_mean(DISCRETE)[0])) / cell.norm
-
-
-def _bias(cell: Cell, gradient: str) -> str:
-    bias, low, high = cell.bias(gradient)
-    return f"{bias:.1%} ({low:.1%} to {high:.1%})"
+    onset, discrete = (cell.estimates[gradient].first.mean(axis=0) for gradient in (ONSET, DISCRETE))
+    return float(np.linalg.norm(onset - discrete)) / cell.norm
 
 
 def _reasons(cell: Cell, gradient: str) -> str:
