@@ -39,14 +39,11 @@ class Run:
 
 
 def load_runs(file: str, overrides: list[str]) -> list[Run]:
-    """Read a configuration: one run, or one per combination of its `[sweep]` table.
+    """Read a configuration: one run, or one per combination of its `[sweep]` table, its last key changing fastest.
 
     Args:
         file: a path to a TOML file, or the name of one in `experiments/`.
         overrides: `key=value` in TOML syntax, dotted keys included. A key that the file sweeps is no longer swept.
-
-    Returns:
-        The runs in the order of the sweep, its last key changing fastest.
 
     Raises:
         ConfigurationError: naming every mistake in the file and the overrides.

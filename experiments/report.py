@@ -71,19 +71,7 @@ class Report:
 
 
 def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
-    """Write a report as one HTML file that needs nothing beside it.
-
-    Args:
-        report: the outcome.
-        folder: where its pictures and its video lie.
-        name: of the run.
-        question: what it answers.
-        expected: what was expected, or empty.
-        about: headed lists of settings and circumstances.
-
-    Returns:
-        The page.
-    """
+    """Write a report as one HTML page that needs nothing beside it; `about` are headed lists of settings and circumstances."""
     body = [
         f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
         f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
@@ -103,15 +91,7 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
 
 
 def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
-    """Write the page over a sweep: each combination, its main numbers, its verdict and the way to its report.
-
-    Args:
-        runs: the combinations.
-        folders: their output folders, complete.
-
-    Returns:
-        The page.
-    """
+    """Write the page over a sweep: each combination, its main numbers, its verdict and the way to its report."""
     name, keys = runs[0].name, list(runs[0].varied)
     summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
     # In the order of their first appearance.

@@ -28,17 +28,8 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 
     A result whose settings, source and versions are unchanged is kept: an interrupted sweep goes on where it stopped.
 
-    Args:
-        file: a TOML file, or the name of one in `experiments/`.
-        overrides: `key=value` in TOML syntax.
-        output: the folder that holds each run's folder.
-        force: run what is unchanged, too.
-
-    Returns:
-        The path of the report.
-
-    Raises:
-        ExperimentError: if the run cannot go on.
+    Files and overrides are those of `load_runs`, `output` is the folder that holds each run's folder, and the path that of the
+    report. An `ExperimentError` says why a run cannot go on.
     """
     runs = load_runs(file, overrides)
     command = shlex.join(["python", "-m", "experiments", "run", file, *overrides])

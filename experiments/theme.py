@@ -6,7 +6,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from cycler import cycler
 
 matplotlib.use("Agg")
 
@@ -19,47 +18,17 @@ from experiments.words import superscript
 # Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
 FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
 DEFAULT, MUTED = "#cc79a7", "#8b94a1"
+_STYLE = Path(__file__).parent / "report.mplstyle"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
 
 # By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
 Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
 
-RULES: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9.5,
-    "axes.labelcolor": "#3b4452",
-    "axes.edgecolor": "#9aa3af",
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.prop_cycle": cycler(color=[FIRST, ZEROTH, "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]),
-    "axes.grid": True,
-    "grid.color": "#e8eaed",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "xtick.color": "#9aa3af",
-    "ytick.color": "#9aa3af",
-    "xtick.labelcolor": "#3b4452",
-    "ytick.labelcolor": "#3b4452",
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.6,
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 160,
-    "savefig.facecolor": "white",
-}
-
 
 def subplots(rows: int, columns: int, *, height: float, **settings):
     """Make a figure in the theme, of a height in inches, and an array (rows, columns) of axes."""
     # Titles, ticks and legends read the rules when they are made, so a context around this call would not reach them.
-    plt.rcParams.update(RULES)
+    plt.style.use(_STYLE)
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 

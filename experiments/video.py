@@ -24,17 +24,9 @@ def film(
     columns: int = 1,
     timestep: float | None = None,
 ) -> tuple[str | None, str]:
-    """Draw motions side by side.
+    """Draw motions side by side, each a model and its positions over time.
 
-    Args:
-        workspace: for the folder and the clock.
-        motions: what moves, and its positions over time.
-        look: how fast and how large.
-        camera: of the scene.
-        caption: of the video.
-        titles: of the motions, if there are several.
-        columns: in which several stand.
-        timestep: between positions, in s; the model's own if it is not given.
+    Several have titles and stand in columns. The time between positions (s) is the model's own if it is not given.
 
     Returns:
         The file in the output folder and its caption; without OpenGL None and the reason.

@@ -106,13 +106,7 @@ class VariantOutcome:
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """All variants of a scene, the one with everything first.
-
-    Attributes:
-        name: of the scene.
-        variants: of it.
-        steps_per_run: that one run of a program takes, over its batch.
-    """
+    """All variants of a scene, the one with everything first, and the steps of one run of a program, over its batch."""
 
     name: str
     variants: list[VariantOutcome]
@@ -125,12 +119,7 @@ class SceneOutcome:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
-
-    Attributes:
-        settings: of the run.
-        scenes: in the order of the settings.
-    """
+    """All that was measured, in the order of the settings."""
 
     settings: Settings
     scenes: list[SceneOutcome]

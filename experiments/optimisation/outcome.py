@@ -83,16 +83,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Difference:
-    """One method less another, in final cost.
+    """One method less another, in final cost: the difference of the means with Welch's interval.
 
-    Attributes:
-        ours: the one.
-        other: the other.
-        value: difference of the means.
-        low: end of Welch's interval.
-        high: likewise.
-        p_value: of Mann and Whitney's two-sided rank test, a lost run ranking last.
-        confidence: of the interval; a p-value below what is left counts.
+    Beside it stands the p-value of Mann and Whitney's two-sided rank test, a lost run ranking last; it counts below what is left
+    of the confidence.
     """
 
     ours: Run

@@ -20,14 +20,9 @@ from mjxgrad.estimators.samples import plan_by_noise
 
 
 class Estimated(eqx.Module):
-    """Both parts of one α-order estimate, before they are mixed.
+    """Both parts of one α-order estimate, first order and control variate, before they are mixed.
 
-    Attributes:
-        first: the first-order estimate.
-        unbiased: the control-variate estimate.
-        alpha: what the default rule gives the first.
-        reason: number of the item of `mg.estimators.Reason`.
-        cost: mean over the rollouts.
+    α is what the default rule gives the first, for a reason of `mg.estimators.Reason`; the cost is the mean over the rollouts.
     """
 
     first: Float[Array, " dim"]

@@ -21,15 +21,7 @@ _JUMPS = (0.62, 1.29)  # rad: throws between about 35 and 74 degrees clear the w
 
 @dataclass(frozen=True)
 class Descent:
-    """How a task is optimised by Adam.
-
-    Attributes:
-        start: parameters.
-        stddev: of the noise.
-        learning_rate: of Adam.
-        num_steps: of it.
-        estimators: by which the descents are done: "first" order or "alpha"-order.
-    """
+    """How a task is optimised by Adam, by each of some estimators: "first" order or "alpha"-order."""
 
     start: Float[Array, " dim"]
     stddev: float
@@ -40,13 +32,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Point:
-    """Where gradients are compared.
-
-    Attributes:
-        label: for tables.
-        params: the parameters.
-        hits_and_misses: whether the noise covers a jump of the cost.
-    """
+    """Parameters at which gradients are compared, and whether the noise covers a jump of the cost there."""
 
     label: str
     params: Float[Array, " dim"]
@@ -55,14 +41,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Problem:
-    """A task.
+    """A task with its name in the settings and its title.
 
     Attributes:
-        name: in the settings.
-        title: for headings.
-        task: itself, with a scene and an objective.
-        stddev: of the noise at the points.
-        points: where gradients are compared.
+        stddev: of the noise at the points where gradients are compared.
         num_samples: rollouts of one estimate.
         has_jump_of_force: whether its contacts set in with a force that is not zero.
         descent: None if it is not optimised.

@@ -109,19 +109,10 @@ def classify_derivative(
     largest: float,
     tolerance: float,
 ) -> Int[np.ndarray, " points"]:
-    """Say of each derivative whether it is right.
+    """Say of each derivative of one number by one direction, by values of `Derivative`, whether it is right.
 
-    Args:
-        derivative: of one number by one direction.
-        is_finite: whether the whole gradient that it was taken from is finite.
-        is_sound: whether the rollout did not diverge.
-        truth: what it should be.
-        truth_error: by how much the truth may be off; where that exceeds the tolerance, nothing is judged.
-        largest: beyond which a derivative explodes, right or wrong.
-        tolerance: error allowed, as a share of the larger of the truth and one.
-
-    Returns:
-        Values of `Derivative`.
+    The whole gradient that it was taken from is finite, and its rollout sound, or not. Where the error of the truth exceeds the
+    tolerance, a share of the larger of the truth and one, nothing is judged; beyond `largest` a derivative explodes.
     """
     scale = tolerance * np.maximum(np.abs(truth), 1.0)
     with np.errstate(invalid="ignore"):

@@ -1,6 +1,8 @@
 """The pictures of an experiment on stability."""
 
 import functools
+import re
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -25,24 +27,9 @@ _EXPLICIT = (
     "side of it a single contact gains energy. "
 )
 
-MOTION_COLOURS = {
-    Motion.SETTLES: "#c9e3f4",
-    Motion.MOVES: "#9ccbe8",
-    Motion.BOUNCES_RIGHT: "#56b4e9",
-    Motion.BOUNCES_OTHERWISE: "#0072b2",
-    Motion.GAINS_ENERGY: "#f0c36d",
-    Motion.TUNNELS: "#cc79a7",
-    Motion.UNSOLVED: "#d55e00",
-    Motion.DIVERGES: "#22262e",
-}
-DERIVATIVE_COLOURS = {
-    Derivative.RIGHT: "#56b4e9",
-    Derivative.UNJUDGED: "#e8eaed",
-    Derivative.WRONG: "#d55e00",
-    Derivative.EXPLODES: "#f0c36d",
-    Derivative.NON_FINITE: "#cc79a7",
-    Derivative.NONE: "#22262e",
-}
+# In the order of the items.
+_MOTIONS = ("#c9e3f4", "#9ccbe8", "#56b4e9", "#0072b2", "#f0c36d", "#cc79a7", "#d55e00", "#22262e")
+_DERIVATIVES = ("#56b4e9", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
 _NAMES = {
     "timestep": "time step, s",
     "time_constant": "time constant, s",
@@ -61,11 +48,7 @@ _NAMES = {
 def drawings(outcome: Outcome) -> Drawings:
     """Name a figure per kind of scene, the planes of its first scene."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    return {_file(one): functools.partial(_planes, one) for one in reversed(shown.values())}
-
-
-def _file(one: SceneOutcome) -> str:
-    return "".join(c if c.isalnum() else "_" for c in one.scene.name)
+    return {re.sub(r"\W", "_", one.scene.name): functools.partial(_planes, one) for one in reversed(shown.values())}
 
 
 def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
@@ -78,7 +61,7 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
         for j, (name, what) in enumerate(columns):
             axis = axes[i, j]
             values = one.points.plane(i, one.found[what].sel(simulator=name).values)
-            _image(axis, values, MOTION_COLOURS if what == "motion" else DERIVATIVE_COLOURS)
+            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
             if i == 0:
@@ -96,8 +79,8 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     return figure, one.scene.name.capitalize(), caption
 
 
-def _image(axis: Axes, values: np.ndarray, colours: dict) -> None:
-    palette = ListedColormap(list(colours.values()))
+def _image(axis: Axes, values: np.ndarray, colours: Sequence[str]) -> None:
+    palette = ListedColormap(list(colours))
     norm = BoundaryNorm(np.arange(len(colours) + 1) - 0.5, len(colours))
     axis.imshow(values, cmap=palette, norm=norm, origin="lower", aspect="auto", interpolation="nearest")
     axis.grid(visible=False)
@@ -149,10 +132,8 @@ def _legend(figure: Picture, one: SceneOutcome) -> None:
     shown = one.found.isel(point=one.points.family >= 0)
     kinds = np.unique(shown.motion)
     slopes = np.unique(shown.derivative.drop_sel(simulator=C_MUJOCO))
-    handles = [Patch(color=MOTION_COLOURS[Motion(k)], label=Motion(k).label) for k in kinds]
+    handles = [Patch(color=_MOTIONS[k], label=Motion(k).label) for k in kinds]
     handles += [
-        Patch(color=DERIVATIVE_COLOURS[Derivative(k)], label=f"gradient {Derivative(k).label}")
-        for k in slopes
-        if k != Derivative.NONE
+        Patch(color=_DERIVATIVES[k], label=f"gradient {Derivative(k).label}") for k in slopes if k != Derivative.NONE
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)

@@ -65,15 +65,7 @@ def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Arr
 
 
 class Program:
-    """A scene's rollout with its gradient, vectorised over points.
-
-    Args:
-        scene: of the catalogue.
-        num_steps: of the rollout.
-        gradient: "discrete" or "event".
-        chunk: points at once.
-        onset: of contacts within the step; None is MuJoCo's motion.
-    """
+    """A scene's rollout with its gradient, vectorised over points, a chunk at once."""
 
     def __init__(
         self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int, onset: mg.Onset | None = None
