@@ -107,13 +107,6 @@ def main(arguments: list[str] | None = None) -> None:
     costs.set_defaults(run=_costs)
     throughput = commands.add_parser("throughput", help="a sweep over softness in one program against ten")
     throughput.add_argument("--samples", type=int, default=1000)
-    throughput.add_argument(
-        "--separate", type=int, default=10, help="how many of the ten programs to compile one by one"
-    )
-    throughput.add_argument("--most-samples", type=int, default=10**6, help="of the table of memory")
-    throughput.add_argument(
-        "--run-most", action="store_true", help="run the largest number of samples, too, and time it"
-    )
     throughput.set_defaults(run=_throughput)
     options = parser.parse_args(arguments)
     options.run(options)
@@ -136,7 +129,8 @@ def _compile(function: Any, *arguments: Any) -> tuple[Any, float, float]:
     """Give the compiled program, the seconds that it took to compile, and the bytes of its temporary memory."""
     begin = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
-    return program, time.perf_counter() - begin, program.memory_analysis().temp_size_in_bytes
+    seconds, memory = time.perf_counter() - begin, program.memory_analysis()
+    return program, seconds, memory.temp_size_in_bytes if memory else float("nan")
 
 
 def _bench(options: argparse.Namespace) -> None:
@@ -301,50 +295,27 @@ def _throughput(options: argparse.Namespace) -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     _announce(f"{options.samples} samples, float32")
     task, key = mg.tasks.ball_wall(), jax.random.key(0)
-    sweep = [(stiffness, key) for stiffness in _STIFFNESS]
-    compiling, running = _compile_and_run(_estimates(task, options.samples), sweep)
-    print(f"one program, ten stiffness values: compiled in {compiling:.1f} s, ran in {running:.1f} s")
-    separate = [_one_by_one(task, options.samples, stiffness, key) for stiffness in _STIFFNESS[: options.separate]]
-    compiled, ran = (sum(times) for times in zip(*separate, strict=True))
-    print(f"{len(separate)} programs: compiled in {compiled:.1f} s, ran in {ran:.1f} s")
-    # A process of its own would also import and load the scene.
-    total = (compiled + ran) * len(_STIFFNESS) / len(separate)
-    print(f"the sweep in one program is {total / (compiling + running):.1f} times faster than ten programs")
-    _memory_by_samples(task, key, options)
 
-
-def _estimates(task: mg.tasks.BallWall, num_samples: int) -> Callable:
-    def estimates(stiffness: jax.Array, key: jax.Array) -> list:
+    def estimates(stiffness: jax.Array, key: jax.Array, num_samples: int = options.samples) -> list:
         objective = task.objective(0.1, mg.tasks.wall_softness(stiffness))
         return [estimator(objective, jnp.array([_ANGLE]), key, num_samples=num_samples) for estimator in _ESTIMATORS]
 
-    return estimates
-
-
-def _one_by_one(task: mg.tasks.BallWall, num_samples: int, stiffness: jax.Array, key: jax.Array) -> tuple[float, float]:
-    jax.clear_caches()
-    estimates = _estimates(task, num_samples)
-    return _compile_and_run(lambda key: estimates(stiffness, key), [(key,)])
-
-
-def _compile_and_run(function: Callable, arguments: list[tuple]) -> tuple[float, float]:
-    """Give the seconds to compile for the first arguments, and to run all of them."""
-    program, compilation, _ = _compile(function, *arguments[0])
-    return compilation, sum(_seconds(program, *one) for one in arguments)
-
-
-def _memory_by_samples(task: mg.tasks.BallWall, key: jax.Array, options: argparse.Namespace) -> None:
+    program, compiling, _ = _compile(estimates, _STIFFNESS[0], key)
+    running = sum(_seconds(program, stiffness, key) for stiffness in _STIFFNESS)
+    print(f"one program, ten stiffness values: compiled in {compiling:.1f} s, ran in {running:.1f} s")
+    compiled = ran = 0.0
+    for stiffness in _STIFFNESS:
+        jax.clear_caches()
+        program, seconds, _ = _compile(functools.partial(estimates, stiffness), key)
+        compiled, ran = compiled + seconds, ran + _seconds(program, key)
+    print(f"{len(_STIFFNESS)} programs: compiled in {compiled:.1f} s, ran in {ran:.1f} s")
+    # A process of its own would also import and load the scene.
+    times = (compiled + ran) / (compiling + running)
+    print(f"the sweep in one program is {times:.1f} times faster than ten programs")
     print("samples      memory of the three estimators in one program")
-    count = 1000
-    while count <= options.most_samples:
-        program, _, memory = _compile(_estimates(task, count), _STIFFNESS[0], key)
+    for count in (10**3, 10**4, 10**5, 10**6):
+        _, _, memory = _compile(functools.partial(estimates, num_samples=count), _STIFFNESS[0], key)
         print(f"{count:8d} {memory / 1e6:10.2f} MB", flush=True)
-        if options.run_most and count == options.most_samples:
-            runs = [_seconds(program, stiffness, key) for stiffness in _STIFFNESS[:3]]
-            print(
-                f"{count:8d} samples × 3 estimators in {statistics.median(runs):.1f} s, the median of 3 stiffness values"
-            )
-        count *= 10
 
 
 if __name__ == "__main__":

@@ -130,15 +130,19 @@ class Cell:
         sets, alpha = (one.first, self.reference), one.alpha[:, None]
         square, error = squared_distance(*sets), jackknife_error(squared_distance, *sets)
         reference, noise = mean_and_error(self.reference)
+        kinds = (one.first, one.unbiased, alpha * one.first + (1 - alpha) * one.unbiased)
+        squares = [float(np.mean(np.sum((kind - reference) ** 2, axis=1)) - np.sum(noise**2)) for kind in kinds]
         return Judged(
-            *(_root(square + k * error) for k in (0, -2, 2)),
-            share_along(*sets),
-            jackknife_error(share_along, *sets),
-            *(float(x[0]) for x in mean_and_error(alpha)),
-            *(
-                _root(float(np.mean(np.sum((values - reference) ** 2, axis=1)) - np.sum(noise**2))) / self.norm
-                for values in (one.first, one.unbiased, alpha * one.first + (1 - alpha) * one.unbiased)
-            ),
+            bias=_root(square),
+            low=_root(square - 2 * error),
+            high=_root(square + 2 * error),
+            along=share_along(*sets),
+            along_error=jackknife_error(share_along, *sets),
+            alpha=float(one.alpha.mean()),
+            alpha_error=float(mean_and_error(alpha)[1][0]),
+            error_first=_root(squares[0]) / self.norm,
+            error_unbiased=_root(squares[1]) / self.norm,
+            error_mixed=_root(squares[2]) / self.norm,
         )
 
 

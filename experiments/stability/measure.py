@@ -1,8 +1,9 @@
 """From settings to numbers."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOut
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
-from experiments.stability.settings import Settings, Sizes
+from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import soundness
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
@@ -33,7 +34,60 @@ _NOTHING = {
     "gradient_unflagged_by_rollout": False, "missed": False, "apart_from_c": 0.0,
 }  # fmt: skip
 
-_Case = tuple[StabilityScene, Points, Reference, np.ndarray]
+
+@dataclass(frozen=True)
+class _Case:
+    """A scene with its points, and what C MuJoCo did on them."""
+
+    scene: StabilityScene
+    grid: Points
+    reference: Reference
+    settings: Settings
+
+    @property
+    def flown(self) -> Float[np.ndarray, " points"]:
+        """What a body flies in the rollout (m)."""
+        return self.grid.flown * self.settings.num_steps
+
+    @property
+    def largest(self) -> float:
+        """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
+
+        A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of the steps that follow adds to
+        the position.
+        """
+        return 100.0 * 2 * self.settings.num_steps
+
+    @cached_property
+    def push(self) -> dict[str, np.ndarray]:
+        """The change of the start along which derivatives are taken."""
+        shift, push = direction(self.scene, self.settings.num_steps, self.grid.values["timestep"])
+        return {"qpos": shift, "qvel": push}
+
+    @cached_property
+    def changes(self) -> dict[str, np.ndarray]:
+        """The change of the model's parameters: each number by a share of itself, no two by the same."""
+        return {
+            name: value * (1 + 0.3 * np.cos(np.arange(value[0].size))).reshape(value[0].shape)
+            for name, value in self.reference.fields.items()
+            if name in _RELATIVE
+        }
+
+    @cached_property
+    def restitution(self) -> Float[np.ndarray, " points"]:
+        """That of the motion itself, where it is a single bounce from outside."""
+        found = np.full(len(self.grid), np.nan)
+        for i in range(len(self.grid) if self.scene.bounces else 0):
+            point = self.grid[i]
+            stiffness, damping = effective(self.scene, point)
+            constant, ratio = 2 / damping, damping / (2 * np.sqrt(stiffness))
+            impedance = (point["impedance_first"], point["impedance_last"], point["width"])
+            if impedance[0] == impedance[1]:
+                found[i] = float(Bounce(constant, ratio, point["speed"]).restitution)
+            elif impedance[2] > 0:
+                with suppress(ValueError):
+                    found[i] = integrated_restitution(constant, ratio, impedance, point["speed"])[0]
+        return found
 
 
 @dataclass(frozen=True)
@@ -51,51 +105,40 @@ class _Runs:
     differences: np.ndarray | None
 
 
-def largest(num_steps: int) -> float:
-    """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
-
-    A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of the steps that follow adds to the
-    position.
-    """
-    return 100.0 * 2 * num_steps
-
-
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Run every scene in every precision, and C MuJoCo beside it."""
     size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
-    grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]
-    references = []
+    cases = []
     with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to, processes() as pool:
-        for scene, grid in zip(scenes, grids, strict=True):
-            references.append(simulate(scene, grid, settings.num_steps, pool))
-            advance_to(len(references))
-    expected = [_expected(scene, grid) for scene, grid in zip(scenes, grids, strict=True)]
-    cases = list(zip(scenes, grids, references, expected, strict=True))
-    found = [{C_MUJOCO: _of_c(*case, settings)} for case in cases]
+        for scene in scenes:
+            grid = points(scene, size.resolution, size.num_random, settings.seed)
+            cases.append(_Case(scene, grid, simulate(scene, grid, settings.num_steps, pool), settings))
+            advance_to(len(cases))
+    found = [{C_MUJOCO: _of_c(case)} for case in cases]
     truths: list[np.ndarray] = []
     for precision in settings.precisions:
         with _precision(precision):
-            runs = _run_all(cases, precision, size, settings, workspace)
+            runs = _run_all(cases, precision, workspace)
         if precision == "float64":
             truths = [run.differences for run in runs if run.differences is not None]
         else:
             runs = _judge_solves(cases, runs, size.chunk, workspace)
-        for i, (case, run) in enumerate(zip(cases, runs, strict=True)):
-            found[i][precision] = _of_mjxgrad(*case, run, truths[i], precision, settings)
-    datasets = [_labelled(one, len(grid)) for one, grid in zip(found, grids, strict=True)]
-    return Outcome(settings, [SceneOutcome(*one) for one in zip(scenes, grids, datasets, strict=True)])
+        for one, case, run, truth in zip(found, cases, runs, truths, strict=True):
+            one[precision] = _of_mjxgrad(case, run, truth, precision)
+    labelled = [SceneOutcome(case.scene, case.grid, _labelled(one)) for case, one in zip(cases, found, strict=True)]
+    return Outcome(settings, labelled)
 
 
-def _labelled(found: dict[str, dict[str, np.ndarray]], count: int) -> xr.Dataset:
+def _labelled(found: dict[str, dict[str, np.ndarray]]) -> xr.Dataset:
     """Label what each simulator did on the points of a scene."""
-    keys = list(found["float64"])
-    stacks = {
-        key: np.stack([np.broadcast_to(one.get(key, _NOTHING.get(key)), count) for one in found.values()])
-        for key in keys
+    ours, count = found["float64"], len(found["float64"]["motion"])
+    arrays = {
+        key: np.stack([np.broadcast_to(one[key] if key in one else _NOTHING[key], count) for one in found.values()])
+        for key in ours
     }
     return xr.Dataset(
-        {key: (("simulator", "point"), stack) for key, stack in stacks.items()}, {"simulator": list(found)}
+        {key: (("simulator", "point"), array) for key, array in arrays.items()}, {"simulator": list(found)}
     )
 
 
@@ -109,19 +152,18 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(cases: list[_Case], precision: str, size: Sizes, settings: Settings, workspace: Workspace) -> list[_Runs]:
+def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_Runs]:
     """Run the programs of all scenes, some at a time: most of it is compilation."""
 
     def run(case: _Case) -> _Runs:
-        scene, grid, reference, _ = case
-        arrays = (reference.fields, reference.qpos, reference.qvel)
+        scene, settings, size = case.scene, case.settings, case.settings.sizes
+        arrays = (case.reference.fields, case.reference.qpos, case.reference.qvel)
         onset = mg.Onset() if settings.onset else None
         program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
         has_event = not settings.onset and (size.event is None or scene.name in size.event)
         event = Program(scene, settings.num_steps, "event", size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
-        is_judge = precision == "float64"
-        truth = _differences(scene, grid, reference, program, settings.num_steps) if is_judge else None
+        truth = _differences(case, program) if precision == "float64" else None
         return _Runs(program.run(*arrays), event, truth)
 
     with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
@@ -132,15 +174,15 @@ def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: 
     """Judge what seems not to be solved in single precision by the forces in double precision."""
 
     def judge(pair: tuple[_Case, _Runs]) -> _Runs:
-        (scene, _, reference, _), run = pair
+        case, run = pair
         course, steps = run.discrete.course, run.discrete.steps
         seems_wrong = np.flatnonzero(~(course.residual <= UNSOLVED))
         if not len(seems_wrong):
             return run
-        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, reference.fields))
+        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, case.reference.fields))
         # The numbers that were given to the solves.
         fields = {name: value.astype(steps.qpos.dtype) for name, value in fields.items()}
-        errors = errors_of_solves(scene, fields, steps, chunk)
+        errors = errors_of_solves(case.scene, fields, steps, chunk)
         residual = course.residual.copy()
         residual[seems_wrong] = np.fmin(steps.unbalanced, errors).max(axis=1)
         return replace(run, discrete=replace(run.discrete, course=replace(course, residual=residual)))
@@ -149,56 +191,27 @@ def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: 
         return in_threads(judge, zip(cases, runs, strict=True), advance_to)
 
 
-def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):
+def _differences(case: _Case, program: Program) -> np.ndarray:
     """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
-    shift, push = direction(scene, num_steps, grid.values["timestep"])
-    changes = _changes(reference)
+    reference = case.reference
 
     def from_start(width: float) -> np.ndarray:
-        step = (width * grid.flown)[:, None]
-        return program.values(reference.fields, reference.qpos + step * shift, reference.qvel + step * push)
+        step = (width * case.grid.flown)[:, None]
+        moved = {name: getattr(reference, name) + step * push for name, push in case.push.items()}
+        return program.values(reference.fields, **moved)
 
     def by_parameters(width: float) -> np.ndarray:
-        fields = {name: value + width * changes.get(name, 0.0) for name, value in reference.fields.items()}
+        fields = {name: value + width * case.changes.get(name, 0.0) for name, value in reference.fields.items()}
         return program.values(fields, reference.qpos, reference.qvel)
 
-    kinds = ((from_start, WIDTHS, grid.flown), (by_parameters, _PARAMETER_WIDTHS, grid.flown * num_steps))
+    kinds = ((from_start, WIDTHS, case.grid.flown), (by_parameters, _PARAMETER_WIDTHS, case.flown))
     return np.array(
         [[(end(width) - end(-width)) / (2 * width * unit) for width in widths] for end, widths, unit in kinds]
     )
 
 
-def _changes(reference: Reference) -> dict[str, np.ndarray]:
-    """Change each number by a share of itself, no two by the same."""
-    return {
-        name: value * (1 + 0.3 * np.cos(np.arange(value[0].size))).reshape(value[0].shape)
-        for name, value in reference.fields.items()
-        if name in _RELATIVE
-    }
-
-
-def _expected(scene: StabilityScene, grid: Points) -> Float[np.ndarray, " points"]:
-    """Give the restitution of the motion itself, where it is a single bounce from outside."""
-    found = np.full(len(grid), np.nan)
-    for i in range(len(grid) if scene.bounces else 0):
-        point = grid[i]
-        stiffness, damping = effective(scene, point)
-        constant, ratio = 2 / damping, damping / (2 * np.sqrt(stiffness))
-        impedance = (point["impedance_first"], point["impedance_last"], point["width"])
-        if impedance[0] == impedance[1]:
-            found[i] = float(Bounce(constant, ratio, point["speed"]).restitution)
-        elif impedance[2] > 0:
-            try:
-                found[i] = integrated_restitution(constant, ratio, impedance, point["speed"])[0]
-            except ValueError:
-                continue
-    return found
-
-
-def _record(
-    scene: StabilityScene, grid: Points, start: np.ndarray, course: Course, expected: Float[np.ndarray, " points"]
-) -> MotionRecord:
-    count = len(grid)
+def _record(case: _Case, course: Course) -> MotionRecord:
+    scene, grid, start, count = case.scene, case.grid, case.reference.qpos, len(case.grid)
     with np.errstate(all="ignore"):
         stored = np.array([_stored(scene, grid[i]) for i in range(count)])
         budget = course.kinetic[:, 0] + stored + course.potential[:, 0] - course.potential.min(axis=1)
@@ -212,7 +225,7 @@ def _record(
             has_left = (course.qvel[:, 0] > 0) & (course.qpos[:, 0] > grid.values["margin"])
         restitution = np.where(has_left, course.qvel[:, 0] / grid.values["speed"], np.nan)
     is_sound = course.first_bad_step < 0
-    return MotionRecord(is_sound, course.residual, gain, rest, crossed, restitution, expected)
+    return MotionRecord(is_sound, course.residual, gain, rest, crossed, restitution, case.restitution)
 
 
 def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
@@ -225,33 +238,19 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(
-    scene: StabilityScene, grid: Points, reference: Reference, expected: np.ndarray, settings: Settings
-) -> dict[str, np.ndarray]:
-    record = _record(scene, grid, reference.qpos, reference.course, expected)
-    coarse, fine = reference.differences
-    bounds = {"largest": largest(settings.num_steps), "tolerance": _TOLERANCE["float64"]}
+def _of_c(case: _Case) -> dict[str, np.ndarray]:
+    record = _record(case, case.reference.course)
+    coarse, fine = case.reference.differences
+    bounds = {"largest": case.largest, "tolerance": _TOLERANCE["float64"]}
     derivative = classify_derivative(fine, np.isfinite(fine), record.is_sound, fine, np.abs(fine - coarse), **bounds)
     return {"motion": classify_motion(record), "derivative": derivative, "energy": record.gain}
 
 
-def _of_mjxgrad(
-    scene: StabilityScene,
-    grid: Points,
-    reference: Reference,
-    expected: np.ndarray,
-    runs: _Runs,
-    truth: np.ndarray,
-    precision: str,
-    settings: Settings,
-) -> dict[str, np.ndarray]:
+def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> dict[str, np.ndarray]:
     run, event = runs.discrete, runs.event
-    record = _record(scene, grid, reference.qpos, run.course, expected)
-    motion = classify_motion(record)
-    shift, push = direction(scene, settings.num_steps, grid.values["timestep"])
-    flown = grid.flown * settings.num_steps
-    bound = largest(settings.num_steps)
-    slopes = [along(run, {"qpos": shift, "qvel": push}), along(run, _changes(reference)) / flown]
+    record = _record(case, run.course)
+    motion, bound = classify_motion(record), case.largest
+    slopes = [along(run, case.push), along(run, case.changes) / case.flown]
     kinds = [
         classify_derivative(
             slope,
@@ -269,7 +268,7 @@ def _of_mjxgrad(
         (run.gradient[0], *slopes), ~record.is_sound
     )
     with np.errstate(invalid="ignore"):
-        apart = np.abs(run.course.qpos - reference.course.qpos).max(axis=1) / flown
+        apart = np.abs(run.course.qpos - case.reference.course.qpos).max(axis=1) / case.flown
     return {
         "motion": motion,
         "derivative": kinds[0],

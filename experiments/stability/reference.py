@@ -149,7 +149,7 @@ def _follow(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, qvel: 
         energies[bad + 1 :] = energies[bad]
     seen = slice(0, last + 1)
     solves = (masses, accelerations, velocities[:num_steps], smooth, constraint)
-    residual = unbalanced(*(x[seen] for x in solves), model.opt.timestep)
+    residual = unbalanced(*(x[seen] for x in solves), timestep=model.opt.timestep)
     return positions[last], velocities[last], energies[:, 1], energies[:, 0], float(residual.max()), bad
 
 
