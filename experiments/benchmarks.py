@@ -254,14 +254,12 @@ def _print(row: Row, base: Row, steps: int) -> None:
 def _costs(options: argparse.Namespace) -> None:
     """Print one table per scene."""
     _announce(f"batch {options.batch}, {_NUM_STEPS} steps")
-    for name in _STARTS:
-        _cost(name, options)
+    for name, (place, height) in _STARTS.items():
+        scene = mg.load_scene(_SCENES[name])
+        _cost(name, scene, scene.data.qpos.at[place].add(height), options)
 
 
-def _cost(name: str, options: argparse.Namespace) -> None:
-    scene = mg.load_scene(_SCENES[name])
-    place, height = _STARTS[name]
-    qpos = scene.data.qpos.at[place].add(height)
+def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespace) -> None:
     qvel = 0.3 * jax.random.normal(jax.random.key(0), (options.batch, scene.model.nv))
 
     def cost(qvel, **settings):

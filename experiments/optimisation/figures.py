@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
@@ -130,7 +130,7 @@ def curves(outcome: Outcome):
             axis.margins(x=0)
         row[0].set_ylabel(f"cost − {lowest:.4g}")
         row[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5)
-        row[0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009")))
+        row[0].xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009"))
     axes[0, 0].set_title("Against rollouts")
     axes[0, 1].set_title("Against time")
     axes[-1, 0].set_xlabel("rollouts of one run")
@@ -139,7 +139,7 @@ def curves(outcome: Outcome):
     above = outcome.start_cost - lowest
     axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * _smallest(outcome)), 1.5 * above)
     for axis in axes.flat:
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
+        axis.yaxis.set_major_formatter(lambda value, _: power(value))
         axis.yaxis.set_minor_formatter(NullFormatter())
     settings = outcome.settings
     caption = (
@@ -178,7 +178,7 @@ def alpha(outcome: Outcome):
     right.set_yticks(rows, [run.method.label for run in runs])
     _mark_ours(right, runs)
     right.set(title="Share of steps by the reason for α", xlim=(0, 1))
-    right.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
+    right.xaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
     right.grid(visible=False, axis="y")
     right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
     caption = (
@@ -244,7 +244,7 @@ def _log_scale(axis: Axes) -> None:
     low, high = axis.xaxis.get_view_interval()
     subs = (1.0,) if high > 30 * low else (1.0, 2.0, 5.0)
     axis.xaxis.set_major_locator(LogLocator(subs=subs, numticks=12))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
+    axis.xaxis.set_major_formatter(lambda value, _: power(value))
     axis.xaxis.set_minor_formatter(NullFormatter())
 
 

@@ -1,7 +1,5 @@
 """What the plans say, in sentences and in a table."""
 
-import numpy as np
-
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import NAMES
 from experiments.report import Table
@@ -62,13 +60,11 @@ def tables(outcome: Outcome) -> list[Table]:
             f"{1e3 * outcome.distance(attempt):.1f} mm",
             f"{outcome.angle(attempt):.3f} rad",
             str(len(attempt.controls)),
-            str(len(attempt.course["error"])) if is_tree else _in_vain(attempt.course["step"]),
+            str(len(attempt.course["error"]))
+            if is_tree
+            else f"{(attempt.course['step'] == 0).sum()} of {len(attempt.course['step'])}",
             f"{attempt.seconds:.0f} s",
         ]
         for attempt in outcome.attempts
     ]
     return [Table(columns, rows, "Every attempt; later seeds of a kind use the compiled program of the first.")]
-
-
-def _in_vain(steps: np.ndarray) -> str:
-    return f"{(steps == 0).sum()} of {len(steps)}"

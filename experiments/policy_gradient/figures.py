@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure as Picture
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import NullFormatter
 
 from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome, mean_and_error
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
@@ -42,7 +42,7 @@ def summary(outcome: Outcome):
         axis.grid(axis="y", visible=False)
     for axis in axes[0, ::2]:
         axis.set_xscale("log")
-        axis.xaxis.set_major_formatter(FuncFormatter(_percent))
+        axis.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g}%")
         axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].set_xlim(left=_SMALLEST)
     axes[0, 1].set_xlim(-0.04, 1.04)
@@ -87,7 +87,7 @@ def throw(outcome: Outcome):
                 if cell.hits_and_misses:
                     axis.axvspan(place - 0.05, place + 0.05, color=MUTED, alpha=0.18, lw=0)
         left.set_yscale("symlog", linthresh=0.01)
-        left.yaxis.set_major_formatter(FuncFormatter(_plain))
+        left.yaxis.set_major_formatter("{x:g}")
         left.set(title=shown[0].title, ylabel="gradient, m²/rad")
         right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
     for axis in axes[-1]:
@@ -116,7 +116,7 @@ def push(outcome: Outcome):
             first = cell.estimates[gradient].first.mean(axis=0)
             axis.plot(step, first, color=_COLOURS[gradient], label=f"{gradient} gradient", **style)
         axis.set(title=cell.title, xlabel="step")
-        axis.yaxis.set_major_formatter(FuncFormatter(_plain))
+        axis.yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, 1/N")
     _legend(figure, axes, 3)
     caption = (
@@ -145,7 +145,7 @@ def hopper(outcome: Outcome):
         axis.set(title=f"Motor of the {_MOTORS[motor]}")
         axis.set_xticks(places, _OBSERVED, rotation=35, ha="right")
         axis.grid(axis="x", visible=False)
-    axes[0, 0].yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes[0, 0].yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, m per unit of gain")
     _legend(figure, axes, 3)
     caption = (
@@ -171,7 +171,7 @@ def descent(outcome: Outcome):
                 axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
             title = course.title.replace("Throw, ", "Throw,\n")
             above.set_title(f"{title}, {ESTIMATORS[kind[1]]}")
-        above.yaxis.set_major_formatter(FuncFormatter(_plain))
+        above.yaxis.set_major_formatter("{x:g}")
         below.set(ylim=(-0.05, 1.05), xlabel="step")
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("α")
@@ -190,11 +190,3 @@ def _legend(figure: Picture, axes: np.ndarray, columns: int) -> None:
 def _by_motor(flat: np.ndarray) -> np.ndarray:
     """Give (motor, observed) from the flattened gain and offset."""
     return np.concatenate([flat[:18].reshape(3, 6), flat[18:, None]], axis=1)
-
-
-def _percent(value: float, _: object) -> str:
-    return f"{100 * value:g}%"
-
-
-def _plain(value: float, _: object) -> str:
-    return f"{value:g}".replace("-", "−")

@@ -1,5 +1,6 @@
 """From settings to numbers."""
 
+import itertools
 import time
 
 import equinox as eqx
@@ -89,31 +90,22 @@ def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: 
 
 
 def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:
-    if one.descent is None or not one.descent.num_steps:
+    descent, seeds, courses = one.descent, jax.random.split(key, num_seeds), []
+    if descent is None or not descent.num_steps:
         return []
-    seeds = jax.random.split(key, num_seeds)
-    return [
-        _course(one, one.descent, estimator, gradient, seeds)
-        for estimator in one.descent.estimators
-        for gradient in GRADIENTS
-    ]
+    for estimator, gradient in itertools.product(descent.estimators, GRADIENTS):
+        started = time.perf_counter()
+        histories = [_descend(one, descent, gradient, estimator, seed) for seed in seeds]
+        seconds = time.perf_counter() - started
+        costs = np.array([[step.cost for step in history] for history in histories])
+        alphas = np.array([[step.weight(estimator) for step in history] for history in histories])
+        courses.append(Course(one.name, one.title, estimator, gradient, costs, alphas, seconds))
+    return courses
 
 
-def _course(one: Problem, descent: Descent, estimator: str, gradient: str, seeds: Key[Array, " seeds"]) -> Course:
-    started = time.perf_counter()
-    objective = one.objective(gradient, descent.stddev)
-    histories = [_descend(one, descent, objective, estimator, seed) for seed in seeds]
-    seconds = time.perf_counter() - started
-    costs = np.array([[step.cost for step in history] for history in histories])
-    alphas = np.array([[step.weight(estimator) for step in history] for history in histories])
-    return Course(one.name, one.title, estimator, gradient, costs, alphas, seconds)
-
-
-def _descend(
-    one: Problem, descent: Descent, objective: mg.Objective, estimator: str, seed: PRNGKeyArray
-) -> list[Estimated]:
+def _descend(one: Problem, descent: Descent, gradient: str, estimator: str, seed: PRNGKeyArray) -> list[Estimated]:
     """Descend by Adam; the last of what is given back is at the final parameters."""
-    optimiser = optax.adam(descent.learning_rate)
+    objective, optimiser = one.objective(gradient, descent.stddev), optax.adam(descent.learning_rate)
     params, state, history = descent.start, optimiser.init(descent.start), []
     *steps, end = jax.random.split(seed, descent.num_steps + 1)
     for key in steps:
