@@ -3,12 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from experiments.stability.scenes import DEFAULTS, StabilityScene, effective
-from mjxgrad.scene.contact_check import largest_stable_step, steepest
+from experiments.stability.scenes import DEFAULTS, StabilityScene
 
 Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 """From places in [0, 1] to values."""
@@ -101,22 +99,6 @@ def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -
     family = np.repeat([*range(len(planes)), -1], [len(block["timestep"]) for block in blocks])
     values = {name: np.concatenate([block[name] for block in blocks]) for name in DEFAULTS}
     return Points(values, family, tuple((across, up) for across, up, _ in planes))
-
-
-def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
-    r"""Give the time step over the largest at which one spring gains no energy: unstable from 1 on.
-
-    $h \omega_0 / (2 (\sqrt{1 + \zeta^2} - \zeta))$, in the standard format $h / t_c$ over $2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$.
-    """
-    found = np.empty(len(points))
-    for i in range(len(points)):
-        point = points[i]
-        impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
-        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
-        frequency = np.sqrt(stiffness)
-        limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
-        found[i] = point["timestep"] * frequency / limit
-    return found
 
 
 def _block(count: int, given: Mapping[str, np.ndarray | float]) -> dict[str, Float[np.ndarray, " n"]]:

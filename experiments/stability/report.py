@@ -2,12 +2,16 @@
 
 from collections import Counter
 
+import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from experiments.report import Table
 from experiments.stability.classes import Derivative, Motion
-from experiments.stability.grid import load
+from experiments.stability.grid import Points
 from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
+from experiments.stability.scenes import StabilityScene, effective
+from mjxgrad.scene.contact_check import largest_stable_step, steepest
 
 UNEXPLAINED = "unexplained"
 _SAME_MOTION = 1e-3
@@ -120,6 +124,22 @@ def tables(outcome: Outcome) -> list[Table]:
         ),
     ]
     return [table for table in found if table.rows]
+
+
+def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give the time step over the largest at which one spring gains no energy: unstable from 1 on.
+
+    $h \omega_0 / (2 (\sqrt{1 + \zeta^2} - \zeta))$, in the standard format $h / t_c$ over $2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$.
+    """
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        point = points[i]
+        impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
+        frequency = np.sqrt(stiffness)
+        limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
+        found[i] = point["timestep"] * frequency / limit
+    return found
 
 
 def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
