@@ -12,6 +12,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
+import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
@@ -126,31 +127,26 @@ def record(
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     middle, reach = (low + high) / 2, control_share * (high - low) / 2
-    rollouts = []
-    for _ in range(num_rollouts):
-        data = mujoco.MjData(model)
-        data.qvel[:] = _VELOCITY_STDDEV * random.normal(size=model.nv)
+    data, nq = mujoco.MjData(model), model.nq
+    # Time, positions, velocities, and the state of actuators, if there is any.
+    initial = np.zeros((num_rollouts, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    initial[:, 1 : 1 + nq] = data.qpos
+    controls = []
+    for start in initial:
+        start[1 + nq : 1 + nq + model.nv] = _VELOCITY_STDDEV * random.normal(size=model.nv)
         held = middle + reach * random.uniform(-1, 1, (-(-horizon // _HOLD), model.nu))
-        controls = np.repeat(held, _HOLD, axis=0)[:horizon]
-        rollouts.append(_roll(scene, model, data, controls))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rollouts)
-
-
-def _roll(scene: mg.Scene, model: mujoco.MjModel, data: mujoco.MjData, controls: np.ndarray) -> mg.Trajectory:
-    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
-    for row in controls:
-        data.ctrl[:] = row
-        mujoco.mj_step(model, data)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
+        controls.append(np.repeat(held, _HOLD, axis=0)[:horizon])
+    states, _ = mujoco.rollout.rollout(model, data, initial, np.array(controls))
+    states = jnp.asarray(np.concatenate([initial[:, None], states], axis=1))
     return mg.Trajectory(
-        qpos=jnp.asarray(np.array(qpos)),
-        qvel=jnp.asarray(np.array(qvel)),
-        ctrl=jnp.asarray(controls),
+        qpos=states[..., 1 : 1 + nq],
+        qvel=states[..., 1 + nq : 1 + nq + model.nv],
+        ctrl=jnp.asarray(np.array(controls)),
         observations=None,
-        final=mg.initial_state(scene),
-        diverged=jnp.array(False),
-        first_bad_step=jnp.array(-1, jnp.int32),
+        final=jax.tree.map(lambda x: jnp.broadcast_to(x, (num_rollouts, *jnp.shape(x))), mg.initial_state(scene)),
+        diverged=jnp.zeros(num_rollouts, bool),
+        first_bad_step=jnp.full(num_rollouts, -1, jnp.int32),
+        unsolved=jnp.zeros(num_rollouts, jnp.int32),
     )
 
 
