@@ -12,14 +12,7 @@ from experiments.runner import run_file
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: of the command, or None for those of the process.
-
-    Returns:
-        The exit status: 0, 2 for a refusal that was explained, 130 for an interruption.
-    """
+    """Run the command line; the exit status is 0, 2 for a refusal that was explained, or 130 for an interruption."""
     options = _parse(arguments)
     # A run that is asked to stop clears up as it does for Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -40,7 +33,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = _parser()
+    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments on mjxgrad.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="run one configuration, or each combination of its sweep")
+    run.add_argument("file", help="a TOML file, or the name of one in experiments/")
+    run.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, in TOML syntax")
+    run.add_argument("--output", type=Path, default=Path("runs"), help="folder for results (default: runs)")
+    run.add_argument("--force", action="store_true", help="run even if nothing has changed")
+    run.add_argument("--debug", action="store_true", help="show tracebacks")
+    commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
     options, rest = parser.parse_known_args(arguments)
     # argparse takes overrides on one side of an option only; those on its other side are left over.
     if options.command == "list" or any(item.startswith("-") for item in rest):
@@ -57,19 +58,6 @@ def _list() -> int:
         kind = tomllib.loads(text).get("experiment", "?")
         print(f"{path.stem:<16} {kind:<14} {read_header(text)[0]}")
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments on mjxgrad.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    run = commands.add_parser("run", help="run one configuration, or each combination of its sweep")
-    run.add_argument("file", help="a TOML file, or the name of one in experiments/")
-    run.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, in TOML syntax")
-    run.add_argument("--output", type=Path, default=Path("runs"), help="folder for results (default: runs)")
-    run.add_argument("--force", action="store_true", help="run even if nothing has changed")
-    run.add_argument("--debug", action="store_true", help="show tracebacks")
-    commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
-    return parser
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -54,6 +54,18 @@ _PATCHED_ITERATIONS = 10
 # Of `costs`: from how high above contact a scene starts (m), as index in qpos and height; and how many steps it takes.
 _STARTS = {"two_bodies": (2, 0.02), "hopper": (1, 0.05)}
 _NUM_STEPS = 100
+_WAYS = {
+    "": {},
+    "onset": {"onset": mg.Onset()},
+    "event": {"gradient": "event"},
+    "smoothed": {"smoothing": mg.Smoothing(1e-3)},
+    "smoothed backward": {"smoothing": mg.Smoothing(1e-3, mode="backward")},
+}
+_COSTS = {
+    "rollout": ("", "onset", "smoothed"),
+    "value_and_grad": ("", "onset", "event", "smoothed", "smoothed backward"),
+    "jvp": ("", "onset", "event"),
+}
 
 # Of `throughput`.
 _STIFFNESS = np.logspace(1, 5, 10)  # no array of JAX, which would begin before `--per-core` is read
@@ -61,12 +73,11 @@ _ANGLE = 0.65
 _ESTIMATORS = (mg.estimators.first_order, mg.estimators.zeroth_order, mg.estimators.alpha_order)
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One measurement: seconds of each run, seconds to compile, bytes of temporary memory."""
 
     name: str
-    runs: tuple[float, ...]
+    runs: list[float]
     compilation: float
     memory: float
 
@@ -96,13 +107,6 @@ def main(arguments: list[str] | None = None) -> None:
     costs.set_defaults(run=_costs)
     throughput = commands.add_parser("throughput", help="a sweep over softness in one program against ten")
     throughput.add_argument("--samples", type=int, default=1000)
-    throughput.add_argument(
-        "--separate", type=int, default=10, help="how many of the ten programs to compile one by one"
-    )
-    throughput.add_argument("--most-samples", type=int, default=10**6, help="of the table of memory")
-    throughput.add_argument(
-        "--run-most", action="store_true", help="run the largest number of samples, too, and time it"
-    )
     throughput.set_defaults(run=_throughput)
     options = parser.parse_args(arguments)
     options.run(options)
@@ -115,22 +119,18 @@ def _announce(work: str) -> None:
     )
 
 
-def _compile(function: Any, *arguments: Any) -> tuple[Any, float]:
-    """Give the compiled program, and the seconds that it took to compile."""
-    begin = time.perf_counter()
-    return jax.jit(function).lower(*arguments).compile(), time.perf_counter() - begin
-
-
 def _seconds(function: Callable, *arguments: Any) -> float:
-    """Time one run."""
     begin = time.perf_counter()
     jax.block_until_ready(function(*arguments))
     return time.perf_counter() - begin
 
 
-def _memory(program: Any) -> float:
-    """Give the bytes of temporary memory."""
-    return program.memory_analysis().temp_size_in_bytes
+def _compile(function: Any, *arguments: Any) -> tuple[Any, float, float]:
+    """Give the compiled program, the seconds that it took to compile, and the bytes of its temporary memory."""
+    begin = time.perf_counter()
+    program = jax.jit(function).lower(*arguments).compile()
+    seconds, memory = time.perf_counter() - begin, program.memory_analysis()
+    return program, seconds, memory.temp_size_in_bytes if memory else float("nan")
 
 
 def _bench(options: argparse.Namespace) -> None:
@@ -142,31 +142,30 @@ def _bench(options: argparse.Namespace) -> None:
     )
     for name in options.scene:
         print(f"\n{name}")
-        rows: list[Row] = []
-        for row in _measure(name, options):
-            rows.append(row)
-            print(_format(row, rows, options), flush=True)
+        base = None
+        for row in _rows(name, options):
+            base = base or row
+            _print(row, base, options.batch * options.steps)
 
 
-def _measure(name: str, options: argparse.Namespace) -> Iterator[Row]:
+def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
     mj_model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
     mj_model.opt.tolerance, mj_model.opt.iterations, mj_model.opt.ls_iterations = _TOLERANCE, 100, 20
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
-    runs = options.runs
-    yield _time("mjx.step", mg.over_devices(lambda s: _mjx_outcome(scene, s, options.steps)), states, runs)
-    for checkpoint, label in ((True, ""), (False, ", all kept")):
-
-        def outcome(state: Any, checkpoint: bool = checkpoint) -> Any:
-            return _outcome(scene, state, options.steps, checkpoint)
-
-        if checkpoint:
-            yield _time("mg.rollout", mg.over_devices(outcome), states, runs)
-        yield _time(f"mg value_and_grad{label}", mg.over_devices(jax.value_and_grad(outcome)), states, runs)
+    ours = functools.partial(_outcome, scene, steps=options.steps)
+    cases = {
+        "mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps),
+        "mg.rollout": ours,
+        "mg value_and_grad": jax.value_and_grad(ours),
+        "mg value_and_grad, all kept": jax.value_and_grad(functools.partial(ours, checkpoint=False)),
+    }
+    for case, function in cases.items():
+        yield _time(case, mg.over_devices(function), states, options.runs)
     if not options.skip_patched:
         yield _patched(scene, states, options)
-    if jax.default_backend() == "cpu" and runs:
+    if jax.default_backend() == "cpu" and options.runs:
         yield _native(mj_model, states, options)
 
 
@@ -179,7 +178,7 @@ def _states(mj_model: mujoco.MjModel, batch: int) -> tuple[jax.Array, jax.Array]
     return jnp.asarray(np.tile(data.qpos, (batch, 1))), jnp.asarray(qvel)
 
 
-def _outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int, checkpoint: bool) -> jax.Array:
+def _outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int, checkpoint: bool = True) -> jax.Array:
     start = mg.initial_state(scene, *state)
     final = mg.rollout(scene, start, horizon=steps, checkpoint=checkpoint).final
     return jnp.sum(final.qpos**2) + jnp.sum(final.qvel**2)
@@ -223,10 +222,9 @@ def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
 
 
 def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
-    program, compilation = _compile(function, states)
-    if runs:
-        _seconds(program, states)
-    return Row(name, tuple(_seconds(program, states) for _ in range(runs)), compilation, _memory(program))
+    program, compilation, memory = _compile(function, states)
+    # The first run, which is left out, finds nothing in the caches.
+    return Row(name, [_seconds(program, states) for _ in range(runs + 1 if runs else 0)][1:], compilation, memory)
 
 
 def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
@@ -239,65 +237,48 @@ def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], optio
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         run = functools.partial(pool.rollout, nstep=options.steps)
         seconds = [_seconds(run, [mj_model] * options.batch, data, initial) for _ in range(options.runs + 1)]
-    return Row(f"C MuJoCo, {threads} threads", tuple(seconds[1:]), 0.0, float("nan"))
+    return Row(f"C MuJoCo, {threads} threads", seconds[1:], 0.0, float("nan"))
 
 
-def _format(row: Row, rows: list[Row], options: argparse.Namespace) -> str:
-    steps = options.batch * options.steps
+def _print(row: Row, base: Row, steps: int) -> None:
     span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
     memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
-    return (
+    print(
         f"  {row.name:28s} {row.median * 1e3:9.1f} ms {span}"
-        f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / rows[0].median:6.2f} of mjx.step"
-        f"  compile {row.compilation:5.1f} s {memory}"
+        f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / base.median:6.2f} of mjx.step"
+        f"  compile {row.compilation:5.1f} s {memory}",
+        flush=True,
     )
 
 
 def _costs(options: argparse.Namespace) -> None:
     """Print one table per scene."""
     _announce(f"batch {options.batch}, {_NUM_STEPS} steps")
-    for name in _STARTS:
-        _cost(name, options)
+    for name, (place, height) in _STARTS.items():
+        scene = mg.load_scene(_SCENES[name])
+        _cost(name, scene, scene.data.qpos.at[place].add(height), options)
 
 
-def _cost(name: str, options: argparse.Namespace) -> None:
-    scene = mg.load_scene(_SCENES[name])
-    place, height = _STARTS[name]
-    qpos = scene.data.qpos.at[place].add(height)
+def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespace) -> None:
     qvel = 0.3 * jax.random.normal(jax.random.key(0), (options.batch, scene.model.nv))
 
     def cost(qvel, **settings):
         state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
         return jnp.sum(mg.rollout(scene, state, horizon=_NUM_STEPS, **settings).qpos[-1] ** 2)
 
-    def reverse(qvel, **settings):
-        return jax.value_and_grad(functools.partial(cost, **settings))(qvel)
-
-    def forward(qvel, **settings):
-        return jax.jvp(functools.partial(cost, **settings), (qvel,), (jnp.ones_like(qvel),))
-
-    smooth, behind = mg.Smoothing(1e-3), mg.Smoothing(1e-3, mode="backward")
-    cases = {
-        "rollout": (cost, {}),
-        "rollout, onset": (cost, {"onset": mg.Onset()}),
-        "rollout, smoothed": (cost, {"smoothing": smooth}),
-        "value_and_grad": (reverse, {}),
-        "value_and_grad, onset": (reverse, {"onset": mg.Onset()}),
-        "value_and_grad, event": (reverse, {"gradient": "event"}),
-        "value_and_grad, smoothed": (reverse, {"smoothing": smooth}),
-        "value_and_grad, smoothed backward": (reverse, {"smoothing": behind}),
-        "jvp": (forward, {}),
-        "jvp, onset": (forward, {"onset": mg.Onset()}),
-        "jvp, event": (forward, {"gradient": "event"}),
+    transforms = {
+        "rollout": lambda one: one,
+        "value_and_grad": jax.value_and_grad,
+        "jvp": lambda one: lambda qvel: jax.jvp(one, (qvel,), (jnp.ones_like(qvel),)),
     }
-    cases = {case: how for case, how in cases.items() if "," not in case or options.only in case}
-    programs = {case: jax.jit(jax.vmap(functools.partial(f, **settings))) for case, (f, settings) in cases.items()}
-    seconds = {case: [] for case in programs}
-    for turn in range(options.repeats + 1):
-        for case, program in programs.items():
-            taken = _seconds(program, qvel)
-            if turn:
-                seconds[case].append(taken)
+    programs = {
+        f"{what}, {way}" if way else what: jax.jit(jax.vmap(transforms[what](functools.partial(cost, **_WAYS[way]))))
+        for what, ways in _COSTS.items()
+        for way in ways
+        if not way or options.only in f"{what}, {way}"
+    }
+    turns = [{case: _seconds(program, qvel) for case, program in programs.items()} for _ in range(options.repeats + 1)]
+    seconds = {case: [turn[case] for turn in turns[1:]] for case in programs}
     for case, times in seconds.items():
         base = float(np.median(seconds[case.split(",")[0]]))
         low, middle, high = (1e3 * float(q) for q in np.quantile(times, [0, 0.5, 1]))
@@ -312,51 +293,27 @@ def _throughput(options: argparse.Namespace) -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     _announce(f"{options.samples} samples, float32")
     task, key = mg.tasks.ball_wall(), jax.random.key(0)
-    compiling, running = _compile_and_run(
-        _estimates(task, options.samples), [(stiffness, key) for stiffness in _STIFFNESS]
-    )
-    print(f"one program, ten stiffness values: compiled in {compiling:.1f} s, ran in {running:.1f} s")
-    separate = [_one_by_one(task, options.samples, stiffness, key) for stiffness in _STIFFNESS[: options.separate]]
-    compiled, ran = (sum(times) for times in zip(*separate, strict=True))
-    print(f"{len(separate)} programs: compiled in {compiled:.1f} s, ran in {ran:.1f} s")
-    # A process of its own would also import and load the scene.
-    total = (compiled + ran) * len(_STIFFNESS) / len(separate)
-    print(f"the sweep in one program is {total / (compiling + running):.1f} times faster than ten programs")
-    _memory_by_samples(task, key, options)
 
-
-def _estimates(task: mg.tasks.BallWall, num_samples: int) -> Callable:
-    def estimates(stiffness: jax.Array, key: jax.Array) -> list:
+    def estimates(stiffness: jax.Array, key: jax.Array, num_samples: int = options.samples) -> list:
         objective = task.objective(0.1, mg.tasks.wall_softness(stiffness))
         return [estimator(objective, jnp.array([_ANGLE]), key, num_samples=num_samples) for estimator in _ESTIMATORS]
 
-    return estimates
-
-
-def _one_by_one(task: mg.tasks.BallWall, num_samples: int, stiffness: jax.Array, key: jax.Array) -> tuple[float, float]:
-    jax.clear_caches()
-    estimates = _estimates(task, num_samples)
-    return _compile_and_run(lambda key: estimates(stiffness, key), [(key,)])
-
-
-def _compile_and_run(function: Callable, arguments: list[tuple]) -> tuple[float, float]:
-    """Give the seconds to compile for the first arguments, and to run all of them."""
-    program, compilation = _compile(function, *arguments[0])
-    return compilation, sum(_seconds(program, *one) for one in arguments)
-
-
-def _memory_by_samples(task: mg.tasks.BallWall, key: jax.Array, options: argparse.Namespace) -> None:
+    program, compiling, _ = _compile(estimates, _STIFFNESS[0], key)
+    running = sum(_seconds(program, stiffness, key) for stiffness in _STIFFNESS)
+    print(f"one program, ten stiffness values: compiled in {compiling:.1f} s, ran in {running:.1f} s")
+    compiled = ran = 0.0
+    for stiffness in _STIFFNESS:
+        jax.clear_caches()
+        program, seconds, _ = _compile(functools.partial(estimates, stiffness), key)
+        compiled, ran = compiled + seconds, ran + _seconds(program, key)
+    print(f"{len(_STIFFNESS)} programs: compiled in {compiled:.1f} s, ran in {ran:.1f} s")
+    # A process of its own would also import and load the scene.
+    times = (compiled + ran) / (compiling + running)
+    print(f"the sweep in one program is {times:.1f} times faster than ten programs")
     print("samples      memory of the three estimators in one program")
-    count = 1000
-    while count <= options.most_samples:
-        program, _ = _compile(_estimates(task, count), _STIFFNESS[0], key)
-        print(f"{count:8d} {_memory(program) / 1e6:10.2f} MB", flush=True)
-        if options.run_most and count == options.most_samples:
-            runs = [_seconds(program, stiffness, key) for stiffness in _STIFFNESS[:3]]
-            print(
-                f"{count:8d} samples × 3 estimators in {statistics.median(runs):.1f} s, the median of 3 stiffness values"
-            )
-        count *= 10
+    for count in (10**3, 10**4, 10**5, 10**6):
+        _, _, memory = _compile(functools.partial(estimates, num_samples=count), _STIFFNESS[0], key)
+        print(f"{count:8d} {memory / 1e6:10.2f} MB", flush=True)
 
 
 if __name__ == "__main__":

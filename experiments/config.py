@@ -5,14 +5,15 @@ import itertools
 import json
 import re
 import tomllib
+import types
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from experiments.failure import ConfigurationError, suggest
-from experiments.mistakes import mistakes_of
 from experiments.settings import RunSettings
 
 FOLDER = Path(__file__).parent
@@ -38,14 +39,11 @@ class Run:
 
 
 def load_runs(file: str, overrides: list[str]) -> list[Run]:
-    """Read a configuration: one run, or one per combination of its `[sweep]` table.
+    """Read a configuration: one run, or one per combination of its `[sweep]` table, its last key changing fastest.
 
     Args:
         file: a path to a TOML file, or the name of one in `experiments/`.
         overrides: `key=value` in TOML syntax, dotted keys included. A key that the file sweeps is no longer swept.
-
-    Returns:
-        The runs in the order of the sweep, its last key changing fastest.
 
     Raises:
         ConfigurationError: naming every mistake in the file and the overrides.
@@ -75,17 +73,7 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
 
 
 def find_file(file: str) -> Path:
-    """Find a configuration by path or by name.
-
-    Args:
-        file: a path to a TOML file, or the name of one in `experiments/`.
-
-    Returns:
-        The path of a file that exists.
-
-    Raises:
-        ConfigurationError: answering an unknown name with those there are.
-    """
+    """Find a configuration by path or by name; an unknown one is answered with those there are."""
     path = Path(file)
     if path.is_file():
         return path
@@ -96,14 +84,7 @@ def find_file(file: str) -> Path:
 
 
 def read_header(text: str) -> tuple[str, str]:
-    """Read the comment that opens a configuration.
-
-    Args:
-        text: of the TOML file.
-
-    Returns:
-        The question it asks, and what is expected (after the word "Expected:"); empty if there is none.
-    """
+    """Read the comment that opens a configuration: its question, and what is expected, after the word "Expected:"."""
     lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
     comment = " ".join(line.lstrip("# ").strip() for line in lines)
     question, _, expected = comment.partition("Expected:")
@@ -138,7 +119,59 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
     except ValidationError as error:
-        return None, mistakes_of(settings, error, swept)
+        return None, [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
+
+
+def _follows(detail: ErrorDetails, error: ValidationError) -> bool:
+    """Tell whether an array is only too short for the mistakes within it, which are reported themselves."""
+    place = detail["loc"]
+    inner = (other["loc"][: len(place)] for other in error.errors() if len(other["loc"]) > len(place))
+    return detail["type"] == "too_short" and place in inner
+
+
+def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
+    # Pydantic puts a union's branch into the path too; only names of settings and positions in arrays help a reader.
+    parts, owner = _walk(settings, detail["loc"])
+    path = ".".join(parts)
+    swept_path = f"sweep.{path}" if path in swept else path
+    given = json.dumps(detail.get("input"), ensure_ascii=False)
+    match detail["type"]:
+        case "extra_forbidden":
+            return f"{swept_path}: unknown key; {suggest(parts[-1], owner.model_fields)}"
+        case "missing":
+            return f"{swept_path}: required, and missing"
+        case "literal_error":
+            expected = detail.get("ctx", {}).get("expected", "").replace("'", "")
+            choices = expected.replace(" or ", ", ").split(", ")
+            return f"{swept_path}: there is no {given}; {suggest(str(detail.get('input')), choices)}"
+        case "too_short":
+            return f"{swept_path}: must hold at least {detail.get('ctx', {}).get('min_length')}, got {given}"
+        case "value_error":
+            reason = detail["msg"].removeprefix("Value error, ")
+            return f"{swept_path}: {reason}" if path else reason
+    reason = detail["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return f"{swept_path}: must be {reason}, got {given}"
+
+
+def _walk(settings: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel]]:
+    """Follow an error's location through nested settings: its readable parts, and the last table on its way."""
+    owner, table, parts = settings, settings, []
+    for step in location:
+        if isinstance(step, int):
+            parts[-1] = f"{parts[-1]}[{step}]"
+            continue
+        if not parts or table is not None:
+            parts.append(step)
+            owner = table or owner
+            field = owner.model_fields.get(step)
+            table = _nested(field.annotation) if field else None
+    return parts, owner
+
+
+def _nested(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return annotation if issubclass(annotation, BaseModel) else None
+    return next((found for argument in get_args(annotation) if (found := _nested(argument))), None)
 
 
 def _apply(table: dict[str, Any], override: str) -> str | None:

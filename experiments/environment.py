@@ -50,12 +50,6 @@ def fingerprint(settings: Any) -> str:
     """A hash of all that decides a result: settings, source and versions.
 
     The source is hashed rather than its commit asked for, so that an uncommitted change counts too.
-
-    Args:
-        settings: resolved, defaults filled in; anything that JSON can hold.
-
-    Returns:
-        64 hexadecimal digits.
     """
     digest = hashlib.sha256(json.dumps([settings, versions()], sort_keys=True).encode())
     for folder, pattern in (("mjxgrad", "*.py"), ("experiments", "*.py"), ("mjcf", "*")):

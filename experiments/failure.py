@@ -24,15 +24,7 @@ class ConfigurationError(ExperimentError):
 
 
 def suggest(given: str, choices: Iterable[str]) -> str:
-    """Answer a wrong choice with the nearest one, or with all of them.
-
-    Args:
-        given: what was written.
-        choices: what may be written.
-
-    Returns:
-        The end of a sentence, such as `did you mean "seed"?`.
-    """
+    """Answer a wrong choice with the nearest one, or with all: the end of a sentence, such as `did you mean "seed"?`."""
     choices = list(choices)
     near = difflib.get_close_matches(given, choices, n=1, cutoff=0.6)
     return f'did you mean "{near[0]}"?' if near else f"choose one of {', '.join(sorted(choices))}"

@@ -17,15 +17,6 @@ def building(folder: Path) -> Iterator[Path]:
     """Build an output folder beside its place, and put it there only once it is complete.
 
     If the block raises, what it wrote is removed and the folder's former content stays.
-
-    Args:
-        folder: the final place.
-
-    Yields:
-        An empty folder to write to.
-
-    Raises:
-        ExperimentError: if it cannot be written.
     """
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     previous = folder.with_name(f".{folder.name}.previous")
@@ -42,14 +33,7 @@ def building(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Turn an operating system's refusal into a sentence.
-
-    Args:
-        folder: where the results were to go.
-
-    Raises:
-        ExperimentError: naming the folder, the cause and the remedy.
-    """
+    """Turn an operating system's refusal into an `ExperimentError` that names the folder, the cause and the remedy."""
     try:
         yield
     except OSError as error:
@@ -62,12 +46,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is complete or absent.
-
-    Args:
-        path: of the file.
-        text: its whole content.
-    """
+    """Write a file that is complete or absent."""
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
         partial.write_text(text, encoding="utf-8")
@@ -77,27 +56,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows that share their keys as CSV.
-
-    Args:
-        path: of the file.
-        rows: at least one.
-    """
+    """Write rows as CSV; what a row has nothing to say about is empty."""
     rows = list(rows)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
 
 
 def write_toml(path: Path, table: Mapping[str, Any], header: str) -> None:
-    """Write settings as TOML.
-
-    Args:
-        path: of the file.
-        table: values that TOML knows, and nested tables; None is left out.
-        header: a comment to open the file with.
-    """
+    """Write nested tables as TOML under a comment; None is left out."""
     lines = [f"# {line}" for line in header.splitlines()] + _toml_lines(table)
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -139,8 +107,6 @@ def _replace(folder: Path, complete: Path, previous: Path) -> None:
 def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
+    except OSError as error:
+        return not isinstance(error, ProcessLookupError)
     return True

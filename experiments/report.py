@@ -2,12 +2,14 @@
 
 import base64
 import html
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from experiments.config import Run
 from experiments.words import capitalised
 
 STYLE = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
@@ -15,13 +17,7 @@ STYLE = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in the output folder.
-
-    Attributes:
-        file: relative to the output folder.
-        caption: what it shows and how to read it.
-        title: a few words.
-    """
+    """A picture: its file, relative to the output folder, a title of a few words, and what it shows and how to read it."""
 
     file: str
     title: str
@@ -50,7 +46,7 @@ class Report:
     """The outcome of a run.
 
     Attributes:
-        verdict: the answer in a sentence or two, computed from the data.
+        verdict: the answer in at most three sentences, computed from the data.
         findings: further sentences, one each.
         figures: in order of reading.
         tables: after the figures.
@@ -75,19 +71,7 @@ class Report:
 
 
 def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
-    """Write a report as one HTML file that needs nothing beside it.
-
-    Args:
-        report: the outcome.
-        folder: where its pictures and its video lie.
-        name: of the run.
-        question: what it answers.
-        expected: what was expected, or empty.
-        about: headed lists of settings and circumstances.
-
-    Returns:
-        The page.
-    """
+    """Write a report as one HTML page that needs nothing beside it; `about` are headed lists of settings and circumstances."""
     body = [
         f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
         f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
@@ -103,19 +87,31 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
         *(_definitions(heading, entries) for heading, entries in about.items()),
         "</section>",
     ]
-    return document(f"{name}: {question}", "\n".join(part for part in body if part))
+    return _document(f"{name}: {question}", "\n".join(part for part in body if part))
 
 
-def document(title: str, body: str) -> str:
-    """Frame a page's body.
+def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
+    """Write the page over a sweep: each combination, its main numbers, its verdict and the way to its report."""
+    name, keys = runs[0].name, list(runs[0].varied)
+    summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
+    # In the order of their first appearance.
+    headings = list(dict.fromkeys(heading for one in summaries for heading in one["headline"]))
+    numbers, verdicts = [], []
+    for run, folder, summary in zip(runs, folders, summaries, strict=True):
+        varied = [_text(value) for value in run.varied.values()]
+        link = f'<a href="{_text(folder.name)}/report.html">report</a>'
+        numbers.append([*varied, *(_text(summary["headline"].get(heading, "")) for heading in headings)])
+        verdicts.append([*varied, _text(summary["verdict"]), link])
+    return _document(
+        f"{name}, {len(runs)} runs",
+        f'<header><p class="kicker">{_text(name)}, swept over {_text(", ".join(keys))}</p>'
+        f"<h1>{_text(runs[0].question)}</h1></header>"
+        f"{_grid([*keys, *headings], map(_cells, numbers)) if headings else ''}"
+        f"{_grid([*keys, 'verdict', ''], map(_cells, verdicts))}",
+    )
 
-    Args:
-        title: of the browser's tab.
-        body: HTML.
 
-    Returns:
-        The page.
-    """
+def _document(title: str, body: str) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -161,15 +157,21 @@ def _video(report: Report, folder: Path) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{_text(column)}</th>' for column in table.columns)
-    rows = []
-    for i, row in enumerate(table.rows):
-        cells = [f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>" for j, cell in enumerate(row)]
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    return (
-        f'<figure class="table"><figcaption>{_text(table.caption)}</figcaption><div class="scroll"><table>'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></figure>"
+    rows = (
+        "".join(f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>" for j, cell in enumerate(row))
+        for i, row in enumerate(table.rows)
     )
+    return f'<figure class="table"><figcaption>{_text(table.caption)}</figcaption>{_grid(table.columns, rows)}</figure>'
+
+
+def _grid(columns: Iterable[str], rows: Iterable[str]) -> str:
+    head = "".join(f'<th scope="col">{_text(column)}</th>' for column in columns)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _cells(row: Iterable[str]) -> str:
+    return "".join(f"<td>{cell}</td>" for cell in row)
 
 
 def _class(table: Table, position: tuple[int, int], cell: str) -> str:

@@ -15,10 +15,8 @@ from typing import Any
 
 from experiments import environment
 from experiments.config import Run, load_runs
-from experiments.opengl import OpenGL
 from experiments.output import building, write_csv, write_text, write_toml, writing
-from experiments.overview import overview
-from experiments.report import Report, page
+from experiments.report import Report, overview, page
 from experiments.workspace import CompileClock, Workspace
 
 # What a kind's report.py may say of its outcome, each by a function of that name.
@@ -30,17 +28,8 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 
     A result whose settings, source and versions are unchanged is kept: an interrupted sweep goes on where it stopped.
 
-    Args:
-        file: a TOML file, or the name of one in `experiments/`.
-        overrides: `key=value` in TOML syntax.
-        output: the folder that holds each run's folder.
-        force: run what is unchanged, too.
-
-    Returns:
-        The path of the report.
-
-    Raises:
-        ExperimentError: in one sentence, if the run cannot go on.
+    Files and overrides are those of `load_runs`, `output` is the folder that holds each run's folder, and the path that of the
+    report. An `ExperimentError` says why a run cannot go on.
     """
     runs = load_runs(file, overrides)
     command = shlex.join(["python", "-m", "experiments", "run", file, *overrides])
@@ -62,13 +51,11 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     previous = _previous(folder)
     # A report that lacks its video is made again once there is an OpenGL to draw it with.
     is_unchanged = previous.get("fingerprint") == fingerprint
-    if is_unchanged and not force and not (previous["lacks_opengl"] and OpenGL().settle()):
+    if is_unchanged and not force and not (previous["lacks_video"] and _can_draw()):
         print(f"unchanged: {folder / 'report.html'} (same settings and code; --force runs it again)")
         return
     with building(folder) as partial:
-        search = OpenGL()
         _set_up_jax(run.settings.precision)
-        opengl = search.settle()
         print(f"{folder}: {run.question}", file=sys.stderr)
         workspace, started, compiling = Workspace(partial), time.perf_counter(), CompileClock()
         report = _call(run, workspace)
@@ -80,8 +67,7 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
             "dirty": is_dirty,
             "versions": environment.versions(),
             "device": environment.device(),
-            "opengl": opengl,
-            "lacks_opengl": opengl is None and report.video is None and bool(report.video_caption),
+            "lacks_video": report.video is None and bool(report.video_caption),
             "seconds": {
                 **workspace.seconds,
                 "total": time.perf_counter() - started,
@@ -94,11 +80,17 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     print(f"{report.verdict}\n{folder / 'report.html'}")
 
 
+def _can_draw() -> bool:
+    from experiments.video import can_draw
+
+    return can_draw()
+
+
 def _call(run: Run, workspace: Workspace) -> Report:
     """Run the experiment; what the library warns of, and what it finds unstable, goes into the report, not to the terminal."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        # Late, once precision and OpenGL are chosen: these import JAX and MuJoCo.
+        # Late, once the precision is chosen: these import JAX and MuJoCo.
         from experiments.theme import save
 
         measure, words, pictures = (

@@ -7,7 +7,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from cycler import cycler
 
 matplotlib.use("Agg")
 
@@ -26,71 +25,22 @@ DEFAULT, MUTED, ONSET = "#cc79a7", "#8b94a1", "#009e73"
 # For what comes besides, in order; told apart by their markers, too.
 OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#393b79")
 MARKERS = "osD^vP*X<>"
+_STYLE = Path(__file__).parent / "report.mplstyle"
 WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
 
 # By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
 Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
 
-RULES: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9.5,
-    "axes.labelcolor": "#3b4452",
-    "axes.edgecolor": "#9aa3af",
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.prop_cycle": cycler(color=[FIRST, ZEROTH, "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]),
-    "axes.grid": True,
-    "grid.color": "#e8eaed",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "xtick.color": "#9aa3af",
-    "ytick.color": "#9aa3af",
-    "xtick.labelcolor": "#3b4452",
-    "ytick.labelcolor": "#3b4452",
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.6,
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 160,
-    "savefig.facecolor": "white",
-}
-
 
 def subplots(rows: int, columns: int, *, height: float, **settings):
-    """Make a figure in the theme.
-
-    Args:
-        rows: of axes.
-        columns: of axes.
-        height: of the figure, in inches.
-        **settings: as for `matplotlib.pyplot.subplots`.
-
-    Returns:
-        The figure, and an array (rows, columns) of axes.
-    """
+    """Make a figure in the theme, of a height in inches, and an array (rows, columns) of axes."""
     # Titles, ticks and legends read the rules when they are made, so a context around this call would not reach them.
-    plt.rcParams.update(RULES)
+    plt.style.use(_STYLE)
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 
 def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
-    """Draw figures, write them, and let go of them.
-
-    Args:
-        drawings: pictures made by `subplots`.
-        outcome: the numbers.
-        folder: of the run.
-
-    Returns:
-        The figures of the report.
-    """
+    """Draw the figures of a report into a run's folder, and let go of them."""
     (folder / "figures").mkdir(exist_ok=True)
     figures = []
     for name, drawing in drawings.items():

@@ -25,17 +25,9 @@ def film(
     columns: int = 1,
     timestep: float | None = None,
 ) -> tuple[str | None, str]:
-    """Draw motions side by side.
+    """Draw motions side by side, each a model and its positions over time.
 
-    Args:
-        workspace: for the folder and the clock.
-        motions: what moves, and its positions over time.
-        look: how fast and how large.
-        camera: of the scene.
-        caption: of the video.
-        titles: of the motions, if there are several.
-        columns: in which several stand.
-        timestep: between positions, in s; the model's own if it is not given.
+    Several have titles and stand in columns. The time between positions (s) is the model's own if it is not given.
 
     Returns:
         The file in the output folder and its caption; without OpenGL None and the reason.
@@ -56,6 +48,15 @@ def film(
     except RenderingUnavailableError as error:
         return None, str(error)
     return FILE, caption
+
+
+def can_draw() -> bool:
+    """Say whether there is an OpenGL that renders without a display."""
+    try:
+        frames(mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros((1, 0)), height=8, width=8)
+    except RenderingUnavailableError:
+        return False
+    return True
 
 
 def shown_speed(speed: float) -> str:

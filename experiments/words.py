@@ -4,15 +4,7 @@ from collections.abc import Iterable
 
 
 def quantity(value: float, error: float | None = None) -> str:
-    """Write a number with as many digits as its error allows.
-
-    Args:
-        value: the number.
-        error: one standard error or half an interval; without it three digits are given.
-
-    Returns:
-        Such as "−0.0118 ± 0.0004" or "(1.23 ± 0.05)×10⁵".
-    """
+    """Write a number with as many digits as its error allows, or three: "−0.0118 ± 0.0004", "(1.23 ± 0.05)×10⁵"."""
     if value != value or (error is not None and error != error):
         return "undefined"
     magnitude = max(abs(value), error or 0.0)

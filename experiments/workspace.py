@@ -15,15 +15,7 @@ if TYPE_CHECKING:
 
 
 class Workspace:
-    """An output folder under construction, with the time that its stages took.
-
-    Args:
-        folder: exists, and is moved to its final place by the runner once all is written.
-
-    Attributes:
-        seconds: wall time by stage.
-        warnings: what a reader must know of the scenes that were checked.
-    """
+    """An output folder under construction, with the time of its stages and what a reader must know of its scenes."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -31,13 +23,7 @@ class Workspace:
         self.warnings: list[str] = []
 
     def check(self, scene: "Scene", *, speed: float | None = None, name: str | None = None) -> None:
-        """Note what the time step of a scene does not follow; it becomes part of the report.
-
-        Args:
-            scene: that is simulated, with known values.
-            speed: at which its bodies meet, in m/s.
-            name: in place of the scene's own.
-        """
+        """Note what the time step of a scene, whose bodies meet at a speed (m/s), does not follow, for the report."""
         # A configuration is checked before anything heavy is imported.
         from mjxgrad.diagnostics.stability import check_stability
 
@@ -45,16 +31,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def stage(self, name: str, unit: str, total: int) -> Iterator[Callable[[int], None]]:
-        """Time a stage and show how far it is.
-
-        Args:
-            name: what is being done.
-            unit: what it consists of, in the plural.
-            total: how many of these there are.
-
-        Yields:
-            A function to be told how many are done.
-        """
+        """Time a stage of so many units and show how far it is; the function that it gives is told how many are done."""
         start = time.perf_counter()
         is_terminal = sys.stderr.isatty()
         # A log is no place for a bar that redraws itself ten times a second.

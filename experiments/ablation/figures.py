@@ -1,18 +1,19 @@
 """The pictures of an experiment on leaving out."""
 
+import numpy as np
 from matplotlib.lines import Line2D
 
-from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
+from experiments.ablation.outcome import Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
 from experiments.parallel import num_compilers
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
-_KINDS = {
-    NEEDED: (ZEROTH, "all that no motion needs"),
-    REACHED: (FIRST, "and what recorded motions did not reach"),
-    None: (MUTED, "one group"),
-}
+_LOOKS = (
+    (ZEROTH, "all that no motion needs"),
+    (FIRST, "and what recorded motions did not reach"),
+    (MUTED, "one group"),
+)
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -25,12 +26,11 @@ def ratios(outcome: Outcome):
     drawn = _drawn(outcome)
     figure, axes = subplots(1, 4, height=1.7 + 0.27 * len(drawn), sharey=True)
     for place, (_, variant) in enumerate(drawn):
-        for axis, (middle, low, high) in zip(axes[0], _shares(variant), strict=True):
-            if middle is None:
-                continue
-            fill = _colour(variant) if variant.is_unchanged else "white"
-            axis.plot([low, high], [place, place], color=_colour(variant), lw=2, solid_capstyle="round")
-            axis.plot(middle, place, "o", color=_colour(variant), mfc=fill, ms=6)
+        colour = _look(variant)[0]
+        fill = colour if variant.is_unchanged else "white"
+        for axis, (low, middle, high) in zip(axes[0], _shares(variant), strict=True):
+            axis.plot([low, high], [place, place], color=colour, lw=2, solid_capstyle="round")
+            axis.plot(middle, place, "o", color=colour, mfc=fill, ms=6)
     for axis, title in zip(axes[0], _TITLES, strict=True):
         axis.axvline(1.0, color=REFERENCE, lw=1)
         axis.set_title(title)
@@ -38,12 +38,8 @@ def ratios(outcome: Outcome):
         axis.set_xlabel("share")
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
-    kinds = {_kind(variant) for _, variant in drawn}
-    handles = [
-        Line2D([], [], color=colour, marker="o", ls="", label=label)
-        for kind, (colour, label) in _KINDS.items()
-        if kind in kinds
-    ]
+    looks = {_look(variant) for _, variant in drawn}
+    handles = [Line2D([], [], color=look[0], marker="o", ls="", label=look[1]) for look in _LOOKS if look in looks]
     if not all(variant.is_unchanged for _, variant in drawn):
         handles.append(Line2D([], [], color=MUTED, marker="o", mfc="white", ls="", label="changes motion or gradient"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
@@ -62,25 +58,17 @@ def _drawn(outcome: Outcome) -> list[tuple[SceneOutcome, VariantOutcome]]:
     return [(scene, v) for scene in outcome.scenes for v in scene.variants[1:] if not v.is_same_program]
 
 
-def _kind(variant: VariantOutcome) -> str | None:
-    return variant.name if variant.name in _KINDS else None
+def _look(variant: VariantOutcome) -> tuple[str, str]:
+    places = {NEEDED: 0, REACHED: 1}
+    return _LOOKS[places.get(variant.name, 2)]
 
 
-def _colour(variant: VariantOutcome) -> str:
-    return _KINDS[_kind(variant)][0]
-
-
-def _shares(variant: VariantOutcome) -> list[tuple[float | None, float | None, float | None]]:
-    operations = variant.step.flops / variant.step.base_flops
-    compilation = None
-    if variant.gradient is not None:
-        compilation = variant.gradient.compile_seconds / variant.gradient.base_compile_seconds
-    counted = (operations, operations, operations), (compilation, compilation, compilation)
-    return [_of(variant.step), _of(variant.gradient), *counted]
-
-
-def _of(cost: Cost | None) -> tuple[float | None, float | None, float | None]:
-    if cost is None:
-        return None, None, None
-    low, middle, high = cost.ratio
-    return middle, low, high
+def _shares(variant: VariantOutcome) -> list[tuple[float, float, float]]:
+    """Give what each panel shows: lower end, dot and upper end; NaN where it was not measured."""
+    step, gradient, unknown = variant.step, variant.gradient, (np.nan,) * 3
+    return [
+        step.ratio,
+        gradient.ratio if gradient else unknown,
+        (step.flops / step.base_flops,) * 3,
+        (gradient.compile_seconds / gradient.base_compile_seconds,) * 3 if gradient else unknown,
+    ]

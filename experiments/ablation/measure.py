@@ -5,20 +5,27 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
 from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
-from experiments.ablation.recording import record, scene_path, segments
 from experiments.ablation.settings import Settings
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, REACHED, Variant, variants
 from experiments.parallel import num_compilers
 from experiments.workspace import Workspace
 
+_OWN = Path(__file__).parents[2] / "mjcf"
+_GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+_HOLD = 10  # steps for which a control is held
+_VELOCITY_STDDEV = 0.5  # of the start (m/s or rad/s)
 _EPSILON_STEPS = 4  # roundings by which starts are moved, to see what rounding alone changes
 _Starts = tuple[jax.Array, jax.Array, jax.Array]
 
@@ -84,23 +91,72 @@ def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
         }
     # All have been compiled, so that nothing else runs while they are timed.
     steps, slopes = motions.compare(sizes.repeats), gradients.compare(sizes.repeats)
-    outcomes = []
-    for variant in found:
-        in_recorded, in_others = checks.get(variant.name, (None, None))
-        outcomes.append(
-            VariantOutcome(
-                name=variant.name,
-                what=variant.what,
-                num_pairs=len(variant.scene.pairs),
-                num_rows=int(variant.scene.data._impl.nefc),
-                num_bodies=int(variant.scene.model.nbody),
-                step=steps[variant.name],
-                gradient=slopes.get(variant.name),
-                recorded=in_recorded,
-                others=in_others,
-            )
+    outcomes = [
+        VariantOutcome(
+            name=v.name,
+            what=v.what,
+            num_pairs=len(v.scene.pairs),
+            num_rows=int(v.scene.data._impl.nefc),
+            num_bodies=int(v.scene.model.nbody),
+            step=steps[v.name],
+            gradient=slopes.get(v.name),
+            checks=checks.get(v.name, ()),
         )
+        for v in found
+    ]
     return SceneOutcome(name, outcomes, sizes.batch * sizes.horizon)
+
+
+def scene_path(name: str) -> Path:
+    """Give the MJCF file of a scene: ours, or gymnasium's."""
+    own = _OWN / f"{name}.xml"
+    return own if own.exists() else _GYMNASIUM / f"{name}.xml"
+
+
+def record(
+    scene: mg.Scene, *, num_rollouts: int, duration: float, least_steps: int, control_share: float, seed: int
+) -> mg.Trajectory:
+    """Roll out random controls, held for a few steps, from the reference pose with random velocities, by C MuJoCo.
+
+    Each takes its duration (s), or so many steps at least, and controls over a share of their range, about its middle. C MuJoCo
+    needs no compilation.
+    """
+    model = scene.to_mujoco()
+    random = np.random.default_rng(seed)
+    horizon = max(round(duration / model.opt.timestep), least_steps)
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = np.where(limited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    middle, reach = (low + high) / 2, control_share * (high - low) / 2
+    data, nq = mujoco.MjData(model), model.nq
+    # Time, positions, velocities, and the state of actuators, if there is any.
+    initial = np.zeros((num_rollouts, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    initial[:, 1 : 1 + nq] = data.qpos
+    controls = []
+    for start in initial:
+        start[1 + nq : 1 + nq + model.nv] = _VELOCITY_STDDEV * random.normal(size=model.nv)
+        held = middle + reach * random.uniform(-1, 1, (-(-horizon // _HOLD), model.nu))
+        controls.append(np.repeat(held, _HOLD, axis=0)[:horizon])
+    states, _ = mujoco.rollout.rollout(model, data, initial, np.array(controls))
+    states = jnp.asarray(np.concatenate([initial[:, None], states], axis=1))
+    return mg.Trajectory(
+        qpos=states[..., 1 : 1 + nq],
+        qvel=states[..., 1 + nq : 1 + nq + model.nv],
+        ctrl=jnp.asarray(np.array(controls)),
+        observations=None,
+        final=jax.tree.map(lambda x: jnp.broadcast_to(x, (num_rollouts, *jnp.shape(x))), mg.initial_state(scene)),
+        diverged=jnp.zeros(num_rollouts, bool),
+        first_bad_step=jnp.full(num_rollouts, -1, jnp.int32),
+        unsolved=jnp.zeros(num_rollouts, jnp.int32),
+    )
+
+
+def segments(recorded: mg.Trajectory, *, batch: int, horizon: int, seed: int) -> _Starts:
+    """Draw positions and velocities from recorded rollouts, with the controls that followed, one row per start."""
+    random = np.random.default_rng(seed)
+    which = random.integers(len(recorded.qpos), size=batch)
+    when = random.integers(recorded.ctrl.shape[1] - horizon, size=batch)
+    follow = when[:, None] + np.arange(horizon)
+    return recorded.qpos[which, when], recorded.qvel[which, when], recorded.ctrl[which[:, None], follow]
 
 
 def _motion(scene: mg.Scene) -> Callable[..., Any]:
@@ -125,11 +181,7 @@ def _gradient(scene: mg.Scene) -> Callable[..., Any]:
 class _Programs:
     """One program of every variant; where two make the same, letter for letter, it is compiled and timed once.
 
-    Args:
-        found: the variants, the one with everything first.
-        make: from a scene to what is compiled.
-        starts: that it is compiled for and run on.
-        pool: of threads, in which compilation goes on after the return.
+    Compilation goes on in the threads of the pool after the return.
     """
 
     def __init__(
@@ -178,17 +230,14 @@ class _Programs:
 
 def _compiled(lowered: jax.stages.Lowered, text: str, traced_in: float) -> _Program:
     compiled, seconds = _timed(lowered.compile)
-    return _Program(compiled, text, traced_in + seconds, _flops(compiled))
+    flops = (compiled.cost_analysis() or {}).get("flops", np.nan)
+    return _Program(compiled, text, traced_in + seconds, float(flops))
 
 
 def _timed(function: Callable[[], Any]) -> tuple[Any, float]:
     began = time.perf_counter()
     result = function()
     return result, time.perf_counter() - began
-
-
-def _flops(compiled: Any) -> float:
-    return float((compiled.cost_analysis() or {}).get("flops", np.nan))
 
 
 def _numbers(result: Any) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The numbers of an experiment on leaving out, and what follows from them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,11 +49,6 @@ class Cost:
         return float(low), float(middle), float(high)
 
     @property
-    def is_equal(self) -> bool:
-        """Whether every number is the same, bit for bit."""
-        return self.difference == 0.0
-
-    @property
     def is_unchanged(self) -> bool:
         """Whether nothing differs by more than rounding makes of it."""
         return self.difference <= _ROUNDING_FACTOR * max(self.rounding, np.finfo(float).eps * self.scale)
@@ -62,7 +58,7 @@ class Cost:
         """Say in a word or two whether numbers are those with everything."""
         if self.is_same_program:
             return "same program"
-        if self.is_equal:
+        if self.difference == 0.0:
             return "equal"
         return "to rounding" if self.is_unchanged else f"differs by {self.difference / self.scale:.1e}"
 
@@ -79,9 +75,8 @@ class VariantOutcome:
         num_bodies: world included.
         step: cost of the motion.
         gradient: cost of its gradient; None if not measured.
-        recorded: what the full model says of the motions from which it was told what is not reached; None where a
-            group alone is left out.
-        others: likewise of other motions of the kind.
+        checks: what the full model says of the motions from which it was told what is not reached, and of other motions of the
+            kind; empty where a group alone is left out.
     """
 
     name: str
@@ -91,29 +86,27 @@ class VariantOutcome:
     num_bodies: int
     step: Cost
     gradient: Cost | None
-    recorded: OmissionCheck | None
-    others: OmissionCheck | None
+    checks: Sequence[OmissionCheck]
+
+    @property
+    def costs(self) -> list[Cost]:
+        """Of the motion and, where measured, of its gradient."""
+        return [self.step, self.gradient] if self.gradient else [self.step]
 
     @property
     def is_same_program(self) -> bool:
         """Whether XLA is given what it is given with everything."""
-        return all(cost.is_same_program for cost in (self.step, self.gradient) if cost is not None)
+        return all(cost.is_same_program for cost in self.costs)
 
     @property
     def is_unchanged(self) -> bool:
         """Whether motion and, where measured, gradient are those with everything."""
-        return all(cost.is_unchanged for cost in (self.step, self.gradient) if cost is not None)
+        return all(cost.is_unchanged for cost in self.costs)
 
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """All variants of a scene, the one with everything first.
-
-    Attributes:
-        name: of the scene.
-        variants: of it.
-        steps_per_run: that one run of a program takes, over its batch.
-    """
+    """All variants of a scene, the one with everything first, and the steps of one run of a program, over its batch."""
 
     name: str
     variants: list[VariantOutcome]
@@ -126,55 +119,35 @@ class SceneOutcome:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
-
-    Attributes:
-        settings: of the run.
-        scenes: in the order of the settings.
-    """
+    """All that was measured, in the order of the settings."""
 
     settings: Settings
     scenes: list[SceneOutcome]
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per scene and variant, for metrics.csv."""
+        """One row per scene and variant, for metrics.csv; the first, with everything, has every column."""
         rows = []
         for scene in self.scenes:
             for variant in scene.variants:
-                row = {
+                row: dict[str, Any] = {
                     "scene": scene.name,
                     "left_out": variant.name,
                     "what": variant.what,
                     "pairs": variant.num_pairs,
                     "rows": variant.num_rows,
                     "bodies": variant.num_bodies,
-                    "missed_recorded": len(variant.recorded.missed) if variant.recorded else "",
-                    "missed_others": len(variant.others.missed) if variant.others else "",
                 }
-                for word, cost in (("step", variant.step), ("gradient", variant.gradient)):
-                    row |= _cost_row(word, cost, scene.steps_per_run)
+                missed = [len(check.missed) for check in variant.checks] or ("", "")
+                row |= dict(zip(("missed_recorded", "missed_others"), missed, strict=True))
+                for word, cost in zip(("step", "gradient"), variant.costs, strict=False):
+                    low, middle, high = cost.ratio
+                    row |= {
+                        f"{word}_microseconds": 1e6 * float(np.median(cost.seconds)) / scene.steps_per_run,
+                        f"{word}_ratio_low": low,
+                        f"{word}_ratio": middle,
+                        f"{word}_ratio_high": high,
+                    }
+                    parts = ("compile_seconds", "flops", "difference", "rounding", "scale")
+                    row |= {f"{word}_{part}": getattr(cost, part) for part in parts}
                 rows.append(row)
         return rows
-
-
-def _cost_row(word: str, cost: Cost | None, steps: int) -> dict[str, Any]:
-    if cost is None:
-        return dict.fromkeys((f"{word}_{part}" for part in _PARTS), "")
-    low, middle, high = cost.ratio
-    values = (
-        1e6 * float(np.median(cost.seconds)) / steps,
-        low,
-        middle,
-        high,
-        cost.compile_seconds,
-        cost.flops,
-        cost.difference,
-        cost.rounding,
-        cost.scale,
-    )
-    return {f"{word}_{part}": value for part, value in zip(_PARTS, values, strict=True)}
-
-
-_PARTS = (
-    "microseconds", "ratio_low", "ratio", "ratio_high", "compile_seconds", "flops", "difference", "rounding", "scale"
-)  # fmt: skip

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from experiments.ablation.outcome import Cost, Outcome, SceneOutcome, VariantOutcome
+from experiments.ablation.outcome import Cost, Outcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
 from experiments.report import Table
-from experiments.words import joined
+from experiments.words import joined, percent
 
 
 def verdict(outcome: Outcome) -> str:
@@ -14,21 +14,40 @@ def verdict(outcome: Outcome) -> str:
         _gain(outcome, NEEDED, "what no motion needs"),
         _gain(outcome, REACHED, "what recorded motions did not reach, either"),
     ]
-    return " ".join([*filter(None, gains), _safety(outcome)])
+    safe = [(scene.name, scene.find(NEEDED)) for scene in outcome.scenes]
+    changed = [name for name, v in safe if v is not None and not v.is_unchanged]
+    safety = (
+        f"Motion or gradient change by more than rounding in {joined(changed)}."
+        if changed
+        else "Without what no motion needs motions and gradients stay the same, bit for bit or to rounding, in every scene."
+    )
+    return " ".join([*filter(None, gains), safety])
+
+
+def _gain(outcome: Outcome, name: str, subject: str) -> str:
+    having = [
+        (v.step.ratio[1], scene.name) for scene in outcome.scenes if (v := scene.find(name)) and not v.is_same_program
+    ]
+    if not having:
+        return ""
+    ends = [f"{percent(share)} of its time with everything in {scene}" for share, scene in (min(having), max(having))]
+    others = (
+        f" and {ends[1]}; {len(having)} of {len(outcome.scenes)} scenes have something of it" if len(having) > 1 else ""
+    )
+    return f"Without {subject} a step takes {ends[0]}{others}."
 
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what other motions reached of what was left out."""
     sentences = []
     for scene in outcome.scenes:
-        for name in (NEEDED, REACHED):
-            variant = scene.find(name)
-            check = variant.others if variant else None
+        for variant in scene.variants:
+            check = variant.checks[1] if variant.checks else None
             if check is None or check.is_sound:
                 continue
             first = check.missed[0]
             sentences.append(
-                f"{scene.name}, without {name}: in other motions {first.what} acted first at {first.time:.2f} s, in "
+                f"{scene.name}, without {variant.name}: in other motions {first.what} acted first at {first.time:.2f} s, in "
                 f"{first.num_states} of {check.num_states} states; in one step a number changes by up to {check.step_error:.2g}."
             )
     return sentences
@@ -36,92 +55,51 @@ def findings(outcome: Outcome) -> list[str]:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate the scenes with everything, and every group beside them."""
-    return [_scenes(outcome), _groups(outcome)]
-
-
-def _gain(outcome: Outcome, name: str, subject: str) -> str:
-    having = [(scene, v) for scene in outcome.scenes if (v := scene.find(name)) and not v.is_same_program]
-    if not having:
-        return ""
-    times = ", ".join(
-        f"{scene.name} {_percent(v.step)} %" + (f", its gradient {_percent(v.gradient)} %" if v.gradient else "")
-        for scene, v in sorted(having, key=lambda one: one[1].step.ratio[1])
-    )
-    return f"Without {subject} a step takes of its time with everything: {times}."
-
-
-def _safety(outcome: Outcome) -> str:
-    safe = [(scene, scene.find(NEEDED)) for scene in outcome.scenes]
-    changed = [scene.name for scene, v in safe if v is not None and not v.is_unchanged]
-    if changed:
-        return f"Motion or gradient change by more than rounding in {joined(changed)}."
-    return "Motions and gradients stay the same, bit for bit or to rounding, in every scene."
-
-
-def _scenes(outcome: Outcome) -> Table:
-    rows = []
+    whole, groups, emphasised = [], [], set()
     for scene in outcome.scenes:
         base = scene.variants[0]
-        rows.append(
-            [
-                scene.name, str(base.num_pairs), str(base.num_rows),
-                _microseconds(base.step, scene), _microseconds(base.gradient, scene),
-                f"{base.step.compile_seconds:.1f}", f"{base.gradient.compile_seconds:.1f}" if base.gradient else "",
-            ]
-        )  # fmt: skip
-    return Table(
-        ("scene", "pairs", "rows", "step, µs", "gradient, µs", "compile step, s", "compile gradient, s"),
-        rows,
-        "With everything. Time per step of one rollout in a batch, median; the gradient includes the motion. Compilation "
-        "includes tracing.",
-    )
-
-
-def _groups(outcome: Outcome) -> Table:
-    rows, emphasised = [], set()
-    for scene in outcome.scenes:
+        times = [f"{1e6 * float(np.median(cost.seconds)) / scene.steps_per_run:.3g}" for cost in base.costs]
+        compiling = [f"{cost.compile_seconds:.1f}" for cost in base.costs]
+        whole.append([scene.name, str(base.num_pairs), str(base.num_rows), *times, *compiling])
         for variant in scene.variants[1:]:
             if not variant.is_unchanged:
-                emphasised.add((len(rows), 8))
-            rows.append([scene.name, variant.name, variant.what, *_cells(variant)])
-    return Table(
-        ("scene", "left out", "what", "rows", "operations, %", "step, %", "gradient, %", "compile, %", "motion, gradient",
-         "missed in other motions"),
-        rows,
-        "In per cent of the scene with everything; times are medians over turns with their quartiles, compilation is that of the "
-        "gradient where measured, once. Motion and gradient: the same program before XLA sees it, equal bit for bit, equal "
-        "to what rounding the start makes of them, or the difference as a share of the largest number (bold).",
-        frozenset(emphasised),
-    )  # fmt: skip
+                emphasised.add((len(groups), 8))
+            groups.append([scene.name, variant.name, variant.what, *_cells(variant)])
+    return [
+        Table(
+            ("scene", "pairs", "rows", "step, µs", "gradient, µs", "compile step, s", "compile gradient, s"),
+            whole,
+            "With everything. Time per step of one rollout in a batch, median; the gradient includes the motion. Compilation "
+            "includes tracing.",
+        ),
+        Table(
+            ("scene", "left out", "what", "rows", "operations, %", "step, %", "gradient, %", "compile, %", "motion, gradient",
+             "missed in other motions"),
+            groups,
+            "In per cent of the scene with everything; times are medians over turns with their quartiles, compilation is that of "
+            "the gradient where measured, once. Motion and gradient: the same program before XLA sees it, equal bit for bit, "
+            "equal to what rounding the start makes of them, or the difference as a share of the largest number (bold).",
+            frozenset(emphasised),
+        ),
+    ]  # fmt: skip
 
 
 def _cells(variant: VariantOutcome) -> list[str]:
-    main = variant.gradient or variant.step
-    head = [str(variant.num_rows)]
-    tail = [str(len(variant.others.missed) or "none") if variant.others else ""]
+    rows, missed = str(variant.num_rows), str(len(variant.checks[1].missed) or "none") if variant.checks else ""
     if variant.is_same_program:
-        return [*head, "100", "", "", "", "same program", *tail]
+        return [rows, "100", "", "", "", "same program", missed]
+    main = variant.costs[-1]
     return [
-        *head,
+        rows,
         f"{100 * variant.step.flops / variant.step.base_flops:.0f}",
         _spread(variant.step),
-        _spread(variant.gradient),
+        _spread(variant.gradient) if variant.gradient else "",
         f"{100 * main.compile_seconds / main.base_compile_seconds:.0f}",
-        ", ".join(cost.verdict for cost in (variant.step, variant.gradient) if cost),
-        *tail,
+        ", ".join(cost.verdict for cost in variant.costs),
+        missed,
     ]
 
 
-def _percent(cost: Cost) -> str:
-    return f"{100 * cost.ratio[1]:.0f}"
-
-
-def _spread(cost: Cost | None) -> str:
-    if cost is None:
-        return ""
+def _spread(cost: Cost) -> str:
     low, middle, high = (100 * x for x in cost.ratio)
     return f"{middle:.0f} ({low:.0f} to {high:.0f})"
-
-
-def _microseconds(cost: Cost | None, scene: SceneOutcome) -> str:
-    return f"{1e6 * float(np.median(cost.seconds)) / scene.steps_per_run:.3g}" if cost else ""

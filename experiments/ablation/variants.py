@@ -26,37 +26,29 @@ class Variant:
         name: of the group that is left out.
         scene: without it.
         what: what was left out, in a few words.
-        changes_rows: whether constraint rows are fewer or other.
     """
 
     name: str
     scene: mg.Scene
     what: str
-    changes_rows: bool
 
 
 def variants(path: Path, recorded: mg.Trajectory) -> list[Variant]:
     """Build a scene with everything, without each group that it has, and without all that it does not need.
 
-    Args:
-        path: of its MJCF.
-        recorded: its motions, for what they reach.
-
-    Returns:
-        The one with everything first; last the one without all that no motion needs, and where the recorded motions
-        leave more unreached, the one without that, too.
+    The one with everything comes first; last the one without all that no motion needs, and where the recorded motions leave
+    more unreached, the one without that, too.
     """
     with warnings.catch_warnings():
         # On the file, so the same for every variant: deprecated words, and contacts unlike C MuJoCo's.
         warnings.simplefilter("ignore", UserWarning)
         everything = mg.load_scene(path, keep_everything=True)
         unused = mg.diagnostics.unused(everything, recorded)
-        found = [Variant(EVERYTHING, everything, "", False)]
+        found = [Variant(EVERYTHING, everything, "")]
         for name, edit in _EDITS.items():
             edited = edit(path)
             if edited is not None:
-                scene = mg.load_scene(edited[0], keep_everything=True)
-                found.append(Variant(name, scene, edited[1], name == FUSED))
+                found.append(Variant(name, mg.load_scene(edited[0], keep_everything=True), edited[1]))
         found += _constraints(everything, unused)
         found.append(_lean(NEEDED, path, mg.LeaveOut()))
         if unused.pairs or unused.limits:
@@ -68,7 +60,7 @@ def _lean(name: str, path: Path, wanted: mg.LeaveOut) -> Variant:
     scene = mg.load_scene(path, leave_out=wanted)
     parts = {"pairs": len(scene.omitted_pairs), "limits": len(wanted.limits)}
     listed = [f"{count} {word}" for word, count in parts.items() if count]
-    return Variant(name, scene, ", ".join(["as load_scene does", *listed]), bool(listed))
+    return Variant(name, scene, ", ".join(["as load_scene does", *listed]))
 
 
 def _constraints(everything: mg.Scene, unused: mg.LeaveOut) -> Iterator[Variant]:
@@ -76,10 +68,9 @@ def _constraints(everything: mg.Scene, unused: mg.LeaveOut) -> Iterator[Variant]
         model = everything.to_mujoco()
         omitted, omissions = omit(model, wanted)
         if omissions:
-            count = (
-                f"{len(omitted)} of {len(everything.pairs)} pairs" if name != LIMITS else f"{len(unused.limits)} limits"
-            )
-            yield Variant(name, mg.load_scene(model, keep_everything=True), count, True)
+            pairs = f"{len(omitted)} of {len(everything.pairs)} pairs"
+            what = f"{len(unused.limits)} limits" if name == LIMITS else pairs
+            yield Variant(name, mg.load_scene(model, keep_everything=True), what)
 
 
 def _without_rendering(path: Path) -> tuple[mujoco.MjModel, str] | None:
@@ -126,8 +117,7 @@ def _without_tendons(path: Path) -> tuple[mujoco.MjModel, str] | None:
 
 
 def _fused(path: Path) -> tuple[mujoco.MjModel, str] | None:
-    spec = mujoco.MjSpec.from_file(str(path))
-    before = spec.compile().nbody
+    before = mujoco.MjModel.from_xml_path(str(path)).nbody
     spec = mujoco.MjSpec.from_file(str(path))
     spec.compiler.fusestatic = True
     model = spec.compile()

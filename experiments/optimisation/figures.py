@@ -1,10 +1,10 @@
 """The pictures of an optimisation experiment."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.optimisation.outcome import Outcome, Run
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
@@ -69,7 +69,12 @@ def final(outcome: Outcome):
             low, high = run.interval(outcome.settings.confidence)
             left.plot([low, high], [y, y], color=colour, lw=2.4, solid_capstyle="butt")
         left.plot(run.mean, y, "|", color=colour, ms=13, mew=2.2)
-        _published(left, outcome, run, y)
+        if (published := outcome.published(run)) is not None:
+            spread = np.nan_to_num(published[1], posinf=0.0)
+            left.errorbar(
+                published[0], y - 0.33, xerr=spread, fmt="D", ms=4.5, mfc="white", mec=REFERENCE, ecolor=REFERENCE,
+                elinewidth=1.0, capsize=2, zorder=5,
+            )  # fmt: skip
         notes = [f"{run.is_lost.sum()} of {len(run.is_lost)} not finite"] if run.is_lost.any() else []
         notes += [f"{quantity(run.mean, run.spread)} →"] if run.mean > limit else []
         if notes:
@@ -81,21 +86,21 @@ def final(outcome: Outcome):
             axes[0, 1].errorbar(error[0], y, xerr=spread, fmt="o", ms=5, color=colour, capsize=2.5, elinewidth=1.3)
     left.set_yticks(rows, [run.method.label for run in outcome.runs])
     left.set_ylim(-0.6, len(rows) - 0.4)
-    low = min([*_finals(outcome), limit])
+    low = min([*(float(cost) for run in outcome.runs for cost in run.kept), limit])
     if limit > _WIDE * low > 0:
-        _log_scale(left, "x")
+        _log_scale(left)
         left.set_xlim(low / 1.08, limit * 1.08)
     else:
         margin = 0.04 * (limit - low or 1.0)
         left.set_xlim(low - margin, limit + margin)
     left.set(title="Cost without noise after the last step", xlabel="cost")
     if has_errors:
-        _log_scale(axes[0, 1], "x")
+        _log_scale(axes[0, 1])
         axes[0, 1].set(title="Relative error of one estimate at the start", xlabel="error / norm of the gradient")
     _mark_ours(left, outcome.runs)
     settings = outcome.settings
     percent = f"{settings.confidence:.0%}"
-    published = "; diamonds are published means ± standard deviations" if outcome.reference else ""
+    diamonds = "; diamonds are published means ± standard deviations" if outcome.reference else ""
     errors = (
         " Right, distance of one estimate at the start to the gradient, over its norm: root mean square of "
         f"{settings.error_repeats} estimates of {outcome.num_samples} rollouts, with its {percent} interval; the gradient is "
@@ -104,7 +109,7 @@ def final(outcome: Outcome):
         else ""
     )
     caption = (
-        f"Left, dots are seeds, bars the means with their {percent} intervals{published}. An arrow stands for a mean ± "
+        f"Left, dots are seeds, bars the means with their {percent} intervals{diamonds}. An arrow stands for a mean ± "
         f"standard deviation beyond the panel.{errors}"
     )
     return figure, "Where each method ends, and how far off one estimate is", caption
@@ -112,7 +117,10 @@ def final(outcome: Outcome):
 
 def curves(outcome: Outcome):
     """Cost without noise against what was spent, the median and the range over seeds."""
-    groups = [group for group in (_descents(outcome), _searches(outcome)) if group]
+    descents, baselines = _descents(outcome), [run for run in outcome.runs if _is_baseline(run)]
+    # What one would otherwise use has α-order as it comes beside it.
+    searches = [run for run in outcome.runs if run.method.is_default_alpha] + baselines if baselines else []
+    groups = [group for group in (descents, searches) if group]
     figure, axes = subplots(len(groups), 2, height=3.7 * len(groups), sharey=True)
     lowest = _lowest(outcome)
     for row, group in zip(axes, groups, strict=True):
@@ -123,7 +131,7 @@ def curves(outcome: Outcome):
             axis.margins(x=0)
         row[0].set_ylabel(f"cost − {lowest:.4g}")
         row[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5)
-        row[0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009")))
+        row[0].xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009"))
     axes[0, 0].set_title("Against rollouts")
     axes[0, 1].set_title("Against time")
     axes[-1, 0].set_xlabel("rollouts of one run")
@@ -132,7 +140,7 @@ def curves(outcome: Outcome):
     above = outcome.start_cost - lowest
     axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * _smallest(outcome)), 1.5 * above)
     for axis in axes.flat:
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
+        axis.yaxis.set_major_formatter(lambda value, _: power(value))
         axis.yaxis.set_minor_formatter(NullFormatter())
     settings = outcome.settings
     caption = (
@@ -158,17 +166,20 @@ def alpha(outcome: Outcome):
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=8.5)
     rows = np.arange(len(runs))[::-1]
     starts = np.zeros(len(runs))
+    totals = np.array([max((~np.isnan(run.alpha)).sum(), 1) for run in runs])
     for name, (text, colour) in _SENTENCES.items():
-        totals = np.array([max((~np.isnan(run.alpha)).sum(), 1) for run in runs])
         shares = np.array([run.reasons[name].sum() if name in run.reasons else 0 for run in runs]) / totals
         if shares.any():
             right.barh(rows, shares, left=starts, color=colour, height=0.6, label=text)
-            _name_bars(right, rows, starts, shares, "white" if name in _DARK else REFERENCE)
+            ink = "white" if name in _DARK else REFERENCE
+            for y, start, share in zip(rows, starts, shares, strict=True):
+                if share >= 0.08:
+                    right.text(start + share / 2, y, f"{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
         starts += shares
     right.set_yticks(rows, [run.method.label for run in runs])
     _mark_ours(right, runs)
     right.set(title="Share of steps by the reason for α", xlim=(0, 1))
-    right.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
+    right.xaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
     right.grid(visible=False, axis="y")
     right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
     caption = (
@@ -180,12 +191,6 @@ def alpha(outcome: Outcome):
 
 def _descents(outcome: Outcome) -> list[Run]:
     return [run for run in outcome.runs if not _is_baseline(run)]
-
-
-def _searches(outcome: Outcome) -> list[Run]:
-    """Give what one would otherwise use, with α-order as it comes beside it."""
-    baselines = [run for run in outcome.runs if _is_baseline(run)]
-    return [run for run in outcome.runs if run.method.is_default_alpha] + baselines if baselines else []
 
 
 def _is_baseline(run: Run) -> bool:
@@ -203,25 +208,10 @@ def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
     axis.plot(x, np.nanmedian(cost, axis=0), color=colour, lw=width, label=run.method.label, zorder=order)
 
 
-def _published(axis: Axes, outcome: Outcome, run: Run, y: float) -> None:
-    found = outcome.published(run)
-    if found is None:
-        return
-    error = found[1] if np.isfinite(found[1]) else 0.0
-    axis.errorbar(
-        found[0], y - 0.33, xerr=error, fmt="D", ms=4.5, mfc="white", mec=REFERENCE, ecolor=REFERENCE, elinewidth=1.0,
-        capsize=2, zorder=5,
-    )  # fmt: skip
-
-
 def _mark_ours(axis: Axes, runs: Sequence[Run]) -> None:
     for label, run in zip(axis.get_yticklabels(), runs, strict=True):
         if run.method.is_default_alpha:
             label.set_fontweight("bold")
-
-
-def _finals(outcome: Outcome) -> list[float]:
-    return [float(cost) for run in outcome.runs for cost in run.kept]
 
 
 def _limit(outcome: Outcome) -> float:
@@ -250,20 +240,13 @@ def _smallest(outcome: Outcome) -> float:
     return min(medians, default=outcome.start_cost) - _lowest(outcome)
 
 
-def _log_scale(axis: Axes, which: str) -> None:
-    getattr(axis, f"set_{which}scale")("log")
-    side = getattr(axis, f"{which}axis")
-    low, high = side.get_view_interval()
-    wide = high > 30 * low
-    side.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=12))
-    side.set_major_formatter(FuncFormatter(lambda value, _: power(value)))
-    side.set_minor_formatter(NullFormatter())
-
-
-def _name_bars(axis: Axes, rows: np.ndarray, starts: np.ndarray, shares: np.ndarray, ink: str) -> None:
-    for y, start, share in zip(rows, starts, shares, strict=True):
-        if share >= 0.08:
-            axis.text(start + share / 2, y, f"{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
+def _log_scale(axis: Axes) -> None:
+    axis.set_xscale("log")
+    low, high = axis.xaxis.get_view_interval()
+    subs = (1.0,) if high > 30 * low else (1.0, 2.0, 5.0)
+    axis.xaxis.set_major_locator(LogLocator(subs=subs, numticks=12))
+    axis.xaxis.set_major_formatter(lambda value, _: power(value))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -273,6 +256,6 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _colours(outcome: Outcome) -> dict[str, str]:
-    labels: Iterable[str] = (run.method.label for run in outcome.runs)
+    labels = [run.method.label for run in outcome.runs]
     others = iter(_OTHERS)
     return {label: _COLOURS.get(label) or next(others, MUTED) for label in labels}

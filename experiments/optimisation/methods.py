@@ -25,6 +25,7 @@ _SCENES = {
     "motion_planning": lambda: mg.tasks.motion_planning(),
     "tennis": lambda: mg.tasks.tennis(),
 }
+_ELITE = 0.2  # share of the candidates that cross-entropy fits to
 # How to optimise the scenes; found by trying, so that few steps show what each is about.
 _PUSH = {"num_samples": 10, "learning_rate": 1e-3, "num_steps": 200, "gamma": 1e8, "bound": 100.0}
 _SCENE_SETTINGS = {
@@ -39,49 +40,29 @@ _SCENE_SETTINGS = {
 
 
 def problem(settings: Settings) -> Published:
-    """Set up the task, with the run's own settings in place of the published ones where they are given.
-
-    Args:
-        settings: of the run.
-
-    Returns:
-        The task. It has reference results only under the published settings.
-    """
-    found = TASKS[settings.task]() if settings.dynamics == "published" else _scene_problem(settings.task)
+    """Set up the task, with the run's own settings in place of the published ones, which alone have reference results."""
+    if settings.dynamics == "published":
+        found = TASKS[settings.task]()
+    else:
+        task, name = _SCENES[settings.task](), settings.task
+        found = Published(
+            name=name.split("_")[0] if name.startswith("push") else name,
+            objective=task.objective(),
+            params=task.initial_params(),
+            reference={},
+            **_SCENE_SETTINGS[name],
+        )
     chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
     return dataclasses.replace(found, **chosen, reference={}) if chosen else found
 
 
-def _scene_problem(name: str) -> Published:
-    task = _SCENES[name]()
-    return Published(
-        name=name.split("_")[0] if name.startswith("push") else name,
-        objective=task.objective(),
-        params=task.initial_params(),
-        reference={},
-        **_SCENE_SETTINGS[name],
-    )
-
-
 def scene(settings: Settings) -> mg.Scene | None:
-    """Give the scene of the task; None under the published equations, which have none.
-
-    Args:
-        settings: of the run.
-    """
+    """Give the scene of the task; None under the published equations, which have none."""
     return None if settings.dynamics == "published" else _SCENES[settings.task]().scene
 
 
 def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
-    """Give an estimator, to be called with `num_samples`.
-
-    Args:
-        method: that is no search.
-        task: for the published constants of its rule.
-
-    Returns:
-        The function of `mjxgrad.estimators`, its options bound.
-    """
+    """Give a function of `mjxgrad.estimators`, its options bound; its rule may take the published constants of the task."""
     options = method.options
     if method.rule is not None:
         options["rule"] = {
@@ -94,17 +75,9 @@ def estimator(method: MethodSettings, task: Published) -> Callable[..., Gradient
 
 
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Run:
-    """Give the function that runs a method.
+    """Give the function that runs a method, of keys, one per seed, and of the options of `mg.optimise`.
 
     A baseline without noise is a rollout, too: an estimator gets as many samples as the rollouts of a step allow.
-
-    Args:
-        method: which one.
-        task: what it optimises.
-        key: for tracing alone.
-
-    Returns:
-        A function of keys, one per seed, and of the options of `mg.optimise`.
     """
     if method.is_search:
         return _search(method, task)
@@ -131,23 +104,7 @@ def _search(method: MethodSettings, task: Published) -> Run:
     if width is None and isinstance(objective, mg.objective.OpenLoop):
         # The controls are the parameters, so noise on the ones is noise on the others.
         width = jax.numpy.broadcast_to(objective.stddev, objective.noise_shape).ravel()
-    own: dict[str, Any] = {}
-    if method.name == "cross_entropy":
-        own["num_elite"] = max(2, round(method.elite * task.num_samples))
-    if method.name == "mppi":
-        own["temperature"] = method.temperature
+    own = {"num_elite": max(2, round(_ELITE * task.num_samples))} if method.name == "cross_entropy" else {}
     search = getattr(mg.baselines, method.name)
-
-    def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
-        return search(
-            objective,
-            task.params,
-            keys,
-            num_samples=task.num_samples,
-            num_steps=task.num_steps,
-            stddev=width,
-            **own,
-            **options,
-        )
-
-    return run
+    sizes = {"num_samples": task.num_samples, "num_steps": task.num_steps}
+    return functools.partial(search, objective, task.params, stddev=width, **sizes, **own)

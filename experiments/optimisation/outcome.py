@@ -83,16 +83,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Difference:
-    """One method less another, in final cost.
+    """One method less another, in final cost: the difference of the means with Welch's interval.
 
-    Attributes:
-        ours: the one.
-        other: the other.
-        value: difference of the means.
-        low: end of Welch's interval.
-        high: likewise.
-        p_value: of Mann and Whitney's two-sided rank test, a lost run ranking last.
-        confidence: of the interval; a p-value below what is left counts.
+    Beside it stands the p-value of Mann and Whitney's two-sided rank test, a lost run ranking last; it counts below what is left
+    of the confidence.
     """
 
     ours: Run
@@ -119,26 +113,19 @@ class Difference:
     @property
     def is_above(self) -> bool:
         """Say whether the one ends higher beyond seed noise, by the means, by the ranks, or by lost runs."""
-        lost = int(self.ours.is_lost.sum()) > int(self.other.is_lost.sum())
-        return lost or self.low > self._noise or (self._is_ranked and self.shift > self._noise)
+        return int(self.ours.is_lost.sum()) > int(self.other.is_lost.sum()) or self._is_beyond(1)
 
     @property
     def is_below(self) -> bool:
         """Say whether it ends lower beyond seed noise."""
-        return not self.is_above and (self.high < -self._noise or (self._is_ranked and self.shift < -self._noise))
+        return not self.is_above and self._is_beyond(-1)
 
-    @property
-    def shift(self) -> float:
-        """Give the difference of the medians, to say which way the ranks point."""
-        return float(np.median(self.ours.final_cost) - np.median(self.other.final_cost))
-
-    @property
-    def _is_ranked(self) -> bool:
-        return self.p_value < 1 - self.confidence
-
-    @property
-    def _noise(self) -> float:
-        return ROUNDING * abs(self.other.mean)
+    def _is_beyond(self, sign: int) -> bool:
+        noise = ROUNDING * abs(self.other.mean)
+        # To say which way the ranks point.
+        shift = float(np.median(self.ours.final_cost) - np.median(self.other.final_cost))
+        is_ranked = self.p_value < 1 - self.confidence
+        return (self.low if sign > 0 else -self.high) > noise or (is_ranked and sign * shift > noise)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.optimisation.outcome import Difference, Outcome, Run
+from experiments.optimisation.outcome import Difference, Outcome
 from experiments.report import Table
 from experiments.words import quantity
 
@@ -12,13 +12,24 @@ _AGREEMENT = 3.0
 
 def verdict(outcome: Outcome) -> str:
     """Say whether α-order is worse than the better of first and zeroth order, and which method ends lowest."""
-    return " ".join([*(_comparison(difference) for difference in outcome.verdicts), _lowest(outcome)])
+    best = outcome.best
+    lowest = f"Lowest of all ends {best.method.label}, at {quantity(best.mean, best.spread)}."
+    return " ".join([*map(_comparison, outcome.verdicts), lowest])
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    found = (_reproduction(outcome), _choice(outcome), _time(outcome), _without_progress(outcome))
-    return [sentence for sentence in found if sentence]
+    """Compare with what was published, within the spreads of both."""
+    pairs = [(run, found) for run in outcome.runs if (found := outcome.published(run)) is not None and run.kept.size]
+    if not pairs:
+        return []
+    apart = []
+    for run, (mean, spread) in pairs:
+        width = np.hypot(np.nan_to_num(run.spread), np.nan_to_num(spread))
+        # Published to three or four digits.
+        if abs(run.mean - mean) > _AGREEMENT * width + 1e-3 * abs(mean):
+            apart.append(f"{run.method.label} ({run.mean:.4g}, published {mean:.4g})")
+    agreeing = f"{len(pairs) - len(apart)} of {len(pairs)} published results are met within three standard deviations"
+    return [f"{agreeing}; apart: {', '.join(apart)}." if apart else f"{agreeing}."]
 
 
 def warnings(outcome: Outcome) -> list[str]:
@@ -47,15 +58,18 @@ def tables(outcome: Outcome) -> list[Table]:
         if run.is_lost.any():
             emphasised.add((i, 4))
         low, high = run.interval(outcome.settings.confidence)
-        error = outcome.relative_error(run)
+        error, published = outcome.relative_error(run), outcome.published(run)
         rows.append(
             [
                 run.method.label,
                 quantity(run.mean, run.spread),
                 f"{quantity(low)} to {quantity(high)}" if low == low else "",
-                _published(outcome, run),
+                ""
+                if published is None
+                else quantity(published[0], published[1] if np.isfinite(published[1]) else None),
                 f"{run.is_lost.sum()} of {run.is_lost.size}",
                 "" if error is None else quantity(error[0], (error[2] - error[1]) / 2),
+                f"{np.nanmean(run.alpha):.3g}" if run.reasons else "",
                 str(run.rollouts_per_step),
                 f"{1e3 * run.seconds_per_step:.3g}",
                 f"{run.compile_seconds:.1f}",
@@ -64,7 +78,7 @@ def tables(outcome: Outcome) -> list[Table]:
     percent = f"{outcome.settings.confidence:.0%}"
     columns = (
         "method", "final cost", f"{percent} interval of the mean", "published", "lost runs", "relative error",
-        "rollouts per step", "ms per step", "compilation, s",
+        "mean α", "rollouts per step", "ms per step", "compilation, s",
     )  # fmt: skip
     caption = (
         f"Cost without noise after {outcome.num_steps} steps, mean ± standard deviation over {outcome.settings.seeds} "
@@ -92,16 +106,12 @@ def _comparison(difference: Difference) -> str:
     ours, other = difference.ours, difference.other
     if not (ours.kept.size and other.kept.size):
         return f"{ours.is_lost.sum()} runs of α-order and {other.is_lost.sum()} of {other.method.label} were lost."
-    ends = f"{quantity(ours.mean, ours.spread)}, against {quantity(other.mean, other.spread)}"
-    numbers = f"{ends}; difference {_signed(difference)}, rank test p = {difference.p_value:.2g}"
+    kind = "ends worse" if difference.is_above else "ends better" if difference.is_below else "is not worse"
+    noise = "" if difference.is_above or difference.is_below else ", beyond seed noise"
     lost = f", with {ours.is_lost.sum()} runs lost" if ours.is_lost.any() else ""
-    if difference.is_above:
-        return f"α-order ends worse than {other.method.label}, the better of first and zeroth order{lost} ({numbers})."
-    if difference.is_below:
-        return f"α-order ends better than {other.method.label}, the better of first and zeroth order{lost} ({numbers})."
     return (
-        f"α-order is not worse than {other.method.label}, the better of first and zeroth order, beyond seed "
-        f"noise{lost} ({numbers})."
+        f"α-order {kind} than {other.method.label}, the better of first and zeroth order{noise}{lost} "
+        f"({_signed(difference)}, rank test p = {difference.p_value:.2g})."
     )
 
 
@@ -110,63 +120,3 @@ def _signed(difference: Difference) -> str:
     ends = f"{quantity(difference.low)} to {quantity(difference.high)}"
     sign = "+" if difference.value > 0 else ""
     return f"{sign}{quantity(difference.value)}, {difference.confidence:.0%} interval {ends}"
-
-
-def _lowest(outcome: Outcome) -> str:
-    best = outcome.best
-    return f"Lowest of all ends {best.method.label}, at {quantity(best.mean, best.spread)}."
-
-
-def _published(outcome: Outcome, run: Run) -> str:
-    found = outcome.published(run)
-    if found is None:
-        return ""
-    return quantity(found[0], found[1] if np.isfinite(found[1]) else None)
-
-
-def _reproduction(outcome: Outcome) -> str | None:
-    """Compare with what was published, within the spreads of both."""
-    pairs = [(run, found) for run in outcome.runs if (found := outcome.published(run)) is not None and run.kept.size]
-    if not pairs:
-        return None
-    apart = []
-    for run, (mean, spread) in pairs:
-        width = np.hypot(np.nan_to_num(run.spread), np.nan_to_num(spread))
-        # Published to three or four digits.
-        if abs(run.mean - mean) > _AGREEMENT * width + 1e-3 * abs(mean):
-            apart.append(f"{run.method.label} ({_number(run.mean)}, published {_number(mean)})")
-    agreeing = f"{len(pairs) - len(apart)} of {len(pairs)} published results are met within three standard deviations"
-    return f"{agreeing}; apart: {', '.join(apart)}." if apart else f"{agreeing}."
-
-
-def _choice(outcome: Outcome) -> str | None:
-    """Say what α-order as it comes did, and why."""
-    ours = [run for run in outcome.runs if run.method.is_default_alpha]
-    if not ours:
-        return None
-    run, total = ours[0], max(int((~np.isnan(ours[0].alpha)).sum()), 1)
-    words = {
-        "inverse_variance": "found no bias",
-        "bias_limit": "found a bias and limited it",
-        "inconsistent": "found that derivatives contradict the costs, and left them out",
-        "not_finite": "had too few finite derivatives",
-        "nothing_felt": "felt nothing",
-    }
-    parts = [f"{words.get(name, name)} in {where.sum() / total:.1%}" for name, where in run.reasons.items()]
-    return f"α-order {', '.join(parts)} of its steps; its mean α is {np.nanmean(run.alpha):.3g}."
-
-
-def _time(outcome: Outcome) -> str | None:
-    times = {run.method.label: run.seconds_per_step for run in outcome.runs}
-    if not {"first order", "α-order"} <= set(times):
-        return None
-    return f"A step of α-order takes {times['α-order'] / times['first order']:.2g} times as long as one of first order."
-
-
-def _without_progress(outcome: Outcome) -> str | None:
-    stuck = [run.method.label for run in outcome.runs if run.kept.size and run.mean >= outcome.start_cost]
-    return f"No better than the start: {', '.join(stuck)}." if stuck else None
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"

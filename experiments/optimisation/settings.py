@@ -8,9 +8,6 @@ from experiments.settings import Positive, RunSettings, SettingsTable
 
 Count = Annotated[int, Field(ge=2)]
 
-ESTIMATORS = (
-    "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "per_step", "reinforce",
-)  # fmt: skip
 SEARCHES = ("cross_entropy", "mppi", "predictive_sampling")
 
 _NAMES = {"mppi": "MPPI", "reinforce": "REINFORCE", "cross_entropy": "cross-entropy", "alpha_order": "α-order"}
@@ -34,10 +31,6 @@ class MethodSettings(SettingsTable):
     """Whether the unbiased part of alpha_order uses derivatives."""
     stddev: Positive | None = None
     """Width of a search, in the parameters' units; without it, the noise on the controls if they are the parameters."""
-    elite: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Share of the candidates that cross_entropy fits to."""
-    temperature: Positive = 0.1
-    """Of mppi, in standard deviations of the costs."""
 
     @model_validator(mode="after")
     def _check(self) -> "MethodSettings":
@@ -47,8 +40,6 @@ class MethodSettings(SettingsTable):
             "rule": ("alpha_order",),
             "control_variate": ("alpha_order",),
             "stddev": SEARCHES,
-            "elite": ("cross_entropy",),
-            "temperature": ("mppi",),
         }
         if wrong := [key for key in sorted(self.model_fields_set - {"name"}) if self.name not in takes[key]]:
             raise ValueError(f"{self.name} takes no {', '.join(wrong)}")

@@ -100,10 +100,10 @@ def plane(outcome: Outcome):
     for axis, part in zip(axes[0], parts, strict=True):
         for number, colour in zip(part, shades(len(part)), strict=True):
             _rod(axis, best.states[number, 2:5], color=colour, alpha=0.55)
-            axis.add_patch(_disc(best.states[number, :2], color=colour))
+            axis.add_patch(Circle(tuple(best.states[number, :2]), _RADIUS, color=colour))
         axis.plot(*best.states[part[0] : part[-1] + 1, :2].T, color=FIRST, lw=1.2)
         _rod(axis, outcome.goal, facecolor="none", edgecolor=REFERENCE, ls="--", lw=1.2)
-        axis.add_patch(_disc(best.states[part[0], :2], facecolor="none", edgecolor=FIRST, lw=1.5))
+        axis.add_patch(Circle(tuple(best.states[part[0], :2]), _RADIUS, facecolor="none", edgecolor=FIRST, lw=1.5))
         axis.set(title=f"{part[0] * _DECISION:.1f} to {part[-1] * _DECISION:.1f} s", xlabel="x in m", aspect="equal")
     axes[0, 0].set_ylabel("y in m")
     axes[0, 0].autoscale_view()
@@ -161,7 +161,3 @@ def _rod(axis: Axes, pose: np.ndarray, **look) -> None:
     axis.fill(x, y, **({"lw": 0} | look))  # pyright: ignore[reportArgumentType]
     # The end that the scene paints in another colour tells one half turn from the other.
     axis.plot(pose[0] + cos * _HALF_LENGTH, pose[1] + sin * _HALF_LENGTH, ".", color=REFERENCE, ms=3)
-
-
-def _disc(centre: np.ndarray, **look):
-    return Circle((float(centre[0]), float(centre[1])), _RADIUS, **look)

@@ -29,8 +29,13 @@ from mjxgrad.tasks.planar_pusher import PlanarPusher, beside_rod, planar_pusher
 # Weights of the rod's x, y and turn; a turn of 0.17 rad counts as much as 0.03 m.
 _ROD = (0.0, 0.0, 1.0, 1.0, 0.03, 0.0, 0.0, 0.0, 0.0, 0.0)
 _STAGE, _TERMINAL = 0.3, 100.0
+_CONTROL = 0.02  # of the squared finger speed
 # Where the tree samples, around the start (m, rad): the rod's pose, and the finger where `beside_rod` does not say.
 _RANGE = (0.3, 0.3, 0.25, 0.25, 3.3)
+# Displacements below which it does not matter that no control causes them (m, rad).
+_RESOLUTION = (0.007, 0.007, 0.007, 0.007, 0.07)
+_MAX_TURNS = 800  # of 16 samples
+_POLISH_LENGTH = 0.002  # m, of the smoothing at which the optimisation of a way begins
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -69,11 +74,6 @@ def _smoother(model: str, settings: Settings, length: float) -> Smoother:
     return Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
 
 
-def _cost(task: PlanarPusher, settings: Settings) -> GoalCost:
-    weight = jnp.array(_ROD)
-    return GoalCost(task.goal, _STAGE * weight, _TERMINAL * weight, settings.control_weight)
-
-
 def _trajectory(task: PlanarPusher, settings: Settings, model: str):
     """Give the function that optimises a trajectory from resting controls."""
     count = settings.num_iterations
@@ -92,7 +92,7 @@ def _trajectory(task: PlanarPusher, settings: Settings, model: str):
 
 def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
     """Optimise a way that was found."""
-    begin, length = time.perf_counter(), settings.tree.polish_length
+    begin, length = time.perf_counter(), _POLISH_LENGTH
     schedule = np.geomspace(1, min(1, settings.last_length / length), settings.tree.polish_iterations)
     smoother = _smoother(way.model, settings, length)
     plan = _optimised(task, settings, jnp.asarray(way.controls), smoother, schedule, way.seed)
@@ -101,17 +101,12 @@ def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
 
 @eqx.filter_jit
 def _optimised(
-    task: PlanarPusher,
-    settings: Settings,
-    controls: jax.Array,
-    smoother: Smoother,
-    schedule: np.ndarray,
-    seed: int,
+    task: PlanarPusher, settings: Settings, controls: jax.Array, smoother: Smoother, schedule: np.ndarray, seed: int
 ) -> Plan:
-    limit = task.speed_limit
+    limit, weight = task.speed_limit, jnp.array(_ROD)
     return optimise_trajectory(
         task.system,
-        _cost(task, settings),
+        GoalCost(task.goal, _STAGE * weight, _TERMINAL * weight, _CONTROL),
         task.start,
         controls,
         jax.random.key(settings.seed + seed),
@@ -138,8 +133,7 @@ def _tree(task: PlanarPusher, settings: Settings, model: str):
     tree, width = settings.tree, jnp.array(_RANGE)
     free = [np.inf] * 2
     tolerance = np.array([*free, *[tree.position_tolerance] * 2, tree.angle_tolerance, *[np.inf] * 5])
-    resolution = jnp.array([tree.position_resolution] * 4 + [tree.angle_resolution])
-    sampling = Sampling(-width, width, resolution, transit=beside_rod)
+    sampling = Sampling(-width, width, jnp.array(_RESOLUTION), transit=beside_rod)
 
     @eqx.filter_jit
     def grow(key):
@@ -154,7 +148,7 @@ def _tree(task: PlanarPusher, settings: Settings, model: str):
             lower=-task.speed_limit,
             upper=task.speed_limit,
             capacity=tree.capacity,
-            max_turns=tree.max_turns,
+            max_turns=_MAX_TURNS,
         )
 
     def run(seed: int) -> Attempt:

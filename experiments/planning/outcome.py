@@ -70,18 +70,19 @@ class Outcome:
         """Give the angle between the rod and its goal in the end (rad)."""
         return float(abs(attempt.states[-1, 4] - self.goal[2]))
 
+    def _off(self, state: np.ndarray) -> float:
+        """Give how far the coordinate of the rod that is farthest off is from the goal, in tolerances."""
+        tree = self.settings.tree
+        units = np.array([tree.position_tolerance, tree.position_tolerance, tree.angle_tolerance])
+        return float(np.max(np.abs(state[2:5] - self.goal) / units))
+
     def is_solved(self, attempt: Attempt) -> bool:
         """Say whether the rod is at its goal, as near as the settings ask for."""
-        tree = self.settings.tree
-        off = np.abs(attempt.states[-1, 2:4] - self.goal[:2])
-        return bool((off <= tree.position_tolerance).all() and self.angle(attempt) <= tree.angle_tolerance)
+        return self._off(attempt.states[-1]) <= 1
 
     def moved(self, attempt: Attempt) -> float:
         """Give which share of the way to the goal was made good, in units of the tolerances."""
-        tree = self.settings.tree
-        units = np.array([tree.position_tolerance, tree.position_tolerance, tree.angle_tolerance])
-        before, after = (np.max(np.abs(attempt.states[i, 2:5] - self.goal) / units) for i in (0, -1))
-        return float(1 - after / before)
+        return 1 - self._off(attempt.states[-1]) / self._off(attempt.states[0])
 
     def of(self, model: str) -> list[Attempt]:
         """Give all attempts with one kind of linear model."""

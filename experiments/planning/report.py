@@ -3,22 +3,38 @@
 from experiments.planning.outcome import Attempt, Outcome
 from experiments.planning.settings import NAMES
 from experiments.report import Table
-from experiments.words import quantity
+from experiments.words import capitalised, quantity
 
 
 def verdict(outcome: Outcome) -> str:
     """Answer the question from the data: which linear models solve the task, and what the others do."""
-    return " ".join(_one(outcome, model) for model in outcome.settings.models)
+    return capitalised("; ".join(_one(outcome, model) for model in outcome.settings.models)) + "."
+
+
+def _one(outcome: Outcome, model: str) -> str:
+    """Say how one kind of linear model did."""
+    attempts, best = outcome.of(model), outcome.shortest(model)
+    name = NAMES[model] if model == "none" else f"{NAMES[model]} models"
+    num_solved = sum(map(outcome.is_solved, attempts))
+    if len(attempts) > 1:
+        ways = f"a way, the shortest of {len(best.controls)} steps" if num_solved else "a way"
+        return f"with {name} {num_solved or 'none'} of {len(attempts)} trees {'find' if num_solved else 'finds'} {ways}"
+    if num_solved:
+        return f"with {name} the rod reaches its goal"
+    fate = "does not move at all" if outcome.moved(best) == 0 else f"ends {_end(outcome, best)} from its goal"
+    return f"with {name} the rod {fate}"
+
+
+def _end(outcome: Outcome, attempt: Attempt) -> str:
+    return f"{1e3 * outcome.distance(attempt):.1f} mm and {outcome.angle(attempt):.3f} rad"
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """List one sentence per further finding."""
-    sentences = []
-    best = outcome.shown[-1]
-    off = max(abs(best - outcome.best.states[-1, :5]))
-    sentences.append(
+    """Hold the plan against the scene, and say what polishing gained."""
+    off = max(abs(outcome.shown[-1] - outcome.best.states[-1, :5]))
+    sentences = [
         f"A rollout of the scene under the plan that was kept ends where the planner says, up to {off:.0e} (m, rad)."
-    )
+    ]
     if outcome.polished is not None:
         before, after = outcome.shortest(outcome.settings.models[0]), outcome.polished
         sentences.append(
@@ -26,66 +42,29 @@ def findings(outcome: Outcome) -> list[str]:
             f"{_end(outcome, after)}, and its cost from {quantity(after.course['cost'][0])} to "
             f"{quantity(after.course['cost'].min())}, in {after.seconds:.0f} s."
         )
-    if outcome.settings.method == "trajectory":
-        for attempt in outcome.attempts:
-            lost = int((attempt.course["step"] == 0).sum())
-            if attempt.model != "none" and lost:
-                sentences.append(
-                    f"With {attempt.label} models {lost} of {len(attempt.course['step'])} iterations found no better step."
-                )
     return sentences
 
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate the attempts."""
-    columns = [
-        "linear models",
-        "seed",
-        "solved",
-        "rod from goal",
-        "turn from goal",
-        "steps",
-        "nodes",
-        "time with compilation",
-    ]
-    rows = []
-    for attempt in outcome.attempts:
-        rows.append([
+    is_tree = outcome.settings.method == "tree"
+    columns = (
+        "linear models", "seed", "solved", "rod from goal", "turn from goal", "steps",
+        "nodes" if is_tree else "iterations without a better step", "time with compilation",
+    )  # fmt: skip
+    rows = [
+        [
             attempt.label,
             str(attempt.seed),
             "yes" if outcome.is_solved(attempt) else "no",
             f"{1e3 * outcome.distance(attempt):.1f} mm",
             f"{outcome.angle(attempt):.3f} rad",
             str(len(attempt.controls)),
-            "" if attempt.nodes is None else str(len(attempt.nodes)),
+            str(len(attempt.course["error"]))
+            if is_tree
+            else f"{(attempt.course['step'] == 0).sum()} of {len(attempt.course['step'])}",
             f"{attempt.seconds:.0f} s",
-        ])  # fmt: skip
+        ]
+        for attempt in outcome.attempts
+    ]
     return [Table(columns, rows, "Every attempt; later seeds of a kind use the compiled program of the first.")]
-
-
-def _one(outcome: Outcome, model: str) -> str:
-    """Say how one kind of linear model did."""
-    attempts, name = outcome.of(model), NAMES[model]
-    name = name if model == "none" else f"{name} models"
-    solved = [attempt for attempt in attempts if outcome.is_solved(attempt)]
-    best = outcome.shortest(model)
-    if len(attempts) == 1:
-        return f"With {name} the rod {_fate(outcome, best)} ({best.seconds:.0f} s, compilation included)."
-    if solved:
-        return (
-            f"With {name} {len(solved)} of {len(attempts)} trees find a way, the shortest of {len(best.controls)} steps "
-            f"({best.seconds:.0f} s; {max(one.seconds for one in attempts):.0f} s the slowest, compilation included)."
-        )
-    return f"With {name} none of {len(attempts)} trees finds a way; in the best the rod {_fate(outcome, best)}."
-
-
-def _fate(outcome: Outcome, attempt: Attempt) -> str:
-    if outcome.is_solved(attempt):
-        return f"reaches its goal up to {_end(outcome, attempt)}"
-    if outcome.moved(attempt) == 0:
-        return "does not move at all"
-    return f"ends {_end(outcome, attempt)} from its goal"
-
-
-def _end(outcome: Outcome, attempt: Attempt) -> str:
-    return f"{1e3 * outcome.distance(attempt):.1f} mm and {outcome.angle(attempt):.3f} rad"

@@ -21,14 +21,8 @@ class TreeSettings(SettingsTable):
 
     capacity: Annotated[int, Field(ge=200)] = 4000
     """Nodes at most."""
-    max_turns: Count = 800
-    """Turns of 16 samples at most."""
     num_seeds: Count = 3
     """Trees for each kind of linear model."""
-    position_resolution: Positive = 0.007
-    """Displacement of finger and rod below which it does not matter that no control causes it (m)."""
-    angle_resolution: Positive = 0.07
-    """Likewise the rod's turn (rad)."""
     position_tolerance: Positive = 0.02
     """How near the rod must come to its goal (m)."""
     angle_tolerance: Positive = 0.15
@@ -36,8 +30,6 @@ class TreeSettings(SettingsTable):
     polish_iterations: Annotated[int, Field(ge=0)] = 0
     """Iterations of trajectory optimisation on the shortest way found. A way of many pushes is easily lost under smoothing:
     then nothing is gained, and the way stays as it was."""
-    polish_length: Positive = 0.002
-    """Smoothing at which these begin (m)."""
 
 
 class Settings(RunSettings):
@@ -47,10 +39,7 @@ class Settings(RunSettings):
     """Trajectory optimisation from resting controls, or a search tree."""
     models: Annotated[
         tuple[Literal["analytic", "mean_jacobian", "least_squares", "none"], ...], Field(min_length=1)
-    ] = (
-        "analytic",
-        "none",
-    )
+    ] = ("analytic", "none")
     """Which linear models to compare; the first is the one that figures and video show."""
     finger: tuple[Finite, Finite] = (0.0, -0.15)
     """Where the finger starts (m)."""
@@ -66,8 +55,6 @@ class Settings(RunSettings):
     """Of trajectory optimisation."""
     horizon: Count = 25
     """Decisions of 0.1 s each."""
-    control_weight: Positive = 0.02
-    """Of the squared finger speed, where a metre from the goal costs 100 at the end and 0.3 in each step."""
     tree: TreeSettings = TreeSettings()
     """If the method is a tree."""
     video: VideoSettings | None = None

@@ -1,9 +1,10 @@
 """The pictures of an experiment on policy gradients."""
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.figure import Figure as Picture
+from matplotlib.ticker import NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome, mean_and_error
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
 _COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
@@ -28,19 +29,20 @@ def summary(outcome: Outcome):
     rows = np.arange(len(cells))
     for gradient, shift in ((DISCRETE, -0.14), (ONSET, 0.14)):
         look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ls": "", "ms": 5}
-        bias, low, high = np.maximum(np.array([cell.bias(gradient) for cell in cells]).T, _SMALLEST)
+        judged = [cell.judged[gradient] for cell in cells]
+        bias, low, high = np.maximum(np.array([one[:3] for one in judged]).T, _SMALLEST)
         spread = np.abs(np.stack([bias - low, high - bias]))
         axes[0, 0].errorbar(bias, rows + shift, xerr=spread, label=f"{gradient} gradient", elinewidth=1, **look)
-        alpha, alpha_error = np.array([cell.alpha(gradient) for cell in cells]).T
+        alpha, alpha_error = np.array([(one.alpha, one.alpha_error) for one in judged]).T
         axes[0, 1].errorbar(alpha, rows + shift, xerr=2 * alpha_error, elinewidth=1, **look)
-        axes[0, 2].plot([cell.error(gradient, "mixed") for cell in cells], rows + shift, **look)
+        axes[0, 2].plot([one.error_mixed for one in judged], rows + shift, **look)
     for axis in axes[0]:
         for row in rows[[cell.hits_and_misses for cell in cells]]:
             axis.axhspan(row - 0.5, row + 0.5, color=MUTED, alpha=0.18, lw=0)
         axis.grid(axis="y", visible=False)
     for axis in axes[0, ::2]:
         axis.set_xscale("log")
-        axis.xaxis.set_major_formatter(FuncFormatter(_percent))
+        axis.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g}%")
         axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].set_xlim(left=_SMALLEST)
     axes[0, 1].set_xlim(-0.04, 1.04)
@@ -49,8 +51,7 @@ def summary(outcome: Outcome):
     axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
     axes[0, 1].set(title="Weight of the first order", xlabel="α")
     axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    _legend(figure, axes, 2)
     caption = (
         "Left, norm of the bias over the norm of the gradient, noise taken off, with two standard errors; where the interval "
         "reaches the edge no bias was found. Middle, mean weight of the first order. Right, root-mean-square error of one "
@@ -68,35 +69,34 @@ def throw(outcome: Outcome):
     for (left, right), name in zip(axes, names, strict=True):
         shown = [cell for cell in cells if cell.name == name]
         angle = np.array([float(cell.point.split()[0]) for cell in shown])
-        reference = np.array([cell.reference_mean() for cell in shown])[:, :, 0]
+        reference = np.array([mean_and_error(cell.reference) for cell in shown])[:, :, 0]
         left.errorbar(
             angle, reference[:, 0], 2 * reference[:, 1], color=REFERENCE, lw=2.2, capsize=3, label="unbiased reference"
         )
         for gradient, shift in ((DISCRETE, -0.006), (ONSET, 0.006)):
             look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ms": 5, "lw": 1, "ls": (0, (4, 2))}
-            first = np.array([cell.first_mean(gradient) for cell in shown])[:, :, 0]
+            first = np.array([mean_and_error(cell.estimates[gradient].first) for cell in shown])[:, :, 0]
             left.errorbar(
                 angle + shift, first[:, 0], 2 * first[:, 1], label=f"first order, {gradient} gradient", **look
             )
-            alpha = np.array([cell.alpha(gradient) for cell in shown])
-            right.errorbar(angle + shift, alpha[:, 0], 2 * alpha[:, 1], **look)
+            judged = [cell.judged[gradient] for cell in shown]
+            spread = [2 * one.alpha_error for one in judged]
+            right.errorbar(angle + shift, [one.alpha for one in judged], spread, **look)
         for axis in (left, right):
             for cell, place in zip(shown, angle, strict=True):
                 if cell.hits_and_misses:
                     axis.axvspan(place - 0.05, place + 0.05, color=MUTED, alpha=0.18, lw=0)
         left.set_yscale("symlog", linthresh=0.01)
-        left.yaxis.set_major_formatter(FuncFormatter(_plain))
+        left.yaxis.set_major_formatter("{x:g}")
         left.set(title=shown[0].title, ylabel="gradient, m²/rad")
         right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
     for axis in axes[-1]:
         axis.set_xlabel("angle, rad")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    settings = outcome.settings
+    _legend(figure, axes, 3)
     caption = (
-        f"Left, gradient of the cost under noise of {settings.angle_stddev:g} rad; error bars are two standard errors. Right, "
-        "weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the last "
-        "that do not; there neither derivative sees the jump."
+        f"Left, gradient of the cost under noise of {outcome.settings.angle_stddev:g} rad; error bars are two standard errors. "
+        "Right, weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the "
+        "last that do not; there neither derivative sees the jump."
     )
     return figure, "Throws over the wall", caption
 
@@ -106,25 +106,22 @@ def push(outcome: Outcome):
     cells = outcome.of(*_PUSHES)
     figure, axes = subplots(1, len(cells), height=3.4)
     for axis, cell in zip(axes[0], cells, strict=True):
-        mean, error = cell.reference_mean()
+        mean, error = mean_and_error(cell.reference)
         step = np.arange(len(mean))
         axis.fill_between(
             step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
         )
         for gradient in GRADIENTS:
             style = {"ls": (0, (4, 2))} if gradient == ONSET else {"lw": 2.4}
-            axis.plot(
-                step, cell.first_mean(gradient)[0], color=_COLOURS[gradient], label=f"{gradient} gradient", **style
-            )
+            first = cell.estimates[gradient].first.mean(axis=0)
+            axis.plot(step, first, color=_COLOURS[gradient], label=f"{gradient} gradient", **style)
         axis.set(title=cell.title, xlabel="step")
-        axis.yaxis.set_major_formatter(FuncFormatter(_plain))
+        axis.yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, 1/N")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    settings = outcome.settings
+    _legend(figure, axes, 3)
     caption = (
-        f"Components of the gradient by the force at each moment: {settings.num_references} unbiased estimates with a band of "
-        "two standard errors, first-order means before it."
+        f"Components of the gradient by the force at each moment: {outcome.settings.num_references} unbiased estimates with a "
+        "band of two standard errors, first-order means before it."
     )
     return figure, "Control gradient of the push", caption
 
@@ -133,26 +130,24 @@ def hopper(outcome: Outcome):
     """A panel per motor: components of the policy gradient by what is observed."""
     (cell,) = outcome.of("hopper")
     figure, axes = subplots(1, 3, height=3.8, sharey=True)
-    looks = [(REFERENCE, "D", "unbiased reference", cell.reference_mean(), 0.0)]
-    looks += [
-        (_COLOURS[gradient], _MARKERS[gradient], f"first order, {gradient} gradient", cell.first_mean(gradient), shift)
-        for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True)
-    ]
+    looks = [(REFERENCE, "D", "unbiased reference", cell.reference, 0.0)]
+    for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True):
+        label, first = f"first order, {gradient} gradient", cell.estimates[gradient].first
+        looks.append((_COLOURS[gradient], _MARKERS[gradient], label, first, shift))
     places = np.arange(len(_OBSERVED))
     for motor, axis in enumerate(axes[0]):
         axis.axhline(0, color=MUTED, lw=0.8)
-        for colour, marker, label, (mean, error), shift in looks:
-            values, errors = _by_motor(mean)[motor], _by_motor(error)[motor]
+        for colour, marker, label, vectors, shift in looks:
+            values, errors = (_by_motor(flat)[motor] for flat in mean_and_error(vectors))
             axis.errorbar(
                 places + shift, values, 2 * errors, color=colour, marker=marker, ms=5, ls="", elinewidth=1, label=label
             )
         axis.set(title=f"Motor of the {_MOTORS[motor]}")
         axis.set_xticks(places, _OBSERVED, rotation=35, ha="right")
         axis.grid(axis="x", visible=False)
-    axes[0, 0].yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes[0, 0].yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, m per unit of gain")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    _legend(figure, axes, 3)
     caption = (
         "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
         "are two standard errors."
@@ -174,30 +169,24 @@ def descent(outcome: Outcome):
             for axis, values in ((above, course.costs), (below, course.alphas)):
                 axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)
                 axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
-            title = course.title.replace("Throw, ", "Throw\n")
-            above.set_title(f"{title}\n{'first order' if kind[1] == 'first' else 'α-order'}".replace("\n", ", ", 1))
-        above.yaxis.set_major_formatter(FuncFormatter(_plain))
+            title = course.title.replace("Throw, ", "Throw,\n")
+            above.set_title(f"{title}, {ESTIMATORS[kind[1]]}")
+        above.yaxis.set_major_formatter("{x:g}")
         below.set(ylim=(-0.05, 1.05), xlabel="step")
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("α")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    settings = outcome.settings
+    _legend(figure, axes, 2)
     caption = (
-        f"Adam from the same start, {settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of each "
-        "step; below, weight of the first order."
+        f"Adam from the same start, {outcome.settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of "
+        "each step; below, weight of the first order."
     )
     return figure, "Descents", caption
+
+
+def _legend(figure: Picture, axes: np.ndarray, columns: int) -> None:
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
 def _by_motor(flat: np.ndarray) -> np.ndarray:
     """Give (motor, observed) from the flattened gain and offset."""
     return np.concatenate([flat[:18].reshape(3, 6), flat[18:, None]], axis=1)
-
-
-def _percent(value: float, _: object) -> str:
-    return f"{100 * value:g}%"
-
-
-def _plain(value: float, _: object) -> str:
-    return f"{value:g}".replace("-", "−")

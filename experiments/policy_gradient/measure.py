@@ -1,6 +1,7 @@
 """From settings to numbers."""
 
 import functools
+import itertools
 import time
 
 import equinox as eqx
@@ -21,14 +22,9 @@ from mjxgrad.estimators.samples import plan_by_noise, stream
 
 
 class Estimated(eqx.Module):
-    """Both parts of one α-order estimate, before they are mixed.
+    """Both parts of one α-order estimate, first order and control variate, before they are mixed.
 
-    Attributes:
-        first: the first-order estimate.
-        unbiased: the control-variate estimate.
-        alpha: what the default rule gives the first.
-        reason: number of the item of `mg.estimators.Reason`.
-        cost: mean over the rollouts.
+    α is what the default rule gives the first, for a reason of `mg.estimators.Reason`; the cost is the mean over the rollouts.
     """
 
     first: Float[Array, " dim"]
@@ -53,15 +49,6 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
 
     The public estimators give the same numbers one by one. To compile takes longer than all rollouts, so bias, reference, α
     and descents share this one program.
-
-    Args:
-        objective: with either gradient.
-        params: the point.
-        key: consumed here.
-        num_samples: rollouts.
-
-    Returns:
-        What each estimator makes of them.
     """
     objective = objective.sized_for(params)
     plan = plan_by_noise(objective, num_samples, None)
@@ -78,7 +65,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         for number, name in enumerate(settings.tasks):
             key, descent_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), number))
             one = problem(name, settings)
-            workspace.check(one.scene)
+            workspace.check(one.task.scene)
             cells += [_cell(one, i, k, settings) for i, k in enumerate(jax.random.split(key, len(one.points)))]
             courses += _courses(one, descent_key, settings.num_seeds)
             advance_to(number + 1)
@@ -98,38 +85,29 @@ def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Ce
 
 
 def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: Key[Array, " count"]) -> Estimates:
-    objective = one.objective(gradient, jnp.asarray(one.stddev))
+    objective = one.objective(gradient, one.stddev)
     found = [estimated(objective, params, key, one.num_samples) for key in keys]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
     return Estimates(stacked.first, stacked.unbiased, stacked.alpha, stacked.reason)
 
 
 def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:
-    if one.descent is None:
+    descent, seeds, courses = one.descent, jax.random.split(key, num_seeds), []
+    if descent is None or not descent.num_steps:
         return []
-    seeds = jax.random.split(key, num_seeds)
-    return [
-        _course(one, one.descent, estimator, gradient, seeds)
-        for estimator in one.descent.estimators
-        for gradient in GRADIENTS
-    ]
+    for estimator, gradient in itertools.product(descent.estimators, GRADIENTS):
+        started = time.perf_counter()
+        histories = [_descend(one, descent, gradient, estimator, seed) for seed in seeds]
+        seconds = time.perf_counter() - started
+        costs = np.array([[step.cost for step in history] for history in histories])
+        alphas = np.array([[step.weight(estimator) for step in history] for history in histories])
+        courses.append(Course(one.name, one.title, estimator, gradient, costs, alphas, seconds))
+    return courses
 
 
-def _course(one: Problem, descent: Descent, estimator: str, gradient: str, seeds: Key[Array, " seeds"]) -> Course:
-    started = time.perf_counter()
-    objective = one.objective(gradient, jnp.asarray(descent.stddev))
-    histories = [_descend(one, descent, objective, estimator, seed) for seed in seeds]
-    seconds = time.perf_counter() - started
-    costs = np.array([[step.cost for step in history] for history in histories])
-    alphas = np.array([[step.weight(estimator) for step in history] for history in histories])
-    return Course(one.name, one.title, estimator, gradient, costs, alphas, seconds)
-
-
-def _descend(
-    one: Problem, descent: Descent, objective: mg.Objective, estimator: str, seed: PRNGKeyArray
-) -> list[Estimated]:
+def _descend(one: Problem, descent: Descent, gradient: str, estimator: str, seed: PRNGKeyArray) -> list[Estimated]:
     """Descend by Adam; the last of what is given back is at the final parameters."""
-    optimiser = optax.adam(descent.learning_rate)
+    objective, optimiser = one.objective(gradient, descent.stddev), optax.adam(descent.learning_rate)
     params, state, history = descent.start, optimiser.init(descent.start), []
     *steps, end = jax.random.split(seed, descent.num_steps + 1)
     for key in steps:

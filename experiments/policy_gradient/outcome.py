@@ -1,46 +1,91 @@
 """The numbers of an experiment on policy gradients."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from experiments.policy_gradient.settings import Settings
-from experiments.policy_gradient.statistics import (
-    Vectors,
-    cosine,
-    jackknife_error,
-    relative_squared_distance,
-    share_along,
-    squared_norm,
-)
 
 DISCRETE, ONSET = GRADIENTS = ("discrete", "onset")
+ESTIMATORS = {"first": "first order", "alpha": "α-order"}
+Vectors = Float[np.ndarray, "estimates dim"]
 
 
-@dataclass(frozen=True)
-class Estimates:
-    """Independent estimates at one point.
+def squared_norm(vectors: Vectors) -> float:
+    r"""Give the squared norm of the mean without bias; below zero if noise is all there is.
 
-    Attributes:
-        first: of first order.
-        unbiased: by control variate.
-        alpha: what the default rule gives the first.
-        reason: numbers of items of `mg.estimators.Reason`.
+    That of the average holds the noise, too: with 200 coordinates more noise than signal. The mean of $x_i \cdot x_j$ over
+    different $i$ and $j$ does not.
     """
+    count = len(vectors)
+    return float((np.sum(vectors.sum(axis=0) ** 2) - np.sum(vectors**2)) / (count * (count - 1)))
+
+
+def share_along(first: Vectors, reference: Vectors) -> float:
+    """Give the component of a mean along another, as a share of that one's length; NaN where that is not known from zero."""
+    square = squared_norm(reference)
+    return float(first.mean(axis=0) @ reference.mean(axis=0)) / square if square > 0 else np.nan
+
+
+def squared_distance(first: Vectors, reference: Vectors) -> float:
+    """Give the squared distance of two means over the squared norm of the second, likewise, without bias."""
+    square = squared_norm(reference)
+    return squared_norm(first) / square + 1 - 2 * share_along(first, reference) if square > 0 else np.nan
+
+
+def jackknife_error(function: Callable[..., float], *sets: Vectors) -> float:
+    """Give the standard error of a function of several sets of independent estimates: each is left out once.
+
+    References:
+        Efron, Tibshirani. An Introduction to the Bootstrap. Chapman & Hall 1993, section 11.5.
+    """
+    variance = 0.0
+    for i, vectors in enumerate(sets):
+        count = len(vectors)
+        without = [function(*sets[:i], np.delete(vectors, j, axis=0), *sets[i + 1 :]) for j in range(count)]
+        variance += (count - 1) * float(np.var(without))
+    return variance**0.5
+
+
+class Estimates(NamedTuple):
+    """Independent estimates at one point, with α of the default rule and the numbers of its `mg.estimators.Reason`."""
 
     first: Vectors
     unbiased: Vectors
     alpha: Float[np.ndarray, " estimates"]
     reason: Int[np.ndarray, " estimates"]
 
-    @property
-    def mixed(self) -> Vectors:
-        """The α-order estimates."""
-        return self.alpha[:, None] * self.first + (1 - self.alpha[:, None]) * self.unbiased
+
+class Judged(NamedTuple):
+    """What one gradient is worth at one point; all but α over the norm of the gradient.
+
+    Attributes:
+        bias: norm of that of the first order, noise taken off.
+        low: two standard errors below; they are of the square, and the square root of what is below zero is zero.
+        high: two standard errors above.
+        along: component of the first-order mean along the reference.
+        along_error: its standard error.
+        alpha: mean weight of the first order.
+        alpha_error: its standard error.
+        error_first: root-mean-square error of one estimate of first order.
+        error_unbiased: of one unbiased estimate.
+        error_mixed: of one α-order estimate.
+    """
+
+    bias: float
+    low: float
+    high: float
+    along: float
+    along_error: float
+    alpha: float
+    alpha_error: float
+    error_first: float
+    error_unbiased: float
+    error_mixed: float
 
 
 @dataclass(frozen=True)
@@ -70,68 +115,55 @@ class Cell:
         """Task and point."""
         return self.title if self.point == "start" else f"{self.title}, {self.point}"
 
-    @property
-    def dim(self) -> int:
-        """Number of parameters."""
-        return self.reference.shape[1]
-
     @functools.cached_property
     def norm(self) -> float:
         """Norm of the reference; NaN where it is not known from zero, as everything measured by it."""
         square = squared_norm(self.reference)
         return square**0.5 if square > 0 else np.nan
 
-    def first_mean(self, gradient: str) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
-        """Mean of the first-order estimates, with its standard error."""
-        return _mean(self.estimates[gradient].first)
+    @functools.cached_property
+    def judged(self) -> dict[str, Judged]:
+        """What each gradient is worth."""
+        return {gradient: self._judge(self.estimates[gradient]) for gradient in GRADIENTS}
 
-    def reference_mean(self) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
-        """The reference, with its standard error."""
-        return _mean(self.reference)
+    def _judge(self, one: Estimates) -> Judged:
+        sets, alpha = (one.first, self.reference), one.alpha[:, None]
+        square, error = squared_distance(*sets), jackknife_error(squared_distance, *sets)
+        reference, noise = mean_and_error(self.reference)
+        kinds = (one.first, one.unbiased, alpha * one.first + (1 - alpha) * one.unbiased)
+        squares = [float(np.mean(np.sum((kind - reference) ** 2, axis=1)) - np.sum(noise**2)) for kind in kinds]
+        return Judged(
+            bias=_root(square),
+            low=_root(square - 2 * error),
+            high=_root(square + 2 * error),
+            along=share_along(*sets),
+            along_error=jackknife_error(share_along, *sets),
+            alpha=float(one.alpha.mean()),
+            alpha_error=float(mean_and_error(alpha)[1][0]),
+            error_first=_root(squares[0]) / self.norm,
+            error_unbiased=_root(squares[1]) / self.norm,
+            error_mixed=_root(squares[2]) / self.norm,
+        )
 
-    def bias(self, gradient: str) -> tuple[float, float, float]:
-        """Norm of the bias of the first order over that of the gradient, with the ends of two standard errors.
 
-        The errors are of the square, in which the noise has been taken off; the square root of what is below zero is zero.
-        """
-        sets = self.estimates[gradient].first, self.reference
-        square, error = relative_squared_distance(*sets), jackknife_error(relative_squared_distance, *sets)
-        return _root(square), _root(square - 2 * error), _root(square + 2 * error)
+def mean_and_error(vectors: Vectors) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
+    """Give the mean and its standard error."""
+    return vectors.mean(axis=0), vectors.std(axis=0, ddof=1) / len(vectors) ** 0.5
 
-    def along(self, gradient: str) -> tuple[float, float]:
-        """Component of the first-order mean along the reference, as a share of it, with its standard error."""
-        sets = self.estimates[gradient].first, self.reference
-        return share_along(*sets), jackknife_error(share_along, *sets)
 
-    def cosine(self, gradient: str) -> float:
-        """Cosine between the first-order mean and the reference."""
-        return cosine(self.estimates[gradient].first, self.reference)
-
-    def error(self, gradient: str, kind: str) -> float:
-        """Root-mean-square error of one estimate over the gradient's norm.
-
-        Args:
-            gradient: "discrete" or "onset".
-            kind: "first", "unbiased" or "mixed".
-        """
-        estimates, (reference, noise) = getattr(self.estimates[gradient], kind), self.reference_mean()
-        return _root(float(np.mean(np.sum((estimates - reference) ** 2, axis=1)) - np.sum(noise**2))) / self.norm
-
-    def alpha(self, gradient: str) -> tuple[float, float]:
-        """Mean weight of the first order, with its standard error."""
-        alpha = self.estimates[gradient].alpha
-        return float(alpha.mean()), float(alpha.std(ddof=1) / len(alpha) ** 0.5)
+def _root(square: float) -> float:
+    return max(square, 0.0) ** 0.5
 
 
 @dataclass(frozen=True)
 class Course:
-    """Descents of one kind, one per seed.
+    """Descents of one kind on a task, one per seed.
 
     Attributes:
         name: of the task.
         title: of the task.
-        estimator: "first" or "alpha".
-        gradient: "discrete" or "onset".
+        estimator: of `ESTIMATORS`.
+        gradient: of `GRADIENTS`.
         costs: mean costs under noise, before each step and at the end.
         alphas: weights of the first order, likewise.
         seconds: of all seeds, with compilation if there was any.
@@ -146,21 +178,15 @@ class Course:
     seconds: float
 
     @property
-    def final(self) -> tuple[float, float]:
-        """Mean final cost, with its standard deviation over seeds (NaN for one)."""
+    def final(self) -> tuple[float, float | None]:
+        """Mean final cost, with its standard deviation over seeds (none of one)."""
         final = self.costs[:, -1]
-        return float(final.mean()), float(final.std(ddof=1)) if len(final) > 1 else np.nan
+        return float(final.mean()), float(final.std(ddof=1)) if len(final) > 1 else None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
-
-    Attributes:
-        settings: of the run.
-        cells: by task and point.
-        courses: of the descents.
-    """
+    """All that was measured: by task and point, and the descents."""
 
     settings: Settings
     cells: list[Cell]
@@ -172,26 +198,17 @@ class Outcome:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per cell and gradient, and per course, for metrics.csv."""
-        rows = []
-        for cell in self.cells:
-            for gradient in GRADIENTS:
-                (bias, low, high), (along, along_error) = cell.bias(gradient), cell.along(gradient)
-                rows.append(
-                    {
-                        "task": cell.name,
-                        "point": cell.point,
-                        "gradient": gradient,
-                        "gradient_norm": cell.norm,
-                        "relative_bias": bias,
-                        "relative_bias_low": low,
-                        "relative_bias_high": high,
-                        "along": along,
-                        "along_error": along_error,
-                        "cosine": cell.cosine(gradient),
-                        "alpha": cell.alpha(gradient)[0],
-                        **{f"error_{kind}": cell.error(gradient, kind) for kind in ("first", "unbiased", "mixed")},
-                    }
-                )
+        rows: list[dict[str, Any]] = [
+            {
+                "task": cell.name,
+                "point": cell.point,
+                "gradient": gradient,
+                "gradient_norm": cell.norm,
+                **cell.judged[gradient]._asdict(),
+            }
+            for cell in self.cells
+            for gradient in GRADIENTS
+        ]
         for course in self.courses:
             final, spread = course.final
             rows.append(
@@ -199,19 +216,9 @@ class Outcome:
                     "task": course.name,
                     "point": f"descent by {course.estimator}",
                     "gradient": course.gradient,
-                    "final_cost": final,
-                    "final_cost_stddev": spread,
                     "alpha": float(course.alphas.mean()),
+                    "final_cost": final,
+                    "final_cost_stddev": "" if spread is None else spread,
                 }
             )
-        # One table holds both: what a row has nothing to say about is empty.
-        columns = dict.fromkeys(key for row in rows for key in row)
-        return [{column: row.get(column, "") for column in columns} for row in rows]
-
-
-def _mean(vectors: Vectors) -> tuple[np.ndarray, np.ndarray]:
-    return vectors.mean(axis=0), vectors.std(axis=0, ddof=1) / len(vectors) ** 0.5
-
-
-def _root(square: float) -> float:
-    return max(square, 0.0) ** 0.5
+        return rows

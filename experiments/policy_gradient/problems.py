@@ -1,6 +1,6 @@
 """The tasks, with and without contact that begins within the step, and the points at which both are compared."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,19 +16,12 @@ DEFAULT_CONTACT = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.
 WALL_STIFFNESS = 1e4  # 1/s², that of the README
 THROW_START, THROW_STDDEV, THROW_RATE = 0.5, 0.1, 0.02  # rad, rad, of Adam; the README's
 HOPPER_RATE = 0.01
+_JUMPS = (0.62, 1.29)  # rad: throws between about 35 and 74 degrees clear the wall
 
 
 @dataclass(frozen=True)
 class Descent:
-    """How a task is optimised by Adam.
-
-    Attributes:
-        start: parameters.
-        stddev: of the noise.
-        learning_rate: of Adam.
-        num_steps: of it.
-        estimators: by which the descents are done: "first" order or "alpha"-order.
-    """
+    """How a task is optimised by Adam, by each of some estimators: "first" order or "alpha"-order."""
 
     start: Float[Array, " dim"]
     stddev: float
@@ -39,13 +32,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Point:
-    """Where gradients are compared.
-
-    Attributes:
-        label: for tables.
-        params: the parameters.
-        hits_and_misses: whether the noise covers a jump of the cost.
-    """
+    """Parameters at which gradients are compared, and whether the noise covers a jump of the cost there."""
 
     label: str
     params: Float[Array, " dim"]
@@ -54,15 +41,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Problem:
-    """A task.
+    """A task with its name in the settings and its title.
 
     Attributes:
-        name: in the settings.
-        title: for headings.
-        scene: that it moves in.
-        objective: of a gradient ("discrete" or "onset") and a standard deviation of the noise.
-        stddev: of the noise at the points.
-        points: where gradients are compared.
+        stddev: of the noise at the points where gradients are compared.
         num_samples: rollouts of one estimate.
         has_jump_of_force: whether its contacts set in with a force that is not zero.
         descent: None if it is not optimised.
@@ -70,76 +52,46 @@ class Problem:
 
     name: str
     title: str
-    scene: mg.Scene
-    objective: Callable[[str, Float[Array, ""]], mg.Objective]
+    task: Any
     stddev: float
     points: Sequence[Point]
     num_samples: int
     has_jump_of_force: bool
     descent: Descent | None = None
 
+    def objective(self, gradient: str, stddev: float) -> mg.Objective:
+        """Give the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
+        return self.task.with_onset(mg.Onset() if gradient == ONSET else None).objective(jnp.asarray(stddev))
+
 
 def problem(name: str, settings: Settings) -> Problem:
-    """Build a task.
-
-    Args:
-        name: one of `experiments.policy_gradient.settings.TaskName`.
-        settings: of the run.
-
-    Returns:
-        The task.
-    """
-    if name == "hopper":
-        return _hopper(settings)
-    return _push(name) if name.startswith("push") else _throw(name, settings)
-
-
-def _moved_by(task: Any, arm: str) -> Any:
-    """Give a task with contact that begins within the step, or with MuJoCo's motion and its derivative."""
-    return task.with_onset(mg.Onset()) if arm == ONSET else task.with_onset(None)
-
-
-# Throws between about 35 and 74 degrees clear the wall.
-_JUMPS = (0.62, 1.29)
+    """Build one of the tasks that the settings name."""
+    if name.startswith("push"):
+        stiffness = {"push_soft": 10.0, "push_stiff": 1000.0}[name]
+        task = mg.tasks.push(stiffness)
+        start = Point("start", task.initial_params())
+        return Problem(name, f"Push, {stiffness:g} N/m", task, task.stddev, [start], 16, has_jump_of_force=False)
+    return _hopper(settings) if name == "hopper" else _throw(name, settings)
 
 
 def _throw(name: str, settings: Settings) -> Problem:
     is_default = name == "ball_wall_default"
     softness = DEFAULT_CONTACT if is_default else mg.tasks.wall_softness(WALL_STIFFNESS)
-    task = mg.tasks.ball_wall().with_softness(softness)
     points = [
         Point(
-            f"{angle:g} rad",
-            jnp.array([angle]),
-            any(abs(angle - jump) < 3 * settings.angle_stddev for jump in _JUMPS),
+            f"{angle:g} rad", jnp.array([angle]), any(abs(angle - jump) < 3 * settings.angle_stddev for jump in _JUMPS)
         )
         for angle in settings.angles
     ]
     return Problem(
         name=name,
         title="Throw, default contact" if is_default else "Throw, gentle contact",
-        scene=task.scene,
-        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
+        task=mg.tasks.ball_wall().with_softness(softness),
         stddev=settings.angle_stddev,
         points=points,
         num_samples=50,
         has_jump_of_force=is_default,
-        descent=_descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"]),
-    )
-
-
-def _push(name: str) -> Problem:
-    stiffness = {"push_soft": 10.0, "push_stiff": 1000.0}[name]
-    task = mg.tasks.push(stiffness)
-    return Problem(
-        name=name,
-        title=f"Push, {stiffness:g} N/m",
-        scene=task.scene,
-        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
-        stddev=task.stddev,
-        points=[Point("start", task.initial_params())],
-        num_samples=16,
-        has_jump_of_force=False,
+        descent=Descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"]),
     )
 
 
@@ -149,15 +101,10 @@ def _hopper(settings: Settings) -> Problem:
     return Problem(
         name="hopper",
         title="Hopper",
-        scene=task.scene,
-        objective=lambda arm, stddev: _moved_by(task, arm).objective(stddev),
+        task=task,
         stddev=0.1,
         points=[Point("start", start)],
         num_samples=32,
         has_jump_of_force=True,
-        descent=_descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"]),
+        descent=Descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"]),
     )
-
-
-def _descent(start, stddev: float, rate: float, num_steps: int, estimators: list[str]) -> Descent | None:
-    return Descent(start, stddev, rate, num_steps, estimators) if num_steps else None

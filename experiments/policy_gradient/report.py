@@ -1,10 +1,12 @@
 """The answer of the experiment on policy gradients in words, computed from its numbers."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
-from experiments.policy_gradient.outcome import DISCRETE, GRADIENTS, ONSET, Cell, Outcome
+from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome
 from experiments.report import Table
-from experiments.words import joined, quantity
+from experiments.words import joined, percent, quantity
 from mjxgrad.estimators import Reason
 
 NEGLIGIBLE = 0.05
@@ -14,15 +16,15 @@ NEGLIGIBLE = 0.05
 def verdict(outcome: Outcome) -> str:
     """Say where which first-order estimate is right."""
     smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]
-    repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_better(cell)]
+    repaired = [cell for cell in smooth if _is_biased(cell, DISCRETE) and _is_beyond(cell, DISCRETE, ONSET)]
     sentences = []
     if repaired:
-        discrete, onset = ([cell.bias(gradient)[0] for cell in repaired] for gradient in GRADIENTS)
+        discrete, onset = ([cell.judged[gradient].bias for cell in repaired] for gradient in GRADIENTS)
         sentences.append(
             f"The discrete first-order gradient is biased at {len(repaired)} of {len(smooth)} points without a jump of the cost, "
-            f"by {_range(discrete)} of the gradient's norm, where contact that begins within the step leaves {_range(onset)}."
+            f"by {_span(discrete)} of the gradient's norm, where contact that begins within the step leaves {_span(onset)}."
         )
-    worse = [cell for cell in smooth if _is_biased(cell, ONSET) and cell.bias(ONSET)[1] > cell.bias(DISCRETE)[2]]
+    worse = [cell for cell in smooth if _is_biased(cell, ONSET) and _is_beyond(cell, ONSET, DISCRETE)]
     sentences.append(
         f"Contact that begins within the step is worse in {joined([cell.label for cell in worse])}."
         if worse
@@ -31,10 +33,10 @@ def verdict(outcome: Outcome) -> str:
     jumps = [cell for cell in outcome.cells if cell.hits_and_misses]
     missed = [cell for cell in jumps if _is_biased(cell, ONSET)]
     if missed:
-        alphas = [cell.alpha(ONSET)[0] for cell in missed]
+        biases, alphas = zip(*((cell.judged[ONSET].bias, cell.judged[ONSET].alpha) for cell in missed), strict=True)
         sentences.append(
             f"Hit or miss it does not see: at {len(missed)} of {len(jumps)} points where the noise covers a jump it is biased by "
-            f"{_range([cell.bias(ONSET)[0] for cell in missed])}, and α-order gives it a weight of {_span(alphas)}."
+            f"{_span(biases)}, and α-order gives it a weight of {_span(alphas, '{:.2f}'.format)}."
         )
     return " ".join(sentences)
 
@@ -58,17 +60,17 @@ def tables(outcome: Outcome) -> list[Table]:
         for gradient in GRADIENTS:
             if _is_biased(cell, gradient):
                 emphasised.add((len(rows), 3))
-            alpha, alpha_error = cell.alpha(gradient)
+            one = cell.judged[gradient]
             rows.append(
                 [
                     cell.label if gradient == DISCRETE else "",
                     f"{cell.norm:.3g}" if gradient == DISCRETE else "",
                     gradient,
-                    _bias(cell, gradient),
-                    quantity(*cell.along(gradient)),
-                    quantity(alpha, alpha_error),
+                    f"{one.bias:.1%} ({one.low:.1%} to {one.high:.1%})",
+                    quantity(one.along, one.along_error),
+                    quantity(one.alpha, one.alpha_error),
                     _reasons(cell, gradient),
-                    *(f"{cell.error(gradient, kind):.1%}" for kind in ("first", "unbiased", "mixed")),
+                    *(f"{error:.1%}" for error in one[-3:]),
                 ]
             )
     columns = (
@@ -80,20 +82,18 @@ def tables(outcome: Outcome) -> list[Table]:
         "to either side; bold where it is not chance and above five per cent. Component along the reference: 1 is right. Errors: "
         "root mean square of one estimate."
     )
-    found = [Table(columns, rows, caption, frozenset(emphasised))]
-    if outcome.courses:
-        found.append(_descents(outcome))
-    return found
+    found = [Table(columns, rows, caption, frozenset(emphasised)), _descents(outcome)]
+    return [table for table in found if table.rows]
 
 
 def _descents(outcome: Outcome) -> Table:
     rows = [
         [
             course.title,
-            "first order" if course.estimator == "first" else "α-order",
+            ESTIMATORS[course.estimator],
             course.gradient,
             f"{course.costs[:, 0].mean():.4g}".replace("-", "−"),
-            quantity(course.final[0], _error(course.final[1])),
+            quantity(*course.final),
             f"{course.alphas[:, :-1].mean():.2f}",
             f"{course.seconds:.1f}",
         ]
@@ -107,22 +107,17 @@ def _descents(outcome: Outcome) -> Table:
 
 def _is_biased(cell: Cell, gradient: str) -> bool:
     """Say whether a bias is beyond chance, and worth speaking of."""
-    bias, low, _ = cell.bias(gradient)
-    return low > 0 and bias > NEGLIGIBLE
+    return cell.judged[gradient].low > 0 and cell.judged[gradient].bias > NEGLIGIBLE
 
 
-def _is_better(cell: Cell) -> bool:
-    return cell.bias(ONSET)[2] < cell.bias(DISCRETE)[1]
+def _is_beyond(cell: Cell, larger: str, smaller: str) -> bool:
+    return cell.judged[larger].low > cell.judged[smaller].high
 
 
 def _change(cell: Cell) -> float:
     """How far apart both first-order means are, over the norm of the gradient; from the same rollouts."""
-    return float(np.linalg.norm(cell.first_mean(ONSET)[0] - cell.first_mean(DISCRETE)[0])) / cell.norm
-
-
-def _bias(cell: Cell, gradient: str) -> str:
-    bias, low, high = cell.bias(gradient)
-    return f"{bias:.1%} ({low:.1%} to {high:.1%})"
+    onset, discrete = (cell.estimates[gradient].first.mean(axis=0) for gradient in (ONSET, DISCRETE))
+    return float(np.linalg.norm(onset - discrete)) / cell.norm
 
 
 def _reasons(cell: Cell, gradient: str) -> str:
@@ -138,15 +133,5 @@ def _reasons(cell: Cell, gradient: str) -> str:
     return ", ".join(f"{word} {share:.0%}" for word, share in shares.items() if share > 0)
 
 
-def _error(spread: float) -> float | None:
-    return None if np.isnan(spread) else spread
-
-
-def _range(values: list[float]) -> str:
-    low, high = (f"{100 * value:.0f}" if value > 0.1 else f"{100 * value:.2g}" for value in (min(values), max(values)))
-    return f"{low} %" if low == high else f"{low} to {high} %"
-
-
-def _span(values: list[float]) -> str:
-    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
-    return low if low == high else f"{low} to {high}"
+def _span(values: Sequence[float], write: Callable[[float], str] = percent) -> str:
+    return " to ".join(dict.fromkeys(map(write, (min(values), max(values)))))

@@ -34,24 +34,8 @@ class Motion(enum.IntEnum):
     @property
     def label(self) -> str:
         """In words."""
-        return _MOTIONS[self]
-
-    @property
-    def rank(self) -> int:
-        """For comparing: all that are fine have rank 0."""
-        return max(0, int(self) - int(Motion.BOUNCES_RIGHT))
-
-
-_MOTIONS = {
-    Motion.SETTLES: "settles",
-    Motion.MOVES: "moves on",
-    Motion.BOUNCES_RIGHT: "bounces right",
-    Motion.BOUNCES_OTHERWISE: "bounces otherwise",
-    Motion.GAINS_ENERGY: "gains energy",
-    Motion.TUNNELS: "tunnels",
-    Motion.UNSOLVED: "not solved",
-    Motion.DIVERGES: "diverges",
-}
+        others = {Motion.MOVES: "moves on", Motion.UNSOLVED: "not solved"}
+        return others.get(self, self.name.lower().replace("_", " "))
 
 
 class Derivative(enum.IntEnum):
@@ -98,14 +82,7 @@ class MotionRecord(eqx.Module):
 
 
 def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:
-    """Say of each rollout what it did; of several failures the worst.
-
-    Args:
-        record: of the rollouts.
-
-    Returns:
-        Values of `Motion`.
-    """
+    """Say of each rollout what it did, by values of `Motion`; of several failures the worst."""
     knows = np.isfinite(record.restitution) & np.isfinite(record.expected)
     with np.errstate(invalid="ignore"):
         is_right = np.abs(record.restitution - record.expected) <= BOUNCE
@@ -132,19 +109,10 @@ def classify_derivative(
     largest: float,
     tolerance: float,
 ) -> Int[np.ndarray, " points"]:
-    """Say of each derivative whether it is right.
+    """Say of each derivative of one number by one direction, by values of `Derivative`, whether it is right.
 
-    Args:
-        derivative: of one number by one direction.
-        is_finite: whether the whole gradient that it was taken from is finite.
-        is_sound: whether the rollout did not diverge.
-        truth: what it should be.
-        truth_error: by how much the truth may be off; where that exceeds the tolerance, nothing is judged.
-        largest: beyond which a derivative explodes, right or wrong.
-        tolerance: error allowed, as a share of the larger of the truth and one.
-
-    Returns:
-        Values of `Derivative`.
+    The whole gradient that it was taken from is finite, and its rollout sound, or not. Where the error of the truth exceeds the
+    tolerance, a share of the larger of the truth and one, nothing is judged; beyond `largest` a derivative explodes.
     """
     scale = tolerance * np.maximum(np.abs(truth), 1.0)
     with np.errstate(invalid="ignore"):

@@ -1,18 +1,23 @@
 """The pictures of an experiment on stability."""
 
 import functools
+import re
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
 from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
-from experiments.stability.grid import AXES
-from experiments.stability.limits import limit_curve
+from experiments.stability.grid import AXES, Points
 from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
+from experiments.stability.report import load
+from experiments.stability.scenes import RADIUS, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
+from mjxgrad.tasks.textbook import Bounce
 
 _LIMITS = {
     "two balls": "Dashed, against the speed: one step, or one bounce, carries a ball past the other's centre. ",
@@ -23,24 +28,9 @@ _EXPLICIT = (
     "side of it a single contact gains energy. "
 )
 
-MOTION_COLOURS = {
-    Motion.SETTLES: "#c9e3f4",
-    Motion.MOVES: "#9ccbe8",
-    Motion.BOUNCES_RIGHT: "#56b4e9",
-    Motion.BOUNCES_OTHERWISE: "#0072b2",
-    Motion.GAINS_ENERGY: "#f0c36d",
-    Motion.TUNNELS: "#cc79a7",
-    Motion.UNSOLVED: "#d55e00",
-    Motion.DIVERGES: "#22262e",
-}
-DERIVATIVE_COLOURS = {
-    Derivative.RIGHT: "#56b4e9",
-    Derivative.UNJUDGED: "#e8eaed",
-    Derivative.WRONG: "#d55e00",
-    Derivative.EXPLODES: "#f0c36d",
-    Derivative.NON_FINITE: "#cc79a7",
-    Derivative.NONE: "#22262e",
-}
+# In the order of the items.
+_MOTIONS = ("#c9e3f4", "#9ccbe8", "#56b4e9", "#0072b2", "#f0c36d", "#cc79a7", "#d55e00", "#22262e")
+_DERIVATIVES = ("#56b4e9", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
 _NAMES = {
     "timestep": "time step, s",
     "time_constant": "time constant, s",
@@ -59,11 +49,7 @@ _NAMES = {
 def drawings(outcome: Outcome) -> Drawings:
     """Name a figure per kind of scene, the planes of its first scene."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    return {_file(one): functools.partial(_planes, one) for one in reversed(shown.values())}
-
-
-def _file(one: SceneOutcome) -> str:
-    return "".join(c if c.isalnum() else "_" for c in one.scene.name)
+    return {re.sub(r"\W", "_", one.scene.name): functools.partial(_planes, one) for one in reversed(shown.values())}
 
 
 def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
@@ -75,8 +61,8 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     for i, (across, up) in enumerate(one.points.planes):
         for j, (name, what) in enumerate(columns):
             axis = axes[i, j]
-            values = one.plane(i, getattr(one.behaviour[name], what))
-            _image(axis, values, MOTION_COLOURS if what == "motion" else DERIVATIVE_COLOURS)
+            values = one.points.plane(i, one.found[what].sel(simulator=name).values)
+            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
             if i == 0:
@@ -94,8 +80,8 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     return figure, one.scene.name.capitalize(), caption
 
 
-def _image(axis: Axes, values: np.ndarray, colours: dict) -> None:
-    palette = ListedColormap(list(colours.values()))
+def _image(axis: Axes, values: np.ndarray, colours: Sequence[str]) -> None:
+    palette = ListedColormap(list(colours))
     norm = BoundaryNorm(np.arange(len(colours) + 1) - 0.5, len(colours))
     axis.imshow(values, cmap=palette, norm=norm, origin="lower", aspect="auto", interpolation="nearest")
     axis.grid(visible=False)
@@ -118,21 +104,37 @@ def _short(value: float) -> str:
 
 
 def _limit(axis: Axes, one: SceneOutcome, index: int) -> None:
-    """Draw the analytic limit, in the coordinates of the squares."""
-    curve = limit_curve(one.scene, one.points, index)
-    if curve is not None:
-        axis.contour(curve, levels=[0.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+    """Draw the analytic limit, if one passes through the plane: where a logarithm is 0, in the coordinates of the squares."""
+    names = set(one.points.planes[index])
+    if one.scene.family == "two balls" and "speed" in names:
+        values = _crossing(one.scene, one.points)
+    elif names & {"timestep", "time_constant", "damping_ratio", "stiffness"}:
+        values = load(one.scene, one.points)
+    else:
+        return
+    image = one.points.plane(index, np.log(values))
+    if image.min() < 0 < image.max():
+        axis.contour(image, levels=[0.0], colors=REFERENCE, linewidths=1.4, linestyles="--")
+
+
+def _crossing(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give how far two balls go into each other, over the distance at which their centres meet: beyond 1 they pass.
+
+    One step carries them $v h$, unseen; a bounce goes $v \sqrt e / \omega_0$ deep.
+    """
+    springs = np.array([effective(scene, points[i]) for i in range(len(points))])
+    frequency, damping = np.sqrt(springs[:, 0]), springs[:, 1]
+    restitution = np.asarray(Bounce(2 / damping, damping / (2 * frequency)).restitution)
+    time = np.maximum(points.values["timestep"], np.sqrt(restitution) / frequency)
+    return points.values["speed"] * time / (2 * RADIUS)
 
 
 def _legend(figure: Picture, one: SceneOutcome) -> None:
-    shown = one.points.family >= 0
-    kinds = np.unique(np.concatenate([behaviour.motion[shown] for behaviour in one.behaviour.values()]))
-    ours = [behaviour for name, behaviour in one.behaviour.items() if name != C_MUJOCO]
-    slopes = np.unique(np.concatenate([behaviour.derivative[shown] for behaviour in ours]))
-    handles = [Patch(color=MOTION_COLOURS[Motion(k)], label=Motion(k).label) for k in kinds]
+    shown = one.found.isel(point=one.points.family >= 0)
+    kinds = np.unique(shown.motion)
+    slopes = np.unique(shown.derivative.drop_sel(simulator=C_MUJOCO))
+    handles = [Patch(color=_MOTIONS[k], label=Motion(k).label) for k in kinds]
     handles += [
-        Patch(color=DERIVATIVE_COLOURS[Derivative(k)], label=f"gradient {Derivative(k).label}")
-        for k in slopes
-        if k != Derivative.NONE
+        Patch(color=_DERIVATIVES[k], label=f"gradient {Derivative(k).label}") for k in slopes if k != Derivative.NONE
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)

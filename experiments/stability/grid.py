@@ -10,7 +10,6 @@ from experiments.stability.scenes import DEFAULTS, StabilityScene
 
 Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 """From places in [0, 1] to values."""
-RANDOM = "random"
 
 # In the planes of a single bounce the impedance is constant, for a restitution in closed form.
 CONSTANT = {"impedance_first": 0.9, "impedance_last": 0.9}
@@ -36,15 +35,8 @@ PLANES: dict[str, tuple[tuple[str, str, dict[str, float]], ...]] = {
 }
 """By scene, or by its family: the parameter across, the one up, and what else differs from the default."""
 _CONTACT = (
-    "timestep",
-    "time_constant",
-    "damping_ratio",
-    "stiffness",
-    "impedance_first",
-    "impedance_last",
-    "width",
-    "speed",
-)
+    "timestep", "time_constant", "damping_ratio", "stiffness", "impedance_first", "impedance_last", "width", "speed"
+)  # fmt: skip
 _RANDOM = {
     "ball": (*_CONTACT, "margin"),
     "sphere": (*_CONTACT, "margin", "friction", "depth"),
@@ -75,19 +67,19 @@ class Points:
     def __getitem__(self, index: int) -> dict[str, float]:
         return {name: float(value[index]) for name, value in self.values.items()}
 
+    @property
+    def flown(self) -> Float[np.ndarray, " points"]:
+        """What a body flies in one step (m)."""
+        return self.values["speed"] * self.values["timestep"]
+
+    def plane(self, index: int, values: np.ndarray) -> np.ndarray:
+        """Arrange what belongs to one plane, of one value per point, as an image, the parameter across along columns."""
+        chosen = values[self.family == index]
+        return chosen.reshape(round(np.sqrt(len(chosen))), -1)
+
 
 def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -> Points:
-    """List the points of a scene.
-
-    Args:
-        scene: of the catalogue.
-        resolution: points along each side of a plane.
-        num_random: points of the hypercube.
-        seed: of the hypercube.
-
-    Returns:
-        The points, plane by plane, the parameter across changing fastest, then the random ones.
-    """
+    """List the points of a scene: plane by plane, the parameter across changing fastest, then the random ones."""
     planes = PLANES.get(scene.name, PLANES[scene.family])
     places = np.linspace(0, 1, resolution)
     blocks = []

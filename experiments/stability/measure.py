@@ -1,22 +1,24 @@
 """From settings to numbers."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
+import xarray as xr
 from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
 from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import Points, points
-from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
-from experiments.stability.settings import Settings, Sizes
+from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import soundness
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
@@ -26,9 +28,66 @@ _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
 _PARAMETER_WIDTHS = (1e-6, 2e-7)
 _TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
 _EVENT_TOLERANCE = 0.1
+# What C MuJoCo is not asked for.
+_NOTHING = {
+    "derivative_by_parameters": NOT_ASKED, "event_derivative": NOT_ASKED, "silent": False, "untold": False,
+    "gradient_unflagged_by_rollout": False, "missed": False, "apart_from_c": 0.0,
+}  # fmt: skip
 
 
-_Case = tuple[StabilityScene, Points, Reference, np.ndarray]
+@dataclass(frozen=True)
+class _Case:
+    """A scene with its points, and what C MuJoCo did on them."""
+
+    scene: StabilityScene
+    grid: Points
+    reference: Reference
+    settings: Settings
+
+    @property
+    def flown(self) -> Float[np.ndarray, " points"]:
+        """What a body flies in the rollout (m)."""
+        return self.grid.flown * self.settings.num_steps
+
+    @property
+    def largest(self) -> float:
+        """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
+
+        A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of the steps that follow adds to
+        the position.
+        """
+        return 100.0 * 2 * self.settings.num_steps
+
+    @cached_property
+    def push(self) -> dict[str, np.ndarray]:
+        """The change of the start along which derivatives are taken."""
+        shift, push = direction(self.scene, self.settings.num_steps, self.grid.values["timestep"])
+        return {"qpos": shift, "qvel": push}
+
+    @cached_property
+    def changes(self) -> dict[str, np.ndarray]:
+        """The change of the model's parameters: each number by a share of itself, no two by the same."""
+        return {
+            name: value * (1 + 0.3 * np.cos(np.arange(value[0].size))).reshape(value[0].shape)
+            for name, value in self.reference.fields.items()
+            if name in _RELATIVE
+        }
+
+    @cached_property
+    def restitution(self) -> Float[np.ndarray, " points"]:
+        """That of the motion itself, where it is a single bounce from outside."""
+        found = np.full(len(self.grid), np.nan)
+        for i in range(len(self.grid) if self.scene.bounces else 0):
+            point = self.grid[i]
+            stiffness, damping = effective(self.scene, point)
+            constant, ratio = 2 / damping, damping / (2 * np.sqrt(stiffness))
+            impedance = (point["impedance_first"], point["impedance_last"], point["width"])
+            if impedance[0] == impedance[1]:
+                found[i] = float(Bounce(constant, ratio, point["speed"]).restitution)
+            elif impedance[2] > 0:
+                with suppress(ValueError):
+                    found[i] = integrated_restitution(constant, ratio, impedance, point["speed"])[0]
+        return found
 
 
 @dataclass(frozen=True)
@@ -46,43 +105,41 @@ class _Runs:
     differences: np.ndarray | None
 
 
-def largest(num_steps: int) -> float:
-    """Bound beyond which a derivative explodes: a hundred times what one jump of a stable contact makes of it.
-
-    Args:
-        num_steps: of the rollout. A damper that is just stable, h b = 2, changes a velocity by twice itself, which each of
-            the steps that follow adds to the position.
-    """
-    return 100.0 * 2 * num_steps
-
-
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Run every scene in every precision, and C MuJoCo beside it."""
     size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
-    grids = [points(scene, size.resolution, size.num_random, settings.seed) for scene in scenes]
-    references = []
+    cases = []
     with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to, processes() as pool:
-        for scene, grid in zip(scenes, grids, strict=True):
-            references.append(simulate(scene, grid, settings.num_steps, pool))
-            advance_to(len(references))
-    expected = [_expected(scene, grid) for scene, grid in zip(scenes, grids, strict=True)]
-    cases = list(zip(scenes, grids, references, expected, strict=True))
-    behaviours = [{C_MUJOCO: _of_c(*case, settings)} for case in cases]
-    apart: list[dict[str, np.ndarray]] = [{} for _ in cases]
+        for scene in scenes:
+            grid = points(scene, size.resolution, size.num_random, settings.seed)
+            cases.append(_Case(scene, grid, simulate(scene, grid, settings.num_steps, pool), settings))
+            advance_to(len(cases))
+    found = [{C_MUJOCO: _of_c(case)} for case in cases]
     truths: list[np.ndarray] = []
     for precision in settings.precisions:
         with _precision(precision):
-            runs = _run_all(cases, precision, size, settings, workspace)
+            runs = _run_all(cases, precision, workspace)
         if precision == "float64":
             truths = [run.differences for run in runs if run.differences is not None]
         else:
             runs = _judge_solves(cases, runs, size.chunk, workspace)
-        for i, (case, run) in enumerate(zip(cases, runs, strict=True)):
-            behaviours[i][precision] = _of_mjxgrad(*case, run, truths[i], precision, settings)
-            apart[i][precision] = _apart(case[1], run.discrete.course, case[2].course, settings.num_steps)
-    found = zip(scenes, grids, behaviours, apart, strict=True)
-    return Outcome(settings, [SceneOutcome(*one) for one in found])
+        for one, case, run, truth in zip(found, cases, runs, truths, strict=True):
+            one[precision] = _of_mjxgrad(case, run, truth, precision)
+    labelled = [SceneOutcome(case.scene, case.grid, _labelled(one)) for case, one in zip(cases, found, strict=True)]
+    return Outcome(settings, labelled)
+
+
+def _labelled(found: dict[str, dict[str, np.ndarray]]) -> xr.Dataset:
+    """Label what each simulator did on the points of a scene."""
+    ours, count = found["float64"], len(found["float64"]["motion"])
+    arrays = {
+        key: np.stack([np.broadcast_to(one[key] if key in one else _NOTHING[key], count) for one in found.values()])
+        for key in ours
+    }
+    return xr.Dataset(
+        {key: (("simulator", "point"), array) for key, array in arrays.items()}, {"simulator": list(found)}
+    )
 
 
 @contextmanager
@@ -95,19 +152,18 @@ def _precision(name: str) -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
-def _run_all(cases: list[_Case], precision: str, size: Sizes, settings: Settings, workspace: Workspace) -> list[_Runs]:
+def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_Runs]:
     """Run the programs of all scenes, some at a time: most of it is compilation."""
 
     def run(case: _Case) -> _Runs:
-        scene, grid, reference, _ = case
-        arrays = (reference.fields, reference.qpos, reference.qvel)
+        scene, settings, size = case.scene, case.settings, case.settings.sizes
+        arrays = (case.reference.fields, case.reference.qpos, case.reference.qvel)
         onset = mg.Onset() if settings.onset else None
         program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
         has_event = not settings.onset and (size.event is None or scene.name in size.event)
         event = Program(scene, settings.num_steps, "event", size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
-        is_judge = precision == "float64"
-        truth = _differences(scene, grid, reference, program, settings.num_steps) if is_judge else None
+        truth = _differences(case, program) if precision == "float64" else None
         return _Runs(program.run(*arrays), event, truth)
 
     with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
@@ -118,15 +174,15 @@ def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: 
     """Judge what seems not to be solved in single precision by the forces in double precision."""
 
     def judge(pair: tuple[_Case, _Runs]) -> _Runs:
-        (scene, _, reference, _), run = pair
+        case, run = pair
         course, steps = run.discrete.course, run.discrete.steps
         seems_wrong = np.flatnonzero(~(course.residual <= UNSOLVED))
         if not len(seems_wrong):
             return run
-        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, reference.fields))
+        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, case.reference.fields))
         # The numbers that were given to the solves.
         fields = {name: value.astype(steps.qpos.dtype) for name, value in fields.items()}
-        errors = errors_of_solves(scene, fields, steps, chunk)
+        errors = errors_of_solves(case.scene, fields, steps, chunk)
         residual = course.residual.copy()
         residual[seems_wrong] = np.fmin(steps.unbalanced, errors).max(axis=1)
         return replace(run, discrete=replace(run.discrete, course=replace(course, residual=residual)))
@@ -135,66 +191,27 @@ def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: 
         return in_threads(judge, zip(cases, runs, strict=True), advance_to)
 
 
-def _differences(scene: StabilityScene, grid: Points, reference: Reference, program: Program, num_steps: int):
+def _differences(case: _Case, program: Program) -> np.ndarray:
     """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
-    flown = _flown_in_step(grid)
-    shift, push = direction(scene, num_steps, grid.values["timestep"])
-    changes = _changes(reference)
-    quotients = []
-    for width in WIDTHS:
-        ends = []
-        for side in (1, -1):
-            step = (side * width * flown)[:, None]
-            start = (reference.qpos + step * shift, reference.qvel + step * push)
-            ends.append(program.values(reference.fields, *start))
-        quotients.append((ends[0] - ends[1]) / (2 * width * flown))
-    for width in _PARAMETER_WIDTHS:
-        ends = []
-        for side in (1, -1):
-            fields = {
-                name: value + side * width * changes.get(name, np.zeros_like(value))
-                for name, value in reference.fields.items()
-            }
-            ends.append(program.values(fields, reference.qpos, reference.qvel))
-        quotients.append((ends[0] - ends[1]) / (2 * width * flown * num_steps))
-    return np.array(quotients).reshape(2, 2, -1)
+    reference = case.reference
+
+    def from_start(width: float) -> np.ndarray:
+        step = (width * case.grid.flown)[:, None]
+        moved = {name: getattr(reference, name) + step * push for name, push in case.push.items()}
+        return program.values(reference.fields, **moved)
+
+    def by_parameters(width: float) -> np.ndarray:
+        fields = {name: value + width * case.changes.get(name, 0.0) for name, value in reference.fields.items()}
+        return program.values(fields, reference.qpos, reference.qvel)
+
+    kinds = ((from_start, WIDTHS, case.grid.flown), (by_parameters, _PARAMETER_WIDTHS, case.flown))
+    return np.array(
+        [[(end(width) - end(-width)) / (2 * width * unit) for width in widths] for end, widths, unit in kinds]
+    )
 
 
-def _changes(reference: Reference) -> dict[str, np.ndarray]:
-    """Change each number by a share of itself, no two by the same."""
-    return {
-        name: value * (1 + 0.3 * np.cos(np.arange(value[0].size))).reshape(value[0].shape)
-        for name, value in reference.fields.items()
-        if name in _RELATIVE
-    }
-
-
-def _flown_in_step(grid: Points) -> Float[np.ndarray, " points"]:
-    return grid.values["speed"] * grid.values["timestep"]
-
-
-def _expected(scene: StabilityScene, grid: Points) -> Float[np.ndarray, " points"]:
-    """Give the restitution of the motion itself, where it is a single bounce from outside."""
-    found = np.full(len(grid), np.nan)
-    for i in range(len(grid) if scene.bounces else 0):
-        point = grid[i]
-        stiffness, damping = effective(scene, point)
-        constant, ratio = 2 / damping, damping / (2 * np.sqrt(stiffness))
-        impedance = (point["impedance_first"], point["impedance_last"], point["width"])
-        if impedance[0] == impedance[1]:
-            found[i] = float(Bounce(constant, ratio, point["speed"]).restitution)
-        elif impedance[2] > 0:
-            try:
-                found[i] = integrated_restitution(constant, ratio, impedance, point["speed"])[0]
-            except ValueError:
-                continue
-    return found
-
-
-def _record(
-    scene: StabilityScene, grid: Points, start: np.ndarray, course: Course, expected: Float[np.ndarray, " points"]
-) -> MotionRecord:
-    count = len(grid)
+def _record(case: _Case, course: Course) -> MotionRecord:
+    scene, grid, start, count = case.scene, case.grid, case.reference.qpos, len(case.grid)
     with np.errstate(all="ignore"):
         stored = np.array([_stored(scene, grid[i]) for i in range(count)])
         budget = course.kinetic[:, 0] + stored + course.potential[:, 0] - course.potential.min(axis=1)
@@ -208,7 +225,7 @@ def _record(
             has_left = (course.qvel[:, 0] > 0) & (course.qpos[:, 0] > grid.values["margin"])
         restitution = np.where(has_left, course.qvel[:, 0] / grid.values["speed"], np.nan)
     is_sound = course.first_bad_step < 0
-    return MotionRecord(is_sound, course.residual, gain, rest, crossed, restitution, expected)
+    return MotionRecord(is_sound, course.residual, gain, rest, crossed, restitution, case.restitution)
 
 
 def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
@@ -221,81 +238,60 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(scene: StabilityScene, grid: Points, reference: Reference, expected, settings: Settings) -> Behaviour:
-    record = _record(scene, grid, reference.qpos, reference.course, expected)
-    coarse, fine = reference.differences
-    is_finite = np.isfinite(fine)
-    derivative = classify_derivative(
-        fine,
-        is_finite,
-        record.is_sound,
-        fine,
-        np.abs(fine - coarse),
-        largest=largest(settings.num_steps),
-        tolerance=_TOLERANCE["float64"],
-    )
-    none = np.zeros(len(grid), bool)
-    return Behaviour(classify_motion(record), derivative, None, None, none, none, none, none, record.gain)
+def _of_c(case: _Case) -> dict[str, np.ndarray]:
+    record = _record(case, case.reference.course)
+    coarse, fine = case.reference.differences
+    bounds = {"largest": case.largest, "tolerance": _TOLERANCE["float64"]}
+    derivative = classify_derivative(fine, np.isfinite(fine), record.is_sound, fine, np.abs(fine - coarse), **bounds)
+    return {"motion": classify_motion(record), "derivative": derivative, "energy": record.gain}
 
 
-def _of_mjxgrad(
-    scene: StabilityScene,
-    grid: Points,
-    reference: Reference,
-    expected: np.ndarray,
-    runs: _Runs,
-    truth: np.ndarray,
-    precision: str,
-    settings: Settings,
-) -> Behaviour:
+def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> dict[str, np.ndarray]:
     run, event = runs.discrete, runs.event
-    record = _record(scene, grid, reference.qpos, run.course, expected)
-    shift, push = direction(scene, settings.num_steps, grid.values["timestep"])
-    flown = _flown_in_step(grid) * settings.num_steps
-    bound, tolerance = largest(settings.num_steps), _TOLERANCE[precision]
-    along_start = along(run, {"qpos": shift, "qvel": push})
-    along_parameters = along(run, _changes(reference)) / flown
+    record = _record(case, run.course)
+    motion, bound = classify_motion(record), case.largest
+    slopes = [along(run, case.push), along(run, case.changes) / case.flown]
     kinds = [
         classify_derivative(
-            value,
+            slope,
             run.is_gradient_finite,
             record.is_sound,
             fine,
             np.abs(fine - coarse),
             largest=bound,
-            tolerance=tolerance,
+            tolerance=_TOLERANCE[precision],
         )
-        for value, (coarse, fine) in zip((along_start, along_parameters), truth, strict=True)
+        for slope, (coarse, fine) in zip(slopes, truth, strict=True)
     ]
-    is_wild = ~run.is_gradient_finite | ~(np.abs(along_start) <= bound) | ~(np.abs(along_parameters) <= bound)
-    is_sound = np.asarray(
-        jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
-            (run.gradient[0], along_start, along_parameters),
-            ~record.is_sound,
-        )
+    is_wild = ~run.is_gradient_finite | ~(np.abs(slopes) <= bound).all(axis=0)
+    judged = jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
+        (run.gradient[0], *slopes), ~record.is_sound
     )
-    return Behaviour(
-        classify_motion(record),
-        kinds[0],
-        kinds[1],
-        None if event is None else _judge_event(record, event, bound),
-        run.is_silent | (False if event is None else event.is_silent),
-        (classify_motion(record) == Motion.UNSOLVED) & ~run.is_unsolved,
-        is_wild & record.is_sound,
-        is_wild & record.is_sound & is_sound,
-        record.gain,
-    )
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(run.course.qpos - case.reference.course.qpos).max(axis=1) / case.flown
+    return {
+        "motion": motion,
+        "derivative": kinds[0],
+        "derivative_by_parameters": kinds[1],
+        "event_derivative": np.array(NOT_ASKED) if event is None else _judge_event(record, event, bound),
+        "silent": run.is_silent if event is None else run.is_silent | event.is_silent,
+        "untold": (motion == Motion.UNSOLVED) & ~run.is_unsolved,
+        "gradient_unflagged_by_rollout": is_wild & record.is_sound,
+        "missed": is_wild & record.is_sound & np.asarray(judged),
+        "apart_from_c": apart,
+        "energy": record.gain,
+    }
 
 
 def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
     """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
-    derivative = run.gradient[1][:, 0]
     truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
     return classify_derivative(
-        derivative, run.is_gradient_finite, record.is_sound, truth, 0 * truth, largest=bound, tolerance=_EVENT_TOLERANCE
+        run.gradient[1][:, 0],
+        run.is_gradient_finite,
+        record.is_sound,
+        truth,
+        0 * truth,
+        largest=bound,
+        tolerance=_EVENT_TOLERANCE,
     )
-
-
-def _apart(grid: Points, ours: Course, theirs: Course, num_steps: int) -> Float[np.ndarray, " points"]:
-    with np.errstate(invalid="ignore"):
-        return np.abs(ours.qpos - theirs.qpos).max(axis=1) / (_flown_in_step(grid) * num_steps)

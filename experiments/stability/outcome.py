@@ -1,44 +1,26 @@
-"""The numbers of an experiment on stability, and what follows from them."""
+"""The numbers of an experiment on stability."""
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+import xarray as xr
 
 from experiments.stability.classes import Derivative, Motion
-from experiments.stability.grid import RANDOM, Points
+from experiments.stability.grid import Points
 from experiments.stability.scenes import StabilityScene
 from experiments.stability.settings import Settings
 
 C_MUJOCO = "C MuJoCo"
-
-
-@dataclass(frozen=True)
-class Behaviour:
-    """What one simulator did on all points of a scene.
-
-    Attributes:
-        motion: values of `Motion`.
-        derivative: values of `Derivative`, of the discrete gradient along a change of the start.
-        by_parameters: the same along a change of the model's parameters; none for C MuJoCo.
-        event: the same of the event gradient; none where it was not asked for.
-        is_silent: numbers that are not finite left the rollout without a flag.
-        is_untold: some step is not solved, and `Trajectory.unsolved` is zero.
-        is_unflagged: the gradient is not finite or explodes where `Trajectory.diverged` is false.
-        is_missed: the same where `soundness` finds nothing wrong either.
-        gain: largest kinetic energy over what there was to draw on.
-    """
-
-    motion: Int[np.ndarray, " points"]
-    derivative: Int[np.ndarray, " points"]
-    by_parameters: Int[np.ndarray, " points"] | None
-    event: Int[np.ndarray, " points"] | None
-    is_silent: Bool[np.ndarray, " points"]
-    is_untold: Bool[np.ndarray, " points"]
-    is_unflagged: Bool[np.ndarray, " points"]
-    is_missed: Bool[np.ndarray, " points"]
-    gain: Float[np.ndarray, " points"]
+NOT_ASKED = -1
+"""In the place of a value of `Derivative` that was not asked for."""
+_KINDS = {
+    "motion": Motion,
+    "derivative": Derivative,
+    "derivative_by_parameters": Derivative,
+    "event_derivative": Derivative,
+}
 
 
 @dataclass(frozen=True)
@@ -48,104 +30,65 @@ class SceneOutcome:
     Attributes:
         scene: of the catalogue.
         points: of its grid.
-        behaviour: by simulator: `C_MUJOCO`, and mjxgrad by its precision.
-        apart: difference of the final positions from those of C MuJoCo, over what a body flies in the rollout, by precision.
+        found: by simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that of
+            the discrete gradient along a change of the start (`derivative`) and of the model's parameters
+            (`derivative_by_parameters`), and that of the event gradient (`event_derivative`); whether numbers that are not
+            finite left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
+            (`untold`), whether the gradient is not finite or explodes where `Trajectory.diverged` is false
+            (`gradient_unflagged_by_rollout`), and `soundness` finds nothing wrong either (`missed`); difference of the final
+            positions from those of C MuJoCo over what a body flies (`apart_from_c`), and largest kinetic energy over what
+            there was to draw on (`energy`).
     """
 
     scene: StabilityScene
     points: Points
-    behaviour: dict[str, Behaviour]
-    apart: dict[str, Float[np.ndarray, " points"]]
-
-    def worse(self, precision: str) -> Bool[np.ndarray, " points"]:
-        """Where mjxgrad's motion is of a worse kind than that of C MuJoCo.
-
-        Args:
-            precision: of mjxgrad.
-        """
-        return _ranks(self.behaviour[precision].motion) > _ranks(self.behaviour[C_MUJOCO].motion)
-
-    def better(self, precision: str) -> Bool[np.ndarray, " points"]:
-        """Where it is of a better kind.
-
-        Args:
-            precision: of mjxgrad.
-        """
-        return _ranks(self.behaviour[precision].motion) < _ranks(self.behaviour[C_MUJOCO].motion)
-
-    def plane(self, index: int, values: np.ndarray) -> np.ndarray:
-        """Arrange what belongs to one plane as an image, the parameter across along columns.
-
-        Args:
-            index: of the plane.
-            values: one per point.
-        """
-        chosen = values[self.points.family == index]
-        return chosen.reshape(round(np.sqrt(len(chosen))), -1)
+    found: xr.Dataset
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
-
-    Attributes:
-        settings: of the run.
-        scenes: in the order of the catalogue.
-    """
+    """All that was measured, the scenes in the order of the catalogue."""
 
     settings: Settings
     scenes: list[SceneOutcome]
 
-    @property
-    def num_points(self) -> int:
-        """Of all scenes, in one precision."""
-        return sum(len(one.points) for one in self.scenes)
-
-    def total(self, precision: str, question: str) -> int:
-        """Count where something holds, over all scenes.
-
-        Args:
-            precision: of mjxgrad.
-            question: a Boolean attribute of `Behaviour`.
-        """
-        return int(sum(getattr(one.behaviour[precision], question).sum() for one in self.scenes))
+    @functools.cached_property
+    def found(self) -> xr.Dataset:
+        """The points of all scenes, one after another."""
+        return xr.concat([one.found for one in self.scenes], "point")
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per point, for metrics.csv."""
-        return [row for one in self.scenes for row in _rows(one, self.settings.precisions)]
+        return [row for one in self.scenes for row in _rows(one)]
 
 
-def _ranks(motion: Int[np.ndarray, " points"]) -> Int[np.ndarray, " points"]:
-    return np.array([kind.rank for kind in Motion])[motion]
+def against_c(found: xr.Dataset, precision: str) -> np.ndarray:
+    """Compare mjxgrad's motion with that of C MuJoCo: above 0 where it is of a worse kind, below where of a better one."""
+    # All that are fine have one rank.
+    ranks = np.maximum(found.motion, Motion.BOUNCES_RIGHT)
+    return (ranks.sel(simulator=precision) - ranks.sel(simulator=C_MUJOCO)).values
 
 
-def _rows(one: SceneOutcome, precisions: tuple[str, ...]) -> list[dict[str, Any]]:
-    rows = []
-    for i in range(len(one.points)):
-        plane = one.points.family[i]
-        row = {
+def _rows(one: SceneOutcome) -> list[dict[str, Any]]:
+    columns: dict[str, Any] = {}
+    for name in one.found.simulator.values:
+        of_one = one.found.sel(simulator=name)
+        keys = [key for key in of_one.data_vars if key != "missed"] if name != C_MUJOCO else ["motion", "derivative"]
+        prefix = "c" if name == C_MUJOCO else name
+        columns |= {f"{prefix}_{key}": _readable(str(key), of_one[key].values) for key in keys}
+    planes = ["random" if i < 0 else " × ".join(one.points.planes[i]) for i in one.points.family]
+    return [
+        {
             "scene": one.scene.name,
-            "plane": RANDOM if plane < 0 else " × ".join(one.points.planes[plane]),
+            "plane": plane,
             **one.points[i],
-            "c_motion": Motion(one.behaviour[C_MUJOCO].motion[i]).label,
-            "c_derivative": Derivative(one.behaviour[C_MUJOCO].derivative[i]).label,
+            **{key: values[i] for key, values in columns.items()},
         }
-        for name in precisions:
-            behaviour = one.behaviour[name]
-            row |= {
-                f"{name}_motion": Motion(behaviour.motion[i]).label,
-                f"{name}_derivative": Derivative(behaviour.derivative[i]).label,
-                f"{name}_derivative_by_parameters": _label(behaviour.by_parameters, i),
-                f"{name}_event_derivative": _label(behaviour.event, i),
-                f"{name}_silent": bool(behaviour.is_silent[i]),
-                f"{name}_untold": bool(behaviour.is_untold[i]),
-                f"{name}_gradient_unflagged_by_rollout": bool(behaviour.is_unflagged[i]),
-                f"{name}_apart_from_c": float(one.apart[name][i]),
-                f"{name}_energy": float(behaviour.gain[i]),
-            }
-        rows.append(row)
-    return rows
+        for i, plane in enumerate(planes)
+    ]
 
 
-def _label(values: Int[np.ndarray, " points"] | None, index: int) -> str:
-    return "" if values is None else Derivative(values[index]).label
+def _readable(key: str, values: np.ndarray) -> list[Any]:
+    if key not in _KINDS:
+        return values.tolist()
+    return ["" if value == NOT_ASKED else _KINDS[key](value).label for value in values]

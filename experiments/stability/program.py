@@ -65,15 +65,7 @@ def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Arr
 
 
 class Program:
-    """A scene's rollout with its gradient, vectorised over points.
-
-    Args:
-        scene: of the catalogue.
-        num_steps: of the rollout.
-        gradient: "discrete" or "event".
-        chunk: points at once.
-        onset: of contacts within the step; None is MuJoCo's motion.
-    """
+    """A scene's rollout with its gradient, vectorised over points, a chunk at once."""
 
     def __init__(
         self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int, onset: mg.Onset | None = None
@@ -89,27 +81,13 @@ class Program:
         self._value = jax.jit(jax.vmap(lambda *start: self._outcome(*start, observe=None)[0]))
 
     def values(self, fields: dict[str, np.ndarray], qpos: np.ndarray, qvel: np.ndarray) -> Float[np.ndarray, " points"]:
-        """Give the outcome alone.
-
-        Args:
-            fields: of the model, for every point.
-            qpos: where each rollout starts.
-            qvel: likewise.
-        """
-        parts = [np.asarray(self._value(*arrays))[:count] for count, arrays in self._chunks((fields, qpos, qvel))]
-        return np.concatenate(parts)
+        """Give the outcome alone, from the model's fields and the start of every point."""
+        return np.concatenate(
+            [np.asarray(self._value(*arrays))[:count] for count, arrays in self._chunks((fields, qpos, qvel))]
+        )
 
     def run(self, fields: dict[str, np.ndarray], qpos: np.ndarray, qvel: np.ndarray) -> Run:
-        """Simulate and differentiate.
-
-        Args:
-            fields: of the model, for every point.
-            qpos: where each rollout starts.
-            qvel: likewise.
-
-        Returns:
-            What came out.
-        """
+        """Simulate and differentiate, likewise."""
         parts = []
         for count, arrays in self._chunks((fields, qpos, qvel)):
             (value, trajectory), gradient = self._both(*arrays)
@@ -119,14 +97,8 @@ class Program:
         # From the first bad step on the solver is asked what has no answer.
         residual = _until(residual, trajectory.first_bad_step)
         is_silent = ~trajectory.diverged & ~_all_finite((trajectory, value))
-        course = Course(
-            trajectory.qpos[:, -1],
-            trajectory.qvel[:, -1],
-            kinetic,
-            potential,
-            residual.max(axis=1),
-            trajectory.first_bad_step,
-        )
+        ends, first_bad = (trajectory.qpos[:, -1], trajectory.qvel[:, -1]), trajectory.first_bad_step
+        course = Course(*ends, kinetic, potential, residual.max(axis=1), first_bad)
         last = self._num_steps
         steps = Steps(trajectory.qpos[:, :last], trajectory.qvel[:, :last], qacc[:, :last], residual[:, :last])
         return Run(course, value, gradient, is_silent, _all_finite(gradient), trajectory.unsolved > 0, steps)
@@ -151,16 +123,7 @@ def errors_of_solves(
     """Ask the forces of a solve of the same states, in the present precision, whether they balance accelerations found.
 
     Forces out of balance bound the error of an acceleration, but in single precision those of stiff rows may be out of balance
-    by rounding alone, with hardly an error.
-
-    Args:
-        scene: of the catalogue.
-        fields: of the model, for every point, as they were for the solves.
-        steps: to be judged.
-        chunk: states at once.
-
-    Returns:
-        Share of a step's velocity by which each is off.
+    by rounding alone, with hardly an error. The answer is the share of a step's velocity by which each is off.
     """
     loaded = mg.load_scene(scene.model())
 
@@ -191,12 +154,7 @@ def _chunks(arrays: Any, size: int, dtype: Any) -> Iterator[tuple[int, Any]]:
 
 
 def along(run: Run, changes: dict[str, np.ndarray]) -> Float[np.ndarray, " points"]:
-    """Take a gradient along a change of fields, positions and velocities.
-
-    Args:
-        run: of all points.
-        changes: by field; "qpos" and "qvel" are the start.
-    """
+    """Take a gradient along a change of fields, and of the start, "qpos" and "qvel"."""
     fields, qpos, qvel = run.gradient
     parts = {**fields, "qpos": qpos, "qvel": qvel}
     with np.errstate(all="ignore"):

@@ -64,13 +64,7 @@ class Reference:
 def direction(scene: StabilityScene, num_steps: int, timestep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give the change of the start along which derivatives are taken; quaternions stay.
 
-    Args:
-        scene: of the catalogue.
-        num_steps: of the rollout.
-        timestep: of each point, in s.
-
-    Returns:
-        Changes of positions (points, nq) and of velocities (points, nv), which move the outcome alike.
+    Positions (points, nq) and velocities (points, nv) move the outcome alike.
     """
     model = scene.model()
     free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
@@ -81,23 +75,8 @@ def direction(scene: StabilityScene, num_steps: int, timestep: np.ndarray) -> tu
     return np.tile(shift, (len(timestep), 1)), push / (num_steps * timestep[:, None])
 
 
-def scale(points: Points) -> Float[np.ndarray, " points"]:
-    """What a body flies in one step (m)."""
-    return points.values["speed"] * points.values["timestep"]
-
-
 def simulate(scene: StabilityScene, points: Points, num_steps: int, pool: Executor) -> Reference:
-    """Run C MuJoCo on every point.
-
-    Args:
-        scene: of the catalogue.
-        points: of its grid.
-        num_steps: of every rollout.
-        pool: of processes: most of the time goes into Python, a step at a time.
-
-    Returns:
-        What it did.
-    """
+    """Run C MuJoCo on every point, in processes: most of the time goes into Python, a step at a time."""
     shifts = np.concatenate(direction(scene, num_steps, points.values["timestep"]), axis=1)
     cases = list(zip((points[i] for i in range(len(points))), shifts, strict=True))
     share = math.ceil(len(cases) / (_SHARES * num_cores()))
@@ -169,30 +148,16 @@ def _follow(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, qvel: 
         bad = last = int(np.argmin(is_good))
         energies[bad + 1 :] = energies[bad]
     seen = slice(0, last + 1)
-    residual = unbalanced(
-        masses[seen],
-        accelerations[seen],
-        velocities[:num_steps][seen],
-        smooth[seen],
-        constraint[seen],
-        model.opt.timestep,
-    )
+    solves = (masses, accelerations, velocities[:num_steps], smooth, constraint)
+    residual = unbalanced(*(x[seen] for x in solves), timestep=model.opt.timestep)
     return positions[last], velocities[last], energies[:, 1], energies[:, 0], float(residual.max()), bad
 
 
 def unbalanced(mass, acceleration, velocity, smooth, constraint, timestep):
     """Share of a step's velocity by which a solve is off, in the norm of kinetic energy; of NumPy or JAX arrays.
 
-    Args:
-        mass: matrix (..., nv, nv), of which the diagonal counts.
-        acceleration: that the solve has found (..., nv).
-        velocity: before the step.
-        smooth: forces but those of constraints.
-        constraint: forces of constraints.
-        timestep: in s.
-
-    Returns:
-        A number (...); 0 where nothing moves and nothing pulls.
+    The norm takes the diagonal of the mass matrix (..., nv, nv); all others are (..., nv). It is 0 where nothing moves and
+    nothing pulls.
     """
     inertia = (mass @ acceleration[..., None])[..., 0]
     weight = mass.diagonal(axis1=-2, axis2=-1)

@@ -1,178 +1,193 @@
 """The answer of an experiment on stability in words, computed from its numbers."""
 
 from collections import Counter
-from collections.abc import Iterator
 
+import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from experiments.report import Table
 from experiments.stability.classes import Derivative, Motion
-from experiments.stability.limits import load
-from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
-from experiments.stability.reasons import UNEXPLAINED, reasons
+from experiments.stability.grid import Points
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
+from experiments.stability.scenes import StabilityScene, effective
+from mjxgrad.contact.warnings import largest_stable_step, steepest
 
-_FAILS = Motion.GAINS_ENERGY
+UNEXPLAINED = "unexplained"
+_SAME_MOTION = 1e-3
+"""Difference of final positions, over what a body flies in the rollout, up to which two motions are one."""
+_LITTLE_FRICTION = 0.03
+"""Below it the edges of a pyramid weigh more than a thousand times what its normal would."""
+_LINES = {"derivative": "by the start", "derivative_by_parameters": "by parameters", "event_derivative": "event"}
 
 
 def verdict(outcome: Outcome) -> str:
     """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
-    precisions = outcome.settings.precisions
-    silent = sum(outcome.total(name, "is_silent") for name in precisions)
-    missed = sum(outcome.total(name, "is_missed") for name in precisions)
+    found, precisions = outcome.found, outcome.settings.precisions
     sentences = [
-        f"Over {outcome.num_points} points, {' and '.join(precisions)}, {_count(silent)} left a rollout with a number that is "
-        f"not finite and no flag, and `soundness` missed {_count(missed)} of the gradients that are not finite or explode."
+        f"Over {found.sizes['point']} points, {' and '.join(precisions)}, {_count(found.silent)} left a rollout with a number "
+        f"that is not finite and no flag, and `soundness` missed {_count(found.missed)} of the gradients that are not finite "
+        "or explode."
     ]
     for name in precisions:
-        stopped = sum(int((one.behaviour[name].motion == Motion.UNSOLVED).sum()) for one in outcome.scenes)
-        untold = outcome.total(name, "is_untold")
-        worse = sum(int(one.worse(name).sum()) for one in outcome.scenes)
-        better = sum(int(one.better(name).sum()) for one in outcome.scenes)
-        open_ones = _reasons(outcome, name)[UNEXPLAINED]
+        signs = against_c(found, name)
+        why = [reason for one in outcome.scenes for reason in reasons(one, name).values()]
+        unexplained = f" ({why.count(UNEXPLAINED) or 'none'} without a reason found)" if why else ""
         sentences.append(
-            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(worse)} of the points"
-            f"{f' ({_count(open_ones)} without a reason found)' if worse else ''}, and of a better one at {_count(better)}; "
-            f"{_count(stopped)} {'have' if stopped > 1 else 'has'} a step that is not solved to a thousandth"
-            + (f", which `Trajectory.unsolved` does not tell at {_count(untold)}." if stopped else ".")
+            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(signs > 0)} of the points{unexplained}, "
+            f"and of a better one at {_count(signs < 0)}."
         )
     return " ".join(sentences)
 
 
+def summary(outcome: Outcome) -> Table:
+    """Count by precision what is not solved, what is right and what only `soundness` tells."""
+    rows = []
+    for name in outcome.settings.precisions:
+        found = outcome.found.sel(simulator=name)
+        unflagged = found.gradient_unflagged_by_rollout
+        rows.append(
+            [
+                name,
+                _count(found.motion == Motion.UNSOLVED),
+                _count(found.untold),
+                *(_right(found[key], found.motion) for key in ("derivative", "derivative_by_parameters")),
+                _count(unflagged),
+                _count(unflagged & (found.derivative == Derivative.NON_FINITE)),
+            ]
+        )
+    columns = (
+        "precision", "not solved to a thousandth", "not told by Trajectory.unsolved", "right by the start", "by parameters",
+        "gradients told by soundness alone", "not finite",
+    )  # fmt: skip
+    caption = (
+        "Points. Derivatives by the start, and by contact parameters, friction and time step, where the motion is fine: right of "
+        "those that finite differences can judge. Told by `soundness` alone, or an estimator's count: gradients that explode, or "
+        "are not finite, although their rollouts did not diverge."
+    )
+    return Table(columns, rows, caption)
+
+
 def findings(outcome: Outcome) -> list[str]:
-    """Single findings, one sentence each."""
-    found = [_limit(outcome), *(_gradients(outcome, name) for name in outcome.settings.precisions)]
-    found += [_unflagged(outcome, name) for name in outcome.settings.precisions]
-    return [sentence for sentence in found if sentence]
+    """Compare the explicit limit with what single bounces do."""
+    singles = [one for one in outcome.scenes if one.scene.bounces]
+    if not singles:
+        return []
+    ratio = np.concatenate([load(one.scene, one.points) for one in singles])
+    fails = np.concatenate([one.found.motion.sel(simulator="float64") for one in singles]) >= Motion.GAINS_ENERGY
+    below = ratio < 1
+    exceptions = fails & below
+    sentence = (
+        f"Of {below.sum()} single bounces within the explicit limit {_count(exceptions)} "
+        f"{'gains' if exceptions.sum() == 1 else 'gain'} energy"
+    )
+    if exceptions.any():
+        sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
+    spared = (~fails & ~below).sum()
+    return [f"{sentence}; of {(~below).sum()} beyond it " + (f"all but {spared} do." if spared else "all do.")]
 
 
 def tables(outcome: Outcome) -> list[Table]:
     """Count classes by scene and simulator, and give the reasons of what is worse than C MuJoCo."""
-    return [_motions(outcome), _derivatives(outcome), *_explained(outcome)]
-
-
-def _count(number: int) -> str:
-    return "none" if number == 0 else f"{number}"
-
-
-def _limit(outcome: Outcome) -> str | None:
-    """Compare the limit with what single bounces do."""
-    predicted, fails = [], []
+    motions, derivatives, explained = [], [], []
     for one in outcome.scenes:
-        if one.scene.bounces:
-            predicted.append(load(one.scene, one.points))
-            fails.append(one.behaviour["float64"].motion >= _FAILS)
-    if not predicted:
-        return None
-    ratio, fails = np.concatenate(predicted), np.concatenate(fails)
-    below, beyond = ratio < 1, ratio >= 1
-    exceptions = int((fails & below).sum())
-    gain = "gains" if exceptions == 1 else "gain"
-    sentence = f"Of {below.sum()} single bounces within the explicit limit {_count(exceptions)} {gain} energy"
-    if exceptions:
-        sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
-    spared = int((~fails & beyond).sum())
-    return f"{sentence}; of {beyond.sum()} beyond it " + (f"all but {spared} do." if spared else "all do.")
-
-
-def _gradients(outcome: Outcome, precision: str) -> str:
-    kinds = _joined(outcome, precision, "derivative")
-    motions = np.concatenate([one.behaviour[precision].motion for one in outcome.scenes])
-    by_parameters = _joined(outcome, precision, "by_parameters")
-    is_fine = motions < _FAILS
-    judged = np.isin(kinds, (Derivative.RIGHT, Derivative.WRONG, Derivative.EXPLODES, Derivative.NON_FINITE))
-    also = np.isin(by_parameters, (Derivative.RIGHT, Derivative.WRONG, Derivative.EXPLODES, Derivative.NON_FINITE))
-    return (
-        f"In {precision}, where the motion is fine, the derivative by the start is right at "
-        f"{((kinds == Derivative.RIGHT) & is_fine).sum()} of {(judged & is_fine).sum()} points that finite differences can judge"
-        f", that by contact parameters, friction and time step at {((by_parameters == Derivative.RIGHT) & is_fine).sum()} of "
-        f"{(also & is_fine).sum()}."
-    )
-
-
-def _unflagged(outcome: Outcome, precision: str) -> str | None:
-    unflagged = outcome.total(precision, "is_unflagged")
-    if not unflagged:
-        return None
-    kinds = _joined(outcome, precision, "derivative")
-    return (
-        f"In {precision}, {unflagged} gradients explode or are not finite ({(kinds == Derivative.NON_FINITE).sum()} of them not "
-        "finite) although their rollouts did not diverge: only `soundness`, or an estimator's count, tells."
-    )
-
-
-def _joined(outcome: Outcome, precision: str, what: str) -> np.ndarray:
-    return np.concatenate([getattr(one.behaviour[precision], what) for one in outcome.scenes])
-
-
-def _simulators(one: SceneOutcome) -> Iterator[tuple[str, Behaviour]]:
-    for name, behaviour in one.behaviour.items():
-        yield (name if name == C_MUJOCO else f"mjxgrad, {name}"), behaviour
-
-
-def _cells(values: np.ndarray, kinds: type[Motion] | type[Derivative]) -> list[str]:
-    counts = np.bincount(values, minlength=len(kinds))
-    return [str(count) if count else "" for count in counts]
-
-
-def _motions(outcome: Outcome) -> Table:
-    rows = []
-    for one in outcome.scenes:
-        for i, (name, behaviour) in enumerate(_simulators(one)):
-            rows.append(["" if i else one.scene.name, name, *_cells(behaviour.motion, Motion)])
-    return Table(
-        ("scene", "simulator", *(kind.label for kind in Motion)),
-        rows,
-        "Points by what the motion does. Bounces are judged by their restitution where it is known, by closed form or quadrature"
-        "; “gains energy” is more kinetic energy than start, gravity and compressed springs had to give; “not solved” is an "
-        "acceleration that is off by a thousandth of a step’s velocity, by the forces that it leaves unbalanced; where these are "
-        "rounded, in float32, by the forces of the same state in float64.",
-    )
-
-
-def _derivatives(outcome: Outcome) -> Table:
-    rows = []
-    for one in outcome.scenes:
-        first = one.scene.name
-        for name, behaviour in _simulators(one):
-            lines = (
-                ("by the start", behaviour.derivative),
-                ("by parameters", behaviour.by_parameters),
-                ("event", behaviour.event),
-            )
-            for what, values in lines:
-                if values is not None:
-                    rows.append([first, name, what, *_cells(values, Derivative)])
-                    first = ""
-    return Table(
-        ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),
-        rows,
-        "Points by what the derivative is. C MuJoCo’s is a central difference; it is unjudged where two widths disagree. Those "
-        "of mjxgrad are judged by central differences of mjxgrad in float64, the event gradient by the restitution.",
-    )
-
-
-def _reasons(outcome: Outcome, precision: str) -> Counter[str]:
-    return Counter(reason for one in outcome.scenes for reason in reasons(one, precision).values())
-
-
-def _explained(outcome: Outcome) -> list[Table]:
-    rows = []
-    for one in outcome.scenes:
+        for name in one.found.simulator.values:
+            found, label = one.found.sel(simulator=name), name if name == C_MUJOCO else f"mjxgrad, {name}"
+            motions.append([one.scene.name, label, *_cells(found.motion, Motion)])
+            for key, line in _LINES.items():
+                if (found[key] != NOT_ASKED).all():
+                    derivatives.append([one.scene.name, label, line, *_cells(found[key], Derivative)])
         for precision in outcome.settings.precisions:
-            found = reasons(one, precision)
-            for reason, count in Counter(found.values()).most_common():
-                index = next(i for i, why in found.items() if why == reason)
-                rows.append([one.scene.name, precision, reason, str(count), _example(one, precision, index)])
-    if not rows:
-        return []
-    caption = "Points where the motion of mjxgrad is of a worse kind than that of C MuJoCo, by the reason found, with one each."
-    return [Table(("scene", "precision", "reason", "points", "for instance"), rows, caption)]
+            why = reasons(one, precision)
+            for reason, count in Counter(why.values()).most_common():
+                index = next(i for i, said in why.items() if said == reason)
+                explained.append([one.scene.name, precision, reason, str(count), _example(one, precision, index)])
+    found = [
+        Table(
+            ("scene", "simulator", *(kind.label for kind in Motion)),
+            motions,
+            "Points by what the motion does. Bounces are judged by their restitution where it is known, by closed form or "
+            "quadrature; “gains energy” is more kinetic energy than start, gravity and compressed springs had to give; “not "
+            "solved” is an acceleration that is off by a thousandth of a step’s velocity, by the forces that it leaves "
+            "unbalanced; where these are rounded, in float32, by the forces of the same state in float64.",
+        ),
+        Table(
+            ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),
+            derivatives,
+            "Points by what the derivative is. C MuJoCo’s is a central difference; it is unjudged where two widths disagree. "
+            "Those of mjxgrad are judged by central differences of mjxgrad in float64, the event gradient by the restitution.",
+        ),
+        Table(
+            ("scene", "precision", "reason", "points", "for instance"),
+            explained,
+            "Points where the motion of mjxgrad is of a worse kind than that of C MuJoCo, by the reason found, with one each.",
+        ),
+    ]
+    return [table for table in found if table.rows]
+
+
+def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
+    r"""Give the time step over the largest at which one spring gains no energy: unstable from 1 on.
+
+    $h \omega_0 / (2 (\sqrt{1 + \zeta^2} - \zeta))$, in the standard format $h / t_c$ over $2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$.
+    """
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        point = points[i]
+        impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
+        frequency = np.sqrt(stiffness)
+        limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
+        found[i] = point["timestep"] * frequency / limit
+    return found
+
+
+def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
+    """Give the reason of every point at which mjxgrad does worse, by its index; `UNEXPLAINED` where none is found."""
+    values, ours, theirs = one.points.values, one.found.sel(simulator=precision), one.found.sel(simulator=C_MUJOCO)
+    is_fine_in_double = against_c(one.found, "float64") <= 0
+    takes_other_impedance = (values["width"] == 0) & (values["impedance_first"] != values["impedance_last"])
+    is_unsolved = ours.motion == Motion.UNSOLVED
+    is_single = is_fine_in_double & (precision == "float32")
+    has_steep_pyramids = one.scene.name.endswith("pyramidal") & (values["friction"] < _LITTLE_FRICTION)
+    # Of balls, two radii deep.
+    coincide = bool(one.scene.crossing) & (values["depth"] == 2)
+    rules = (
+        (is_unsolved & is_single & has_steep_pyramids, "pyramids of little friction weigh as 1/μ²: beyond float32"),
+        (is_unsolved & is_single, "the solve stops short, in float32 alone"),
+        (is_unsolved, "the solve stops short"),
+        (takes_other_impedance, "width 0: C MuJoCo takes the mean of both impedances, MJX the second"),
+        (ours.apart_from_c <= _SAME_MOTION, "the same motion, on either side of the bound between two classes"),
+        (coincide, "the centres coincide: rounding decides on which side they part"),
+        (is_single, "single precision: right in float64"),
+        (theirs.motion >= Motion.GAINS_ENERGY, "C MuJoCo fails, too, in another way"),
+        (load(one.scene, one.points) >= 1, "beyond the explicit limit, where rounding grows"),
+        (theirs.derivative == Derivative.EXPLODES, "the derivative of C MuJoCo's motion explodes: rounding grows"),
+    )
+    names = [reason for _, reason in rules]
+    chosen = np.select([np.asarray(is_so) for is_so, _ in rules], list(range(len(rules))), len(rules))
+    return {int(i): [*names, UNEXPLAINED][chosen[i]] for i in np.flatnonzero(against_c(one.found, precision) > 0)}
+
+
+def _count(where) -> str:
+    return str(int(where.sum()) or "none")
+
+
+def _right(kinds, motion) -> str:
+    """Give how many derivatives are right of those that can be judged, where the motion is fine."""
+    judged = np.isin(kinds, (Derivative.RIGHT, Derivative.WRONG, Derivative.EXPLODES, Derivative.NON_FINITE))
+    is_fine = (motion < Motion.GAINS_ENERGY).values
+    return f"{int(((kinds.values == Derivative.RIGHT) & is_fine).sum())} of {int((judged & is_fine).sum())}"
+
+
+def _cells(values, kinds: type[Motion] | type[Derivative]) -> list[str]:
+    return [str(count or "") for count in np.bincount(values, minlength=len(kinds))]
 
 
 def _example(one: SceneOutcome, precision: str, index: int) -> str:
-    plane = one.points.family[index]
-    point = one.points[index]
+    plane, point = one.points.family[index], one.points[index]
     names = point if plane < 0 else dict.fromkeys(one.points.planes[plane])
     shown = ", ".join(f"{name.replace('_', ' ')} {point[name]:.3g}" for name in names)
-    ours, theirs = (Motion(one.behaviour[name].motion[index]).label for name in (precision, C_MUJOCO))
+    at = one.found.motion.isel(point=index)
+    ours, theirs = (Motion(int(at.sel(simulator=name))).label for name in (precision, C_MUJOCO))
     return f"{shown}: {ours}, C MuJoCo {theirs}"

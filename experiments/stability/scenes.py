@@ -84,14 +84,7 @@ class StabilityScene:
 
 
 def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData, point: Point) -> None:
-    """Set a model to a point of the grid, with all that MuJoCo derives from masses.
-
-    Args:
-        scene: that the model is of.
-        model: changed in place.
-        data: of it, overwritten.
-        point: of the grid.
-    """
+    """Set a scene's model to a point of the grid, in place, with all that MuJoCo derives from masses."""
     model.opt.timestep = point["timestep"]
     if point["stiffness"] > 0:
         frequency = np.sqrt(point["stiffness"])
@@ -99,8 +92,8 @@ def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData,
     else:
         solref = (point["time_constant"], point["damping_ratio"])
     solimp = (point["impedance_first"], point["impedance_last"], point["width"])
-    kinds = (("jnt", model.jnt_solref, model.jnt_solimp),) if scene.has_limits else ()
-    for _, references, impedances in (*kinds, ("geom", model.geom_solref, model.geom_solimp)):
+    kinds = ((model.jnt_solref, model.jnt_solimp),) if scene.has_limits else ()
+    for references, impedances in (*kinds, (model.geom_solref, model.geom_solimp)):
         references[:] = solref
         impedances[:, :3] = solimp
     model.geom_friction[:] = point["friction"] * np.array([1.0, 0.1 * RADIUS, 0.01 * RADIUS])
@@ -113,12 +106,7 @@ def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData,
 
 
 def effective(scene: StabilityScene, point: Point) -> tuple[float, float]:
-    """Give stiffness (1/s²) and damping (1/s) in effect.
-
-    Args:
-        scene: that the point is of.
-        point: of the grid.
-    """
+    """Give stiffness (1/s²) and damping (1/s) in effect."""
     if point["stiffness"] > 0:
         return point["stiffness"], 2 * point["damping_ratio"] * np.sqrt(point["stiffness"])
     constant = point["time_constant"]
@@ -137,6 +125,12 @@ def _mjcf(
 ) -> str:
     flags = f'autoreset="disable" energy="enable" {flags}'
     return _HEAD.format(name=name, gravity=-gravity, cone=cone, condim=condim, flags=flags) + body + _TAIL
+
+
+def _graded(count: int) -> Callable[[float], list[float]]:
+    """Masses of bodies in a row, each heavier than the one before by the same factor, the lightest of `MASS`."""
+    places = np.arange(count) / (count - 1)
+    return lambda ratio: list(MASS * ratio**places / (ratio**places).min())
 
 
 def _above(point: Point) -> float:
@@ -230,17 +224,12 @@ def _stack() -> StabilityScene:
         heights = above * np.arange(1, count + 1) if above < 0 else np.full(count, above)
         return heights, np.full(count, -point["speed"])
 
-    def masses(ratio: float) -> list[float]:
-        powers = ratio ** (np.arange(count) / (count - 1))
-        return list(MASS * powers / powers.min())
-
-    mjcf = _mjcf("stack", _PLANE + balls, gravity=GRAVITY)
     return StabilityScene(
         "stack",
-        mjcf,
+        _mjcf("stack", _PLANE + balls, gravity=GRAVITY),
         "stack",
         start,
-        masses,
+        _graded(count),
         (0.2, 0.3, 0.5, 1.0),
         crossing=tuple((i, i + 1) for i in range(count - 1)),
         spacing=2 * RADIUS,
@@ -285,9 +274,6 @@ def _chain() -> StabilityScene:
         last = 0.5 + point["depth"] * 0.1 if point["depth"] > 0 else 0.5 - FLIGHT * rate * point["timestep"]
         return np.array([0.1, 0.1, last]), np.array([0.0, 0.0, rate])
 
-    def masses(ratio: float) -> list[float]:
-        powers = ratio ** (np.arange(count) / (count - 1))
-        return list(MASS * powers / powers.min())
-
     mjcf = _mjcf("chain", inner, gravity=GRAVITY)
-    return StabilityScene("chain", mjcf, "chain", start, masses, (0.3, 0.5, 1.0), depth_unit=0.1, has_limits=True)
+    weights = (0.3, 0.5, 1.0)
+    return StabilityScene("chain", mjcf, "chain", start, _graded(count), weights, depth_unit=0.1, has_limits=True)

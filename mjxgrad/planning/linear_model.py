@@ -34,9 +34,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._static import is_known
 from mjxgrad.contact.parameters import ContactPair
+from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
-from mjxgrad.scene.contact_check import name_pairs
 
 _Samples = Float[Array, "N both"]
 _Errors = Float[Array, "n columns"]

@@ -17,7 +17,7 @@ from experiments.optimisation.methods import problem
 from experiments.optimisation.outcome import Difference, Outcome, Run
 from experiments.optimisation.report import findings, headline, tables, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.overview import overview
+from experiments.report import overview
 from experiments.theme import save
 
 FILES = ("push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis", "six_tasks")

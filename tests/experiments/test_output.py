@@ -88,6 +88,6 @@ def test_settings_survive_their_way_through_toml(tmp_path):
     assert text.startswith("# Is it so?\n# Expected: yes.\n")
 
 
-def test_rows_become_csv(tmp_path):
-    write_csv(tmp_path / "m.csv", [{"a": 1.5, "b": True}, {"a": -2.0, "b": False}])
-    assert (tmp_path / "m.csv").read_text().splitlines() == ["a,b", "1.5,True", "-2.0,False"]
+def test_rows_become_csv_with_what_one_lacks_left_empty(tmp_path):
+    write_csv(tmp_path / "m.csv", [{"a": 1.5, "b": True}, {"a": -2.0, "c": "x"}])
+    assert (tmp_path / "m.csv").read_text().splitlines() == ["a,b,c", "1.5,True,", "-2.0,,x"]

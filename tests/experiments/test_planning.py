@@ -64,19 +64,20 @@ def test_the_shortest_solved_way_is_shown_and_otherwise_the_nearest():
 
 def test_the_verdict_on_a_trajectory_says_who_arrives_and_who_does_not_move():
     found = outcome(TRAJECTORY, [attempt("analytic", 0.099), attempt("none", 0.0)])
-    assert verdict(found) == (
-        "With analytic models the rod reaches its goal up to 1.0 mm and 0.000 rad (3 s, compilation included). "
-        "With no smoothing the rod does not move at all (3 s, compilation included)."
+    assert (
+        verdict(found)
+        == "With analytic models the rod reaches its goal; with no smoothing the rod does not move at all."
     )
-    assert "With analytic models 1 of 2 iterations found no better step." in findings(found)
+    assert tables(found)[0].rows[0][3:7] == ["1.0 mm", "0.000 rad", "4", "1 of 2"]
 
 
 def test_the_verdict_on_trees_counts_the_seeds():
     found = [attempt("analytic", 0.1, seed=0, is_tree=True), attempt("analytic", 0.02, seed=1, is_tree=True)]
     lost = [attempt("none", x, seed=i, is_tree=True) for i, x in enumerate((0.0, 0.01))]
     said = verdict(outcome(TREE, found + lost))
-    assert "With analytic models 1 of 2 trees find a way, the shortest of 4 steps" in said
-    assert "With no smoothing none of 2 trees finds a way; in the best the rod ends 90.0 mm and 0.000 rad" in said
+    assert said == (
+        "With analytic models 1 of 2 trees find a way, the shortest of 4 steps; with no smoothing none of 2 trees finds a way."
+    )
     assert [row[2] for row in tables(outcome(TREE, found + lost))[0].rows] == ["yes", "no", "no", "no"]
 
 
@@ -114,13 +115,6 @@ def test_settings_that_cannot_be_are_a_sentence(override, sentence):
         load_runs("planar_push", [override])
 
 
-@pytest.mark.parametrize("name", ["planar_push", "planar_turn"])
-def test_the_files_there_are_can_be_read(name):
-    (run,) = load_runs(name, [])
-    assert run.question.endswith("?")
-    assert run.expected
-
-
 def _run(folder, settings):
     """Run without a video; return the verdict and the rows of the metrics."""
     (folder / "near.toml").write_text(f'# Is it pushed?\nexperiment = "planning"\nfinger = [0.0, -0.08]\n{settings}')
@@ -134,7 +128,7 @@ def test_a_rod_that_is_not_touched_is_pushed_on_smoothed_models_alone(tmp_path):
     settings = 'method = "trajectory"\ngoal = [0.0, 0.04, 0.0]\nhorizon = 8\nnum_iterations = 24\ntree.position_tolerance = 0.01'
     said, rows = _run(tmp_path, settings)
     assert [row["is_solved"] for row in rows] == ["True", "False"]
-    assert "With no smoothing the rod does not move at all" in said
+    assert "with no smoothing the rod does not move at all" in said
 
 
 @pytest.mark.slow

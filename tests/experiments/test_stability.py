@@ -5,16 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 import pytest
+import xarray as xr
 
 from experiments.config import load_runs
 from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import PLANES, Points, points
-from experiments.stability.limits import load
-from experiments.stability.outcome import C_MUJOCO, Behaviour, Outcome, SceneOutcome
+from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
 from experiments.stability.program import Steps, errors_of_solves
-from experiments.stability.reasons import UNEXPLAINED, reasons
 from experiments.stability.reference import simulate, unbalanced
-from experiments.stability.report import findings
+from experiments.stability.report import UNEXPLAINED, findings, load, reasons
 from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
 
 SCENES = {scene.name: scene for scene in catalogue()}
@@ -116,13 +115,13 @@ def test_a_solve_is_judged_by_the_forces_of_its_state_and_not_by_those_it_report
 
 
 def _outcome(scene, grid, ours, theirs, apart, derivative=Derivative.RIGHT):
-    def behaviour(motion):
-        none = np.zeros(len(grid), bool)
-        right = np.full(len(grid), derivative)
-        return Behaviour(np.array(motion), right, right, None, none, none, none, none, np.ones(len(grid)))
-
-    kinds = {C_MUJOCO: behaviour(theirs), "float64": behaviour(ours)}
-    return SceneOutcome(SCENES[scene], grid, kinds, {"float64": np.array(apart)})
+    found = {
+        "motion": [theirs, ours],
+        "derivative": [[derivative] * len(grid)] * 2,
+        "apart_from_c": [np.zeros(len(grid)), apart],
+    }
+    arrays = {key: (("simulator", "point"), np.array(values)) for key, values in found.items()}
+    return SceneOutcome(SCENES[scene], grid, xr.Dataset(arrays, {"simulator": [C_MUJOCO, "float64"]}))
 
 
 def test_only_what_is_worse_than_c_mujoco_needs_a_reason():
