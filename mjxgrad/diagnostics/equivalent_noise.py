@@ -19,12 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad.contact.law import impedance
 from mjxgrad.contact.parameters import contact_parameters
 from mjxgrad.dynamics import constraint
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import DenseRows
-from mjxgrad.dynamics.rows import Block, law
+from mjxgrad.dynamics.rows import law, one_sided
 from mjxgrad.dynamics.smoothing import Smoothing, noisy
 from mjxgrad.scene import Scene
 
@@ -142,30 +141,16 @@ def contact_profile(
     @jax.jit
     def profile(distance: Float[Array, " n"]) -> Float[Array, " n"]:
         parameters = contact_parameters(scene.model, scene.pairs[pair : pair + 1])
-
-        def repeat(x: Array) -> Array:
-            return jnp.broadcast_to(x, (len(distance), *x.shape[1:]))
-
-        residual, zero = distance - parameters.margin, jnp.zeros_like(distance)
-        block = Block(
-            map=DenseRows(jnp.ones((len(distance), 1), distance.dtype)),
-            residual=residual,
-            impedance=impedance(repeat(parameters.solimp), residual),
-            solimp=repeat(parameters.solimp),
-            inverse_weight=jnp.ones_like(distance),
-            solref=repeat(parameters.solref),
-            margin=repeat(parameters.margin),
-            friction_loss=zero,
-            is_active=residual < 0,
-            rows_each=1,
-            is_contact=True,
-        )
+        ones = jnp.ones_like(distance)
+        of_pair = (parameters.margin, parameters.solref, parameters.solimp)
+        block = one_sided(DenseRows(ones[:, None]), distance, ones, np.zeros(len(distance), int), *of_pair)
+        block = dataclasses.replace(block, is_contact=True)
         layout, row_noise = RowLayout(0, 0, len(distance)), None
         if smoothing is not None:
             block, row_noise = noisy(scene.model, block, jnp.ones(len(distance), bool), smoothing)
             layout = dataclasses.replace(layout, kernel=smoothing.noise)
         reference, weight = law(scene.model, jnp.zeros(1, distance.dtype), block)
-        rows = Rows(reference, weight, zero, (), row_noise)
+        rows = Rows(reference, weight, block.friction_loss, (), row_noise)
         return constraint.force(layout, rows, jnp.where(block.is_active, acceleration, 0.0) - reference)
 
     return profile

@@ -370,64 +370,60 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
     is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     for i, pair in enumerate(scene.pairs):
         kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
-        yield Spring(
-            kind="contact",
-            name=str(pair),
-            stiffness=float(stiffness[i]),
-            damping=float(damping[i]),
+        springiness = (stiffness[i], damping[i], solref[i], impedance[i], width[i])
+        has_edges = is_pyramidal and pair.condim > 1
+        yield _spring(
+            scene,
+            "contact",
+            str(pair),
+            *springiness,
             size=_thickness(scene, pair),
             num_rows=COLLISION_FUNCTIONS[kinds].ncon,
-            pyramid=float(friction[i]) if is_pyramidal and pair.condim > 1 else None,
-            **_given(scene, solref[i], impedance[i], width[i]),
+            pyramid=float(friction[i]) if has_edges else None,
         )
 
 
 def _others(scene: Scene) -> Iterator[Spring]:
-    """Joint limits, tendon limits and equalities that are switched on."""
-    model, c_model = scene.model, scene.mj_model
-    disabled = int(model.opt.disableflags)
-    flag = mujoco.mjtDisableBit
+    """Return joint limits, tendon limits and equalities that are switched on."""
+    m, c, flag, of = scene.model, scene.mj_model, mujoco.mjtDisableBit, mujoco.mjtObj
+    disabled = int(m.opt.disableflags)
     if disabled & flag.mjDSBL_CONSTRAINT:
         return
-    is_on = {
-        "joint limit": not disabled & flag.mjDSBL_LIMIT,
-        "tendon limit": not disabled & flag.mjDSBL_LIMIT,
-        "equality": not disabled & flag.mjDSBL_EQUALITY,
-    }
+    joints = (c.jnt_limited, m.jnt_solref, m.jnt_solimp, m.jnt_range)
+    tendons = (c.tendon_limited, m.tendon_solref_lim, m.tendon_solimp_lim, m.tendon_range)
     kinds = (
-        ("joint limit", c_model.jnt_limited, model.jnt_solref, model.jnt_solimp, model.jnt_range),
-        ("tendon limit", c_model.tendon_limited, model.tendon_solref_lim, model.tendon_solimp_lim, model.tendon_range),
-        ("equality", c_model.eq_active0, model.eq_solref, model.eq_solimp, None),
+        ("joint limit", flag.mjDSBL_LIMIT, of.mjOBJ_JOINT, *joints),
+        ("tendon limit", flag.mjDSBL_LIMIT, of.mjOBJ_TENDON, *tendons),
+        ("equality", flag.mjDSBL_EQUALITY, of.mjOBJ_EQUALITY, c.eq_active0, m.eq_solref, m.eq_solimp, None),
     )
-    objects = (mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_TENDON, mujoco.mjtObj.mjOBJ_EQUALITY)
-    for (kind, active, solref, solimp, ranges), which in zip(kinds, objects, strict=True):
-        chosen = np.flatnonzero(active) if is_on[kind] else np.zeros(0, int)
-        if not chosen.size:
+    for kind, off, which, active, solref, solimp, ranges in kinds:
+        chosen = np.flatnonzero(active)
+        if disabled & off or not chosen.size:
             continue
-        stiffness, damping = (np.asarray(x, float) for x in stiffness_damping(model, solref))
+        stiffness, damping = (np.asarray(x, float) for x in stiffness_damping(m, solref))
         for i in chosen:
-            name = mujoco.mj_id2name(c_model, which, i) or f"{kind} {i}"
+            name = mujoco.mj_id2name(c, which, i) or f"{kind} {i}"
             size = np.inf if ranges is None else float(np.ptp(np.asarray(ranges[i], float)))
             impedance = np.clip(np.asarray(solimp[i, :2], float), mujoco.mjMINIMP, mujoco.mjMAXIMP)
-            yield Spring(
-                kind=kind,
-                name=name,
-                stiffness=float(stiffness[i]),
-                damping=float(damping[i]),
-                size=size,
-                **_given(scene, np.asarray(solref[i], float), impedance, solimp[i, 2]),
-            )
+            springiness = (stiffness[i], damping[i], np.asarray(solref[i], float), impedance, solimp[i, 2])
+            yield _spring(scene, kind, name, *springiness, size=size)
 
 
-def _given(scene: Scene, solref, impedance, width) -> dict[str, Any]:
-    """What all kinds of springs are given alike."""
-    return {
-        "impedance": (float(impedance[0]), float(impedance[1])),
-        "width": max(float(width), mujoco.mjMINVAL),
-        "given": float(solref[0]) if solref[0] > 0 else None,
-        "timestep": float(scene.model.opt.timestep),
-        "integrator": mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
-    }
+def _spring(
+    scene: Scene, kind: str, name: str, stiffness: float, damping: float, solref, impedance, width, **rest: Any
+) -> Spring:
+    return Spring(
+        kind=kind,
+        name=name,
+        stiffness=float(stiffness),
+        damping=float(damping),
+        impedance=(float(impedance[0]), float(impedance[1])),
+        width=max(float(width), mujoco.mjMINVAL),
+        given=float(solref[0]) if solref[0] > 0 else None,
+        timestep=float(scene.model.opt.timestep),
+        integrator=mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
+        **rest,
+    )
 
 
 def _thickness(scene: Scene, pair: ContactPair) -> float:

@@ -320,22 +320,22 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     blocks: list[Block | None] = [None, None, None]
     if balls.size:
         dofs = model.jnt_dofadr[balls]
-        blocks[0] = _limit(*_ball_limit(model, data, balls), model.dof_invweight0[dofs], balls, *of_joints)
+        blocks[0] = one_sided(*_ball_limit(model, data, balls), model.dof_invweight0[dofs], balls, *of_joints)
     if joints.size:
         dofs = model.jnt_dofadr[joints]
         distance, sign = _nearer_end(data.qpos[model.jnt_qposadr[joints]], model.jnt_range[joints])
-        blocks[1] = _limit(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
+        blocks[1] = one_sided(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
     if tendons.size:
         distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])
         rows = DenseRows(sign[:, None] * data._impl.ten_J[tendons])
-        blocks[2] = _limit(rows, distance, model.tendon_invweight0[tendons], tendons, *of_tendons)
+        blocks[2] = one_sided(rows, distance, model.tendon_invweight0[tendons], tendons, *of_tendons)
     return blocks
 
 
-def _limit(
+def one_sided(
     map: RowMap, distance: _PerRow, inverse_weight: _PerRow, chosen: np.ndarray, margin: Any, solref: Any, solimp: Any
 ) -> Block:
-    """Return the rows of limits, one each; margin, solref and solimp are those of all, of which some are chosen."""
+    """Return rows that only push, one each; margin, solref and solimp are those of all, of which some are chosen."""
     margins, solimps = margin[chosen], solimp[chosen]
     residual = distance - margins
     return Block(
