@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,14 +67,8 @@ class Seconds:
             raise ValueError(f"num_runs must be at least 1, got {self.num_runs}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Affordable:
-    """What a budget buys.
-
-    Attributes:
-        num_samples: to ask an estimator for.
-        seconds: median time of one such estimate, NaN if it was not measured.
-    """
+class Affordable(NamedTuple):
+    """What a budget buys: samples to ask for, and the median time of one such estimate; NaN if it was not measured."""
 
     num_samples: int
     seconds: float

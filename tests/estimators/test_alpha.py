@@ -1,6 +1,5 @@
 """The α-order estimate: what it mixes, where it trusts derivatives, and what it says about it."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
