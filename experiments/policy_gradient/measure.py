@@ -53,9 +53,9 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     objective = objective.sized_for(params)
     plan = plan_by_noise(objective, num_samples, None)
     (parts,) = stream(objective, params, key, plan, functools.partial(both_parts, control_variate=True))
-    weights = weigh(Consistent(), parts, plan, np.zeros(params.size, int), 1)
-    reason = weights.reason._value[0]  # pyright: ignore[reportAttributeAccessIssue]
-    return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha[0], reason, parts.costs.mean)
+    weights = weigh(Consistent(), parts, plan)
+    reason = weights.reason._value  # pyright: ignore[reportAttributeAccessIssue]
+    return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha, reason, parts.costs.mean)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:

@@ -12,13 +12,9 @@ from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivat
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.diagnostics.statistics import (
-    VarianceInterval,
     bias_interval,
-    binomial_bound,
-    binomial_interval,
     mean_interval,
     root_mean_square_interval,
-    variance_interval,
 )
 
 __all__ = [
@@ -38,11 +34,8 @@ __all__ = [
     "Soundness",
     "StabilityReport",
     "UnsoundGradientError",
-    "VarianceInterval",
     "bias_interval",
     "bias_variance",
-    "binomial_bound",
-    "binomial_interval",
     "check_omissions",
     "check_soundness",
     "check_stability",
@@ -60,5 +53,4 @@ __all__ = [
     "root_mean_square_interval",
     "soundness",
     "unused",
-    "variance_interval",
 ]

@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,14 +67,8 @@ class Seconds:
             raise ValueError(f"num_runs must be at least 1, got {self.num_runs}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Affordable:
-    """What a budget buys.
-
-    Attributes:
-        num_samples: to ask an estimator for.
-        seconds: median time of one such estimate, NaN if it was not measured.
-    """
+class Affordable(NamedTuple):
+    """What a budget buys: samples to ask for, and the median time of one such estimate; NaN if it was not measured."""
 
     num_samples: int
     seconds: float
@@ -314,7 +308,7 @@ def affordable(
 def _within_rollouts(run: Callable[..., Any], count: int) -> int:
     def reported(num_samples: int) -> int:
         # All but the count is dead code, which is dropped before anything is compiled.
-        return int(run(num_samples, lambda estimate: estimate.num_rollouts))
+        return int(run(num_samples, True))
 
     num_samples, rollouts = _accepted(reported, count)
     while rollouts > count:
@@ -329,7 +323,7 @@ def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
         runs = []
         for _ in range(1 + budget.num_runs):
             start = time.perf_counter()
-            jax.block_until_ready(run(num_samples, lambda estimate: estimate))
+            jax.block_until_ready(run(num_samples, False))
             runs.append(time.perf_counter() - start)
         # The first run compiled.
         return statistics.median(runs[1:])
@@ -366,9 +360,10 @@ def _estimate(
     params: Array,
     key: PRNGKeyArray,
     num_samples: int,
-    pick: Callable[[GradientEstimate], Any],
-) -> Any:
-    return pick(estimator(objective, params, key, num_samples=num_samples))
+    is_counted: bool,
+) -> GradientEstimate | Int[Array, ""]:
+    estimate = estimator(objective, params, key, num_samples=num_samples)
+    return estimate.num_rollouts if is_counted else estimate
 
 
 def _accepted(measure: Callable[[int], Any], num_samples: int, context: str = "") -> tuple[int, Any]:

@@ -130,17 +130,6 @@ def root_mean_square_interval(
 def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float[np.ndarray, " 2"]:
     """Give the Clopper-Pearson interval of a probability, which covers at least as often as it says.
 
-    Args:
-        count: how often it happened.
-        total: how often it might have.
-        confidence: chance to cover the probability.
-
-    Returns:
-        Lower and upper end.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1, or `count` not between 0 and `total`.
-
     References:
         Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
         26, 1934.
@@ -149,19 +138,7 @@ def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float
 
 
 def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
-    """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %.
-
-    Args:
-        count: how often it happened.
-        total: how often it might have.
-        confidence: chance that the probability is below the bound.
-
-    Returns:
-        The bound.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1, or `count` not between 0 and `total`.
-    """
+    """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %."""
     return float(_binomial_test(count, total, "less").proportion_ci(checked(confidence)).high)
 
 
@@ -213,13 +190,7 @@ def bootstrap_variance_interval(
 
 
 class VarianceInterval(eqx.Module):
-    """A variance with its interval, and how that was found.
-
-    Attributes:
-        value: the trace of the covariance, with N − 1.
-        ends: lower and upper.
-        method: "chi_square" or "bootstrap".
-    """
+    """A variance, the trace of the covariance with N − 1, with the ends of its interval, and how that was found."""
 
     value: float
     ends: Float[np.ndarray, " 2"]
@@ -239,16 +210,7 @@ def variance_interval(
     is taken where there are at least 20 and a test of their kurtosis refuses the normal distribution in some coordinate
     (5 % over all of them).
 
-    Args:
-        samples: independent; those that are not finite are left out.
-        confidence: chance to cover the truth.
-        num_resamples: of the bootstrap.
-
-    Returns:
-        The variance, its interval and the method; NaN for fewer than two finite samples.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1.
+    Samples that are not finite are left out; fewer than two give NaN.
     """
     checked(confidence)
     samples = np.asarray(samples, float)

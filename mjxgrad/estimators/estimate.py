@@ -122,7 +122,7 @@ def assemble(
     diagnosis = Diagnosis.where(count >= 2, diagnosis, Diagnosis.too_few_finite)
     diagnosis = Diagnosis.where(has_baseline, diagnosis, Diagnosis.baseline_not_finite)
     alpha = jnp.asarray(alpha, value.dtype)
-    is_nothing = jnp.broadcast_to(exists & is_nothing_felt(plan, costs, num_felt), alpha.shape)
+    is_nothing = exists & is_nothing_felt(plan, costs, num_felt)
     value = jnp.where(exists, value, jnp.nan)
     squared_error = jnp.where(exists, jnp.maximum(squared_error, 0), jnp.nan)
     return GradientEstimate(
@@ -137,6 +137,6 @@ def assemble(
         num_gradient_rollouts=jnp.asarray(plan.num_rollouts if plan.with_gradient else 0),
         diagnosis=diagnosis,
         alpha=alpha,
-        reason=Reason.where(is_nothing, Reason.nothing_felt, reason),
+        reason=jax.tree.map(lambda x, y: jnp.where(is_nothing, x, y), Reason.nothing_felt, reason),
         bias_bound=jnp.asarray(bias_bound, value.dtype),
     )

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
@@ -60,9 +59,7 @@ def alpha_order(
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
     (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
-    weights = jax.tree.map(
-        lambda leaf: leaf[0], weigh(rule or Consistent(), parts, plan, np.zeros(vector.size, int), 1)
-    )
+    weights = weigh(rule or Consistent(), parts, plan)
     facts = {"alpha": weights.alpha, "reason": weights.reason, "bias_bound": weights.bias_bound}
     return _assembled(parts, plan, restore, jnp.full_like(vector, weights.alpha), **facts)
 
@@ -142,14 +139,13 @@ def per_step(
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
-    num_actions = int(np.prod(objective.noise_shape))
 
     def mixed_chunk(samples: Samples) -> tuple[Summary, ...]:
         chunk = Group.of(samples)
         parts, terms_by_noise, has_cost = parts_and_terms(
             samples, chunk, control_variate=control_variate, take=lambda by_noise: by_noise
         )
-        weights = weigh(rule or Consistent(), parts, plan, np.arange(num_actions), num_actions)
+        weights = weigh(rule or Consistent(), parts, plan, by_coordinate=True)
         alpha = weights.alpha
         mixed = alpha * chunk.derivatives + jnp.where(chunk.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
         values = Moments.of(chunk.by_unit(chunk.pull_back(samples, mixed)), has_cost)
@@ -206,26 +202,25 @@ class Parts(Summary):
 
         return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
 
-    def evidence(self, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Evidence:
-        """Give what a rule may look at, with an axis of blocks; `blocks` has the number of that of each coordinate."""
-
-        def by_block(values: Float[Array, " dim"]) -> Float[Array, " blocks"]:
-            return jax.ops.segment_sum(values, blocks, num_segments=num_blocks)
+    def evidence(self, *, by_coordinate: bool) -> Evidence:
+        """Give what a rule may look at, of all coordinates as one block or of each as one."""
+        pool = jnp.asarray if by_coordinate else jnp.sum
+        dim = pool(jnp.ones_like(self.first.offset))
 
         def in_all(value: Array) -> Array:
-            return jnp.broadcast_to(value, num_blocks)
+            return jnp.broadcast_to(value, dim.shape)
 
         missed, explained = self.secants.missed_variance(), self.linear_variance / jnp.maximum(self.num_costs, 1)
         bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
         return Evidence(
             count=in_all(self.first.count),
-            dim=by_block(jnp.ones_like(self.first.offset)),
-            first_norm=jnp.sqrt(by_block(self.first.mean**2)),
-            zeroth_norm=jnp.sqrt(by_block(self.unbiased.mean**2)),
-            difference_norm=jnp.sqrt(by_block(self.difference.mean**2)),
-            first_variance=by_block(self.first.variance()),
-            zeroth_variance=by_block(self.unbiased.variance()),
-            difference_variance=by_block(self.difference.variance()),
+            dim=dim,
+            first_norm=jnp.sqrt(pool(self.first.mean**2)),
+            zeroth_norm=jnp.sqrt(pool(self.unbiased.mean**2)),
+            difference_norm=jnp.sqrt(pool(self.difference.mean**2)),
+            first_variance=pool(self.first.variance()),
+            zeroth_variance=pool(self.unbiased.variance()),
+            difference_variance=pool(self.difference.variance()),
             inconsistency=in_all(self.secants.inconsistency()),
             relative_bias_bound=in_all(jnp.where(missed == 0, 0, bound)),
             cost_variance=in_all(self.costs.variance()),
@@ -303,11 +298,8 @@ def parts_and_terms(
     return summary, terms_by_noise, has_cost
 
 
-def weigh(rule: Rule, parts: Parts, plan: Plan, blocks: Int[np.ndarray, " dim"], num_blocks: int) -> Weights:
-    """Apply a rule to each block, where it has derivatives to judge that say something.
-
-    `blocks` has the number of the block of each coordinate; the weights have an axis of blocks.
-    """
+def weigh(rule: Rule, parts: Parts, plan: Plan, *, by_coordinate: bool = False) -> Weights:
+    """Apply a rule to all coordinates or to each, where it has derivatives to judge that say something."""
     is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
 
     def one_block(evidence: Evidence) -> Weights:
@@ -316,7 +308,8 @@ def weigh(rule: Rule, parts: Parts, plan: Plan, blocks: Int[np.ndarray, " dim"],
         reason = Reason.where(has_first, weights.reason, Reason.not_finite)
         return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))
 
-    return jax.vmap(one_block)(parts.evidence(blocks, num_blocks))
+    evidence = parts.evidence(by_coordinate=by_coordinate)
+    return jax.vmap(one_block)(evidence) if by_coordinate else one_block(evidence)
 
 
 def _assembled(

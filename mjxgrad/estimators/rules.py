@@ -1,7 +1,7 @@
 r"""How to weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
 A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in `alpha_order(...,
-rule=)`, which maps it over blocks of coordinates if there are several. $\delta$ is the chance to *fail* everywhere.
+rule=)`, and in `per_step`, which maps it over steps and actions. $\delta$ is the chance to *fail* everywhere.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,6 @@ from mjxgrad.estimators.estimate import Reason
 
 class Evidence(eqx.Module):
     """What a rule may look at: norms and variances of one block of coordinates, and what concerns all of them.
-
-    A rule sees numbers; the axis of blocks is mapped over.
 
     Attributes:
         count: samples (pairs of them where starts are random) behind the means.

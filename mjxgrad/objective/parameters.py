@@ -93,7 +93,9 @@ def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Arra
     """
     if eqx.is_array_like(params):
         return jnp.asarray(params), None
-    arrays, others = eqx.partition(params, eqx.is_inexact_array_like)
+    # A tracer's `__jax_array__` is None, which `is_inexact_array_like` calls (jax 0.10.2, equinox 0.13.8).
+    is_parameter = lambda x: eqx.is_inexact_array(x) if eqx.is_array(x) else eqx.is_inexact_array_like(x)  # noqa: E731
+    arrays, others = eqx.partition(params, is_parameter)
     vector, unravel = ravel_pytree(arrays)
     if vector.size == 0:
         raise ValueError(f"params must have floating-point arrays, got none in {params}; write 1.0 in place of 1")

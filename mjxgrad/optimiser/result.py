@@ -56,7 +56,7 @@ class Record(eqx.Module):
     def of_estimate(
         cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
     ) -> "Record":
-        """Summarise a step along an estimate; of blocks the mean α, and the reason of the least."""
+        """Summarise a step along an estimate; of several α the mean, and the reason of the least."""
         dtype = estimate.value.dtype
         alpha = jnp.ravel(estimate.alpha)
         reason = jax.tree.map(
@@ -120,8 +120,8 @@ class History(eqx.Module):
         noise_free_cost: what `evaluate` gave for the parameters before the step, NaN where it was not due.
         gradient_norm: norm of the estimate; NaN where a method has none.
         gradient_error: norm of its standard error.
-        alpha: weight of the first-order part, the mean over blocks.
-        reason: why, for the block with the least weight.
+        alpha: weight of the first-order part, the mean where there are several.
+        reason: why, for the least of them.
         bias_bound: on the norm of the bias; NaN where nothing is known.
         scale: of the annealing; 1 without any.
         step_norm: norm of the change of the parameters.

@@ -275,8 +275,8 @@ def _loop(
         # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
         if options.path is not None and saved.seconds.size > on_disk:
             checkpoint.save(options.path, saved, fingerprint)
-    stopped = saved.carry.stopped
-    return saved, Stopped.where((stopped == Stopped.running) & is_late, Stopped.max_seconds, stopped)
+    is_cut = (saved.carry.stopped == Stopped.running) & is_late
+    return saved, jax.tree.map(lambda x, y: jnp.where(is_cut, x, y), Stopped.max_seconds, saved.carry.stopped)
 
 
 class _Program:

@@ -9,17 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.diagnostics import (
-    Rollouts,
-    Seconds,
-    bias_interval,
-    binomial_bound,
-    binomial_interval,
-    compare,
-    root_mean_square_interval,
-    variance_interval,
-)
+from mjxgrad.diagnostics import Rollouts, Seconds, bias_interval, compare, root_mean_square_interval
 from mjxgrad.diagnostics.comparison import affordable
+from mjxgrad.diagnostics.statistics import binomial_bound, binomial_interval, variance_interval
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
 from mjxgrad.tasks import textbook

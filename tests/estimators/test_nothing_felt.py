@@ -30,24 +30,23 @@ def dead_zone(x):
     return 1e6 + jnp.maximum(jnp.abs(x) - 1, 0.0).sum()
 
 
-def reasons(estimator, function, points, stddev=0.1, **settings):
-    """The reason at each of the points, in one compiled and batched program with chunks."""
+def feels_nothing(estimator, function, points, stddev=0.1):
+    """What is said at each of the points, in one compiled and batched program with chunks; and the estimates."""
 
     def one(point):
-        settings_ = {"num_samples": 16, "chunk_size": 6} | settings
-        return estimator(mg.parameter_noise(function, stddev), point, jax.random.key(3), **settings_)
+        objective = mg.parameter_noise(function, stddev)
+        return estimator(objective, point, jax.random.key(3), num_samples=16, chunk_size=6)
 
     found = jax.jit(jax.vmap(one))(points)
-    return [Reason[item] for item in np.ravel(found.reason)], found
+    return np.asarray(found.reason == Reason.nothing_felt), found
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_dead_zone_is_named_and_its_edge_is_not(name):
     """From 0.9 the noise of 0.1 takes one sample in six over the edge."""
-    found, estimate = reasons(ESTIMATORS[name], dead_zone, jnp.stack([NOWHERE_NEAR, NEAR]))
-    half = len(found) // 2
-    assert set(found[:half]) == {Reason[Reason.nothing_felt]}
-    assert Reason[Reason.nothing_felt] not in found[half:]
+    said, estimate = feels_nothing(ESTIMATORS[name], dead_zone, jnp.stack([NOWHERE_NEAR, NEAR]))
+    assert said[0].all()
+    assert not said[1].any()
     np.testing.assert_allclose(estimate.value[0], 0, atol=1e-8)
     assert np.all(np.asarray(estimate.alpha)[0] == (1 if name == "first_order" else 0))
 
@@ -55,12 +54,10 @@ def test_a_dead_zone_is_named_and_its_edge_is_not(name):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_an_optimum_is_felt(name):
     """Costs differ under noise, be it small, and so do derivatives; also where all costs round to the same number."""
-    for height, stddev in ((0.0, 0.1), (0.0, 1e-6)):
-        found, _ = reasons(ESTIMATORS[name], lambda x, h=height: h + (x**2).sum(), jnp.zeros((1, 2)), stddev)
-        assert Reason[Reason.nothing_felt] not in found
+    for stddev in (0.1, 1e-6):
+        assert not feels_nothing(ESTIMATORS[name], lambda x: (x**2).sum(), jnp.zeros((1, 2)), stddev)[0].any()
     if name in ("first_order", "alpha_order", "per_step", "control_variate"):
-        found, _ = reasons(ESTIMATORS[name], lambda x: 1e9 + (x**2).sum(), jnp.zeros((1, 2)), 1e-5)
-        assert Reason[Reason.nothing_felt] not in found
+        assert not feels_nothing(ESTIMATORS[name], lambda x: 1e9 + (x**2).sum(), jnp.zeros((1, 2)), 1e-5)[0].any()
 
 
 def test_noise_that_is_zero_is_no_evidence():
@@ -70,21 +67,20 @@ def test_noise_that_is_zero_is_no_evidence():
         objective = mg.parameter_noise(lambda x: (x**2).sum(), stddev)
         return estimators.first_order(objective, jnp.zeros(2), jax.random.key(0), num_samples=4).reason
 
-    found = jax.vmap(one)(jnp.array([0.0, 0.1]))
-    assert not np.any(found == Reason.nothing_felt)
+    assert not np.any(jax.vmap(one)(jnp.array([0.0, 0.1])) == Reason.nothing_felt)
 
 
 def test_a_step_that_some_samples_meet_is_felt(key):
     """Its derivative is zero everywhere; the costs tell."""
     estimate = estimators.first_order(mg.parameter_noise(textbook.step, 0.1), jnp.zeros(1), key, num_samples=16)
-    assert Reason[estimate.reason] == Reason[Reason.fixed]
+    assert estimate.reason == Reason.fixed
 
 
 def test_samples_that_are_not_finite_are_felt(key):
     cost = mg.parameter_noise(lambda x: jnp.where(x[0] > 0, jnp.nan, 3.0), 0.1)
     estimate = estimators.alpha_order(cost, jnp.zeros(1), key, num_samples=16)
     assert 2 < estimate.num_finite < 16
-    assert Reason[estimate.reason] != Reason[Reason.nothing_felt]
+    assert estimate.reason != Reason.nothing_felt
 
 
 class Untouched(textbook.RandomStart):
@@ -101,4 +97,4 @@ def test_random_starts_are_compared_with_themselves(key, name):
     for task, is_nothing in ((Untouched(), True), (textbook.RandomStart(), False)):
         estimate = run(mg.open_loop(task, 0.1), controls, key)
         assert estimate.objective_standard_error > 0
-        assert (Reason[estimate.reason] == Reason[Reason.nothing_felt]) == is_nothing
+        assert bool(estimate.reason == Reason.nothing_felt) == is_nothing

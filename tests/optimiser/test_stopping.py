@@ -35,6 +35,11 @@ def test_a_budget_of_seconds_is_looked_at_between_segments(key):
     assert result.num_steps == 8
 
 
+def test_many_seeds_share_the_budget_of_seconds(key):
+    result = run(jax.random.split(key, 2), max_seconds=1e-9)
+    assert list(result.stopped == mg.Stopped.max_seconds) == [True, True]
+
+
 def test_a_log_is_told_the_last_step_of_every_segment(key):
     told = []
     result = run(key, log=lambda step, metrics: told.append((step, metrics)))
