@@ -50,7 +50,7 @@ def derivative(outcome: Outcome):
         f"Derivative of the height after {settings.duration:g} s with respect to the start height, mean over "
         f"{settings.num_phases} start heights; bars are the standard deviation over them, the phases of the time step. The "
         "truth is less the restitution, by quadrature of the contact's own equation. Finite differences span what the ball "
-        "flies in one step; far shorter ones give the discrete gradient. The axis is linear between −0.1 and 0.1."
+        "flies in one step. The axis is linear between −0.1 and 0.1."
     )
     return figure, "Derivative against time step", caption
 

@@ -97,15 +97,15 @@ def _crossing(outcome: Outcome) -> str | None:
     ahead = (zeroth.rmse_high < first.rmse_low).values
     behind = (zeroth.rmse_low > first.rmse_high).values
     name, count = stiffness_name(outcome), outcome.settings.samples_at_stiffness
-    if not ahead.any() or not behind.any():
-        winner = "zeroth" if ahead.any() else "first" if behind.any() else None
-        return winner and f"With {count} rollouts {winner} order is as close or closer at every {name} of the sweep."
-    if x[ahead].min() > x[behind].max():
+    if ahead.any() and behind.any() and x[ahead].min() > x[behind].max():
         return (
             f"With {count} rollouts first order is closer up to {name} = {power(x[behind].max())}, zeroth order from "
             f"{power(x[ahead].min())} on."
         )
-    return f"With {count} rollouts zeroth order is closer at {ahead.sum()} of {len(x)} values of {name}."
+    return (
+        f"With {count} rollouts zeroth order is closer at {ahead.sum()} and first order at {behind.sum()} of {len(x)} values of "
+        f"{name}."
+    )
 
 
 def _unseen(outcome: Outcome) -> str:
