@@ -80,7 +80,7 @@ def _bias(outcome: Outcome) -> str:
         return "No estimator shows a bias."
     share, parts = (outcome.by_samples.bias / abs(outcome.gradient)).where(biased), []
     for label in biased.estimator.values[biased.any("setting")]:
-        worst = int(abs(share.sel(estimator=label)).argmax())
+        worst = int(np.nanargmax(abs(share.sel(estimator=label).values)))
         size = f"{share.sel(estimator=label).values[worst]:+.2g}".replace("-", "−")
         parts.append(f"{label} (by {size} of the gradient with {outcome.settings.num_samples[worst]} rollouts)")
     others = "" if len(parts) == biased.estimator.size else "; the others show no bias"
