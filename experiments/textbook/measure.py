@@ -119,7 +119,7 @@ def _estimator(settings: EstimatorSettings) -> functools.partial:
     names = [name for name in library.__all__ if name[0].islower() and name not in others]
     if settings.name not in names:
         raise ExperimentError(f'there is no estimator "{settings.name}"; {suggest(settings.name, names)}')
-    options = settings.options
+    options = settings.model_dump(exclude={"name"}, exclude_none=True)
     if settings.rule is not None:
         options["rule"] = _RULES[settings.rule]()
     return functools.partial(getattr(library, settings.name), **options)
