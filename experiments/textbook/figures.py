@@ -80,20 +80,16 @@ def samples(outcome: Outcome):
 
 
 def stiffness(outcome: Outcome):
-    """Root-mean-square error and variance against stiffness."""
+    """Root-mean-square error against stiffness."""
     assert outcome.by_stiffness is not None
-    figure, axes = subplots(1, 2, height=4.2)
-    x, count = np.asarray(outcome.settings.stiffness), outcome.settings.samples_at_stiffness
-    left, right = axes[0]
-    _errors(left, x, outcome.by_stiffness)
-    _marks(right, x, outcome.by_stiffness, "variance", count, ls=(0, (1, 2)))
-    right.set(title="Variance, per rollout", yscale="log")
-    for axis in axes[0]:
-        axis.set_xlabel(stiffness_name(outcome))
-    theme.legend_below(figure, left, 4)
+    figure, axes = subplots(1, 1, height=4.2)
+    axis, settings = axes[0, 0], outcome.settings
+    _errors(axis, np.asarray(settings.stiffness), outcome.by_stiffness)
+    axis.set_xlabel(stiffness_name(outcome))
+    theme.legend_below(figure, axis, 4)
     caption = (
-        f"{_repeats(outcome)}, {count} rollouts each. Left, distance to the true gradient; thin lines are closed forms. Right, "
-        "variance of the estimate times rollouts. An estimate that never varies, because all its samples miss, has no mark there."
+        f"{_repeats(outcome)}, {settings.samples_at_stiffness} rollouts each: distance to the true gradient. Thin lines are "
+        "closed forms, dotted ones join marks that have none."
     )
     return figure, "Error against stiffness", caption
 
