@@ -43,8 +43,9 @@ def tables(outcome: Outcome) -> list[Table]:
     caption = (
         f"Gradients in m²/rad with half the width of their {settings.confidence:.0%} intervals, from {settings.num_samples} "
         "rollouts each; † marks means of first order that surely have the wrong sign. A bias in bold differs from zero beyond "
-        "chance over the whole table. The ratio is the variance of a sample of first order over that of zeroth order. The last "
-        f"column is the estimate with the clearly smaller expected error at {settings.rollouts_per_gradient} rollouts per gradient."
+        "chance over the whole table. The ratio is the variance of a sample of first order over that of zeroth order. The "
+        "last column is the estimate with the clearly smaller expected error at "
+        f"{settings.rollouts_per_gradient} rollouts per gradient."
     )
     return [Table(columns, rows, caption, frozenset(emphasised))]
 
