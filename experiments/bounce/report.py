@@ -41,6 +41,8 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say what no table shows: the discrete gradient by how contact sets in, differences, and how well the truth is known."""
     grid, sentences = outcome.grid, []
+    if not grid.judged.any():
+        return []
     slope, discrete = abs(grid.slope.sel(arm=DISCRETE)), grid["mean"].sel(arm=DISCRETE)
     jumps = (abs(discrete) / slope).where(grid.judged & (grid.impedance_first > 0))
     if jumps.notnull().any():
