@@ -79,9 +79,9 @@ def legend_below(figure: Picture, axis: Axes, columns: int) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), fontsize=8.5)
 
 
-def plain(axis: Axis, scale: float = 1.0, unit: str = "") -> None:
+def plain(axis: Axis) -> None:
     """Write the numbers of a logarithmic axis without powers of ten."""
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{scale * value:g}{unit}".replace("-", "−")))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
 
 
 def errorbar(axis: Axes, x: np.ndarray, value: np.ndarray, ends: np.ndarray, **look: Any) -> None:

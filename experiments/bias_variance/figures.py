@@ -95,8 +95,8 @@ def bias_variance(outcome: Outcome):
         above.plot(chance.stiffness, chance.bias, "o", ms=5, mfc="white", mec=FIRST, zorder=3)
         above.set_yscale("symlog", linthresh=threshold)
         above.set_ylim(-2 * extreme, 2 * extreme)
-        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=threshold))
-        above.yaxis.get_major_locator().set_params(numticks=7)
+        # Labels nearer to zero would cover its own.
+        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
         _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
         _bars(below, one, "first_order_variance", FIRST, "o", "first order")
         below.set_yscale("log")

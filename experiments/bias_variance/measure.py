@@ -110,7 +110,8 @@ def wall_contact(
     # MuJoCo reads an impedance of 0 as its smallest, and the scene would warn of it.
     impedance = np.clip(impedance, mujoco.mjMINIMP, mujoco.mjMAXIMP)
     rows = [(value, damping_ratio, impedance, width) for value in stiffness] + [_DEFAULT] * with_default
-    return mg.Softness(*map(np.array, zip(*rows, strict=True)), pairs=WALL_CONTACT)
+    stiffness, damping, impedance, width = (np.array(column) for column in zip(*rows, strict=True))
+    return mg.Softness(stiffness, damping, impedance, width, pairs=WALL_CONTACT)
 
 
 # Stiffness by row, what is swept with a leading axis of rows, and from one of these to the cost under noise.

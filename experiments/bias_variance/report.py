@@ -16,14 +16,6 @@ def verdict(outcome: Outcome) -> str:
     return " ".join([choice, _bias(outcome), *_default(outcome)])
 
 
-def findings(outcome: Outcome) -> list[str]:
-    """Say where first order points the wrong way."""
-    wrong = outcome.table.has_wrong_sign
-    where = _angles(wrong.angle[wrong.any("stiffness")]) if wrong.any() else ""
-    count = f"{int(wrong.sum())} of {wrong.size} cases"
-    return [f"The first-order estimate surely points the wrong way in {count}, {where}."] if where else []
-
-
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate both estimates, the reference and which estimate to use."""
     table, rows, emphasised = outcome.table, [], set()
@@ -31,12 +23,14 @@ def tables(outcome: Outcome) -> list[Table]:
         one = table.isel(stiffness=i, angle=j)
         if one.is_biased:
             emphasised.add((len(rows), 5))
+        gradients = [_with_half_width(one, name) for name in ("first_order", "zeroth_order", "reference", "bias")]
         row = f"default ({power(float(one.stiffness))})" if one.is_default else power(float(one.stiffness))
         rows.append(
             [
                 row if j == 0 else "",
                 f"{float(one.angle):g}",
-                *(_with_half_width(one, name) for name in ("first_order", "zeroth_order", "reference", "bias")),
+                f"{gradients[0]}{' †' if one.has_wrong_sign else ''}",
+                *gradients[1:],
                 quantity(float(one.first_order_variance / one.zeroth_order_variance)),
                 "first" if one.first_wins else "zeroth" if one.zeroth_wins else "either",
             ]
@@ -48,9 +42,10 @@ def tables(outcome: Outcome) -> list[Table]:
     settings = outcome.settings
     caption = (
         f"Gradients in m²/rad with half the width of their {settings.confidence:.0%} intervals, from {settings.num_samples} "
-        "rollouts each. A bias in bold differs from zero beyond chance over the whole table. The ratio is the variance of a "
-        "sample of first order over that of zeroth order. The last column is the estimate with the clearly smaller expected "
-        f"error at {settings.rollouts_per_gradient} rollouts per gradient."
+        "rollouts each; † marks means of first order that surely have the wrong sign. A bias in bold differs from zero beyond "
+        "chance over the whole table. The ratio is the variance of a sample of first order over that of zeroth order. The "
+        "last column is the estimate with the clearly smaller expected error at "
+        f"{settings.rollouts_per_gradient} rollouts per gradient."
     )
     return [Table(columns, rows, caption, frozenset(emphasised))]
 

@@ -8,7 +8,8 @@ equal mass, exchange what is along the line of centres: the collision is elastic
 import functools
 
 import numpy as np
-from scipy.optimize import brentq, minimize
+from numpy.polynomial import Polynomial
+from scipy.optimize import minimize
 
 DRIVEN, KNOCKED = np.array([-2.0, -2.0]), np.array([-1.0, -1.0])
 CONTACT = 0.4  # m, between the centres
@@ -37,19 +38,13 @@ def cost(forces: np.ndarray) -> float:
     position, velocity = DRIVEN.copy(), np.zeros(2)
     end = KNOCKED
     for i, force in enumerate(forces):
-
-        def distance(t, p=position, v=velocity, a=force):
-            return float(np.linalg.norm(p + t * v + t**2 / 2 * a - KNOCKED)) - CONTACT
-
-        times = np.linspace(0, piece, 200)
-        inside = np.flatnonzero([distance(t) < 0 for t in times])
-        if inside.size:
-            bracket = times[inside[0] - 1], times[inside[0]]
-            time = float(brentq(distance, *bracket)) if inside[0] else 0.0  # pyright: ignore[reportArgumentType]
-            normal = KNOCKED - (position + time * velocity + time**2 / 2 * force)
-            normal /= np.linalg.norm(normal)
-            speed = (velocity + time * force) @ normal
-            end = KNOCKED + (1 - i * piece - time) * speed * normal
+        way = [Polynomial(along) for along in zip(position - KNOCKED, velocity, force / 2, strict=True)]
+        roots = (way[0] ** 2 + way[1] ** 2 - CONTACT**2).roots()
+        times = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real >= 0) & (roots.real < piece)]
+        if times.size:
+            time = times.min()
+            normal = -np.array([along(time) for along in way]) / CONTACT
+            end = KNOCKED + (1 - i * piece - time) * ((velocity + time * force) @ normal) * normal
             break
         position, velocity = position + piece * velocity + piece**2 / 2 * force, velocity + piece * force
     return float(end @ end + EFFORT * piece * np.sum(forces**2))

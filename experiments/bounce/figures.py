@@ -21,8 +21,8 @@ def derivative(outcome: Outcome):
     settings, grid = outcome.settings, outcome.grid
     # MuJoCo's own time constant and impedance, or what comes nearest.
     at = {
-        "time_constant": int(abs(grid.time_constant - 0.02).argmin()),
-        "impedance": int((abs(grid.impedance_first - 0.9) + abs(grid.impedance_last - 0.95)).argmin()),
+        "time_constant": int(np.argmin(abs(grid.time_constant.values - 0.02))),
+        "impedance": int(np.argmin((abs(grid.impedance_first - 0.9) + abs(grid.impedance_last - 0.95)).values)),
     }
     shown = grid.isel(at).isel(damping_ratio=slice(None, None, -(-len(settings.damping_ratios) // 5)))
     figure, axes = subplots(1, shown.damping_ratio.size, height=3.6, sharey=True)
@@ -50,7 +50,7 @@ def derivative(outcome: Outcome):
         f"Derivative of the height after {settings.duration:g} s with respect to the start height, mean over "
         f"{settings.num_phases} start heights; bars are the standard deviation over them, the phases of the time step. The "
         "truth is less the restitution, by quadrature of the contact's own equation. Finite differences span what the ball "
-        "flies in one step; far shorter ones give the discrete gradient. The axis is linear between −0.1 and 0.1."
+        "flies in one step. The axis is linear between −0.1 and 0.1."
     )
     return figure, "Derivative against time step", caption
 

@@ -69,12 +69,14 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     differences = compare_to_slope(starts, heights[list(ARMS).index(DISCRETE)], [wide], ("wide",))
     with workspace.stage("quadrature", "steps", 1):
         truths = np.array([_truth(*cell) for cell in cells]).reshape(*shape, 3)
-    return Outcome(settings, _grid(settings, found, differences, truths))
+    return Outcome(settings, grid_of(settings, found, differences, truths))
 
 
-def _grid(
+def grid_of(
     settings: Settings, found: list[SlopeComparison], differences: SlopeComparison, truths: np.ndarray
 ) -> xr.Dataset:
+    """Put together what was found of each arm, what differences give, and truth, closed form and duration of each contact."""
+
     def by_arm(values: Iterable[np.ndarray]) -> tuple[tuple[str, ...], np.ndarray]:
         return ("arm", *_DIMS), np.stack([value.reshape(found[0].slope.shape) for value in values])
 

@@ -16,16 +16,8 @@ from experiments.workspace import Workspace
 from mjxgrad.diagnostics.equivalent_noise import EquivalentNoise, contact_profile, probe
 from mjxgrad.dynamics.kernels import KERNELS
 
-# A ball on a slide joint over a plane, without gravity, driven by a force.
-_SCENE = """<mujoco model="ball"><option timestep="{timestep}" gravity="0 0 0" tolerance="1e-12"/>
-<default><geom condim="1" solref="{time_constant} 1" solimp="{first} {last} .002" margin="{margin}"/></default><worldbody>
-<geom type="plane" size="1 1 .1"/><body pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
-</worldbody><actuator><motor joint="z"/></actuator></mujoco>"""
-
 # Half width of differences by velocity and force (m/s, N), so little that it smooths nothing.
 _LITTLE = 1e-3
-
-
 # Derivatives of the velocity after a step, and what they are by: two entries of A and the one of B.
 _ENTRIES = ("velocity by height (1/s)", "velocity by velocity", "velocity by force (1/N)")
 WAYS = ("smoothed solver", "mean of derivatives", "zeroth order")
@@ -65,14 +57,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             linear.append([_linear(scene, settings, name, velocity, step_key) for velocity in velocities])
             advance_to(i + 1)
     names = ("height", "slope", "sampled", "sampled_error", "sampled_slope", "sampled_slope_error")
-    columns = {
-        name: (("kernel", "time"), np.stack(each)) for name, each in zip(names, zip(*motions, strict=True), strict=True)
-    }
-    hard, hard_slope = _smoothed_motion(scene, settings, None)
-    motion = xr.Dataset(
-        columns | {"hard": ("time", hard), "hard_slope": ("time", hard_slope)},
-        coords={"kernel": list(settings.kernels), "time": settings.timestep * np.arange(settings.horizon + 1)},
-    )
+    time = settings.timestep * np.arange(settings.horizon + 1)
+    coords = {"kernel": list(settings.kernels), "name": list(names), "time": time}
+    motion = xr.DataArray(np.array(motions), coords).to_dataset("name")
+    motion["hard"], motion["hard_slope"] = (("time", each) for each in _smoothed_motion(scene, settings, None))
     value, error = np.moveaxis(np.array(linear), 2, 0)
     dims = {"kernel": list(settings.kernels), "velocity": list(velocities), "entry": list(_ENTRIES), "way": list(WAYS)}
     table = xr.Dataset({"value": (list(dims), value), "error": (list(dims), error)}, coords=dims)
@@ -81,10 +69,14 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 
 def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -> mg.Scene:
-    text = _SCENE.format(
-        timestep=settings.timestep, time_constant=settings.time_constant, first=first, last=last, margin=margin
-    )
-    return mg.load_scene(text)
+    """Give a ball on a slide joint over a plane, without gravity, driven by a force."""
+    contact = f'condim="1" solref="{settings.time_constant} 1" solimp="{first} {last} .002" margin="{margin}"'
+    return mg.load_scene(f"""
+        <mujoco model="ball"><option timestep="{settings.timestep}" gravity="0 0 0" tolerance="1e-12"/>
+        <default><geom {contact}/></default>
+        <worldbody><geom type="plane" size="1 1 .1"/>
+        <body pos="0 0 .1"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="z"/></actuator></mujoco>""")
 
 
 def _profiles(settings: Settings) -> tuple[xr.DataArray, dict[str, EquivalentNoise]]:
@@ -131,12 +123,9 @@ def _heights(scene, smoothing, start, speed, noise):
 
 
 def _smoothed_motion(scene, settings: Settings, smoothing) -> tuple[np.ndarray, np.ndarray]:
-    noise = jnp.zeros(settings.horizon)
-
-    def heights(start: Float[Array, ""]) -> Float[Array, " steps"]:
-        return _heights(scene, smoothing, start, jnp.array(settings.speed), noise)
-
-    height, slope = jax.jvp(heights, (jnp.array(settings.start),), (jnp.array(1.0),))
+    speed, noise = jnp.array(settings.speed), jnp.zeros(settings.horizon)
+    start, one = jnp.array(settings.start), jnp.array(1.0)
+    height, slope = jax.jvp(lambda start: _heights(scene, smoothing, start, speed, noise), (start,), (one,))
     return np.asarray(height), np.asarray(slope)
 
 

@@ -21,6 +21,8 @@ from mjxgrad.tasks.rolling_pin import STIFFNESS, RollingPin, rolling_pin
 # A way to see the bed, as numbers alone, so that several are one batch of one program: `proximity`, weight of the distance in
 # the cost; `extra` radius of the pin, `margin` and `length` of the kernel at first (m); `stddev` of the noise on the controls.
 Variant = dict[str, Float[Array, "..."]]
+# Mode of the kernel (None has none), estimator, rollouts per step, and by label the variants that share these.
+_Program = tuple[str | None, Callable, int, dict[str, Variant]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +74,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     programs, descents = _programs(settings), []
     with workspace.stage("descent", "programs", len(programs)) as advance_to:
         for done, program in enumerate(programs):
-            descents += _descend(task, *program, settings, jax.random.fold_in(key, done))
+            descents += _descend(task, program, settings, jax.random.fold_in(key, done))
             advance_to(done + 1)
     return Outcome(settings, descents, float(jnp.abs(slope).max()), task)
 
@@ -83,8 +85,7 @@ def positions(task: RollingPin, params: Float[Array, " dim"]) -> Float[Array, "s
     return mg.rollout(task.scene, task.state, params.reshape(task.horizon, task.num_controls)).qpos
 
 
-def _programs(settings: Settings) -> list[tuple[str | None, Callable, int, dict[str, Variant]]]:
-    """Give the mode of the kernel (None has none), the estimator, rollouts per step, and by label what shares these."""
+def _programs(settings: Settings) -> list[_Program]:
     few, many, reach = settings.num_samples, settings.search_samples, settings.remedies
 
     def variant(**parts: float) -> Variant:
@@ -108,16 +109,9 @@ def _programs(settings: Settings) -> list[tuple[str | None, Callable, int, dict[
     ]
 
 
-def _descend(
-    task: RollingPin,
-    mode: str | None,
-    estimator: Callable,
-    num_samples: int,
-    variants: dict[str, Variant],
-    settings: Settings,
-    key: Array,
-) -> list[Descent]:
+def _descend(task: RollingPin, program: _Program, settings: Settings, key: Array) -> list[Descent]:
     """Descend for several variants at once, with what reaches out shrinking as it goes."""
+    mode, estimator, num_samples, variants = program
     shrink = optax.exponential_decay(1.0, settings.num_steps, settings.remedies.last)
     start = jnp.zeros(task.horizon * task.num_controls)
 

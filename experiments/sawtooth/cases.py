@@ -63,18 +63,16 @@ def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **
     return Case(title, model, interval=(0.0, 0.03), duration=0.5, qpos=qpos, qvel={0: speed}, **planar | other)
 
 
-_BALL = """
-<mujoco model="ball">
+_BALL = """<mujoco model="ball">
   <option timestep="0.002" cone="{cone}"/>
   <worldbody>
     <geom name="floor" type="plane" size="5 5 0.1" euler="0 {slope} 0" condim="{condim}"/>
-    <body name="ball" pos="0 0 {height}">
+    <body name="ball" pos="0 0 0.1">
       <freejoint/>
       <geom name="ball" type="sphere" size="0.05" condim="{condim}"/>
     </body>
   </worldbody>
-</mujoco>
-"""
+</mujoco>"""
 
 
 def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
@@ -82,7 +80,7 @@ def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
     place = f"plane inclined by {slope:g}°" if slope else "level plane"
     return Case(
         f"Ball, {place}, {cone}, condim {condim}",
-        mujoco.MjModel.from_xml_string(_BALL.format(cone=cone, condim=condim, slope=slope, height=0.1)),
+        mujoco.MjModel.from_xml_string(_BALL.format(cone=cone, condim=condim, slope=slope)),
         moved=2,
         interval=(0.0, 0.03),
         labels=("x", "height", "spin (1/s per m)"),
@@ -92,15 +90,13 @@ def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
     )
 
 
-_TWO_BALLS = """
-<mujoco model="two balls">
+_TWO_BALLS = """<mujoco model="two balls">
   <option timestep="0.002" gravity="0 0 0" cone="{cone}"/>
   <worldbody>
     <body name="first" pos="-0.2 0 0"><freejoint/><geom type="sphere" size="0.05"/></body>
     <body name="second"><freejoint/><geom type="sphere" size="0.05"/></body>
   </worldbody>
-</mujoco>
-"""
+</mujoco>"""
 
 
 def _two_balls_case(cone: str) -> Case:
@@ -117,8 +113,7 @@ def _two_balls_case(cone: str) -> Case:
     )
 
 
-_ARM_MJCF = """
-<mujoco model="arm">
+_ARM = """<mujoco model="arm">
   <option timestep="0.002"/>
   <default><joint type="hinge" axis="0 1 0" damping="0.02"/></default>
   <worldbody>
@@ -132,8 +127,7 @@ _ARM_MJCF = """
       </body>
     </body>
   </worldbody>
-</mujoco>
-"""
+</mujoco>"""
 
 
 _BUILDERS = {
@@ -163,7 +157,7 @@ _BUILDERS = {
     "two_balls_elliptic": lambda: _two_balls_case("elliptic"),
     "arm": lambda: Case(
         "Two-link arm",
-        mujoco.MjModel.from_xml_string(_ARM_MJCF),
+        mujoco.MjModel.from_xml_string(_ARM),
         moved=0,
         interval=(0.0, 0.06),
         labels=("shoulder (rad)", "elbow (rad)"),

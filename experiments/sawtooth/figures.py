@@ -20,14 +20,12 @@ _NAMES = {
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure per motion, at its longest time step, and the errors of all."""
+    """Name a figure per motion, at its longest time step."""
     longest: dict[str, xr.Dataset] = {}
     for course in outcome.courses:
         longest.setdefault(str(course.case.values), course)
-    teeth = {
-        f"teeth_{name}": functools.partial(_teeth, course, k == 0) for k, (name, course) in enumerate(longest.items())
-    }
-    return {**teeth, "error": _errors}
+    named = enumerate(longest.items())
+    return {f"teeth_{name}": functools.partial(_teeth, course, k == 0) for k, (name, course) in named}
 
 
 def _teeth(course: xr.Dataset, is_first: bool, _: Outcome):
@@ -83,26 +81,3 @@ def _draw_times(axis: Axes, one: xr.Dataset) -> None:
 def _show(axis: Axes, values: np.ndarray) -> None:
     pad = 0.15 * max(float(np.ptp(values)), np.abs(values).max(), 1e-9)
     axis.set_ylim(values.min() - pad, values.max() + pad)
-
-
-def _errors(outcome: Outcome):
-    """Draw how far each mean derivative is off the slope of its own outcome, motion by motion."""
-    courses = outcome.courses
-    figure, axes = subplots(1, 1, height=1.6 + 0.32 * len(courses))
-    axis = axes[0, 0]
-    for place, course in enumerate(courses):
-        for shift, arm in zip((-0.22, 0.0, 0.22), ARMS, strict=True):
-            error = np.clip(course.error.sel(arm=arm).values[course.has_impact.values], 1e-4, 1e2)
-            axis.plot(error, np.full(error.size, place + shift), ".", color=_COLOURS[arm], ms=4, alpha=0.4, mec="none")
-            if error.size:
-                axis.plot(np.median(error), place + shift, "o", color=_COLOURS[arm], ms=7, mec="white")
-    axis.axvline(0.05, color=MUTED, lw=1, ls=(0, (2, 3)))
-    axis.set_yticks(range(len(courses)), [f"{c.title.values}, {1e3 * float(c.timestep):g} ms" for c in courses])
-    axis.set(ylim=(len(courses) - 0.5, -0.5), xscale="log", xlabel="error of the mean derivative, over the slope")
-    handles = [Line2D([], [], color=_COLOURS[arm], marker="o", ls="", ms=5, label=arm) for arm in ARMS]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
-    caption = (
-        "One dot per time and coordinate after the first impact, large ones the medians. Dotted, 5%. Sampling errors are part "
-        "of it: where the slope is near zero all arms lie far to the right."
-    )
-    return figure, "Error of the mean derivative", caption

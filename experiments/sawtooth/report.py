@@ -49,18 +49,18 @@ def tables(outcome: Outcome) -> list[Table]:
         within = (c.within & c.has_impact).sum(("time", "coordinate"))
         row = [str(c.title.values), f"{1e3 * float(c.timestep):g}"]
         row.append(f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})")
-        row += [f"{value:.2g}" for value in middle.spread.values]
+        row += [f"{value:.2g}" for value in middle.spread.values] + [f"{value:.1%}" for value in middle.error.values]
         row += [f"{value} of {int(c.has_impact.sum())}" for value in within.values]
         row.append(f"{float(middle['shift']):.2f}")
         rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
-    columns += [f"spread, {arm}" for arm in ARMS] + [f"within 2 errors, {arm}" for arm in ARMS]
-    columns += ["shift of the mean", "error"]
+    columns += [f"{what}, {arm}" for what in ("spread", "error", "within 2 errors") for arm in ARMS]
+    columns += ["shift of the mean", "off the converged motion"]
     caption = (
         "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
-        "single derivatives about their trend, over the slope. Within 2 errors: readings where the mean derivative is the slope "
-        "of its own outcome. Shift of the mean outcome over MuJoCo's sawtooth. Error beside the converged motion over "
-        "MuJoCo's own."
+        "single derivatives about their trend, over the slope. Error: of the mean derivative, over the slope of its own outcome, "
+        "sampling errors included; within 2 errors: readings where it is no more than these. Shift of the mean outcome over "
+        "MuJoCo's sawtooth. Distance of the outcome from the converged motion over MuJoCo's own."
     )
     return [Table(columns, rows, caption)]
 

@@ -1,9 +1,13 @@
 """The pictures of an experiment on a textbook problem."""
 
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
@@ -27,17 +31,23 @@ def stiffness_name(outcome: Outcome) -> str:
 def problem(outcome: Outcome):
     """The cost with and without noise, and both gradients that estimates can converge to."""
     figure, axes = subplots(1, 2, height=3.3)
-    curves, settings = outcome.curves, outcome.settings
+    settings, one = outcome.settings, outcome.problem
     left, right = axes[0]
-    grid = curves.parameter.values
-    left.plot(grid, curves.cost, color=MUTED, lw=1.2, label="without noise")
-    left.plot(grid, curves.smoothed, color=REFERENCE, label=f"mean under noise of {settings.stddev:g}")
-    right.plot(grid, curves.gradient, color=REFERENCE, label="gradient of the mean")
-    right.plot(grid, curves.first_order_mean, color=FIRST, ls=(0, (4, 2)), label="mean of first order", zorder=3)
+    point, stddev = settings.point, settings.stddev
+    grid = jnp.linspace(-1, 1, 801) * max(4 * stddev, 1.5 * abs(point))
+
+    def draw(axis: Axes, function: Callable[[Array], Array], **look: Any) -> None:
+        axis.plot(grid, jax.jit(jax.vmap(function))(grid), **look)
+
+    draw(left, lambda x: one(x[None]), color=MUTED, lw=1.2, label="without noise")
+    draw(left, lambda x: one.smoothed(x, stddev), color=REFERENCE, label=f"mean under noise of {stddev:g}")
+    draw(right, lambda x: one.gradient(x, stddev), color=REFERENCE, label="gradient of the mean")
+    look = {"color": FIRST, "ls": (0, (4, 2)), "zorder": 3}
+    draw(right, lambda x: one.first_order_mean(x, stddev), label="mean of first order", **look)
     for axis, title in ((left, "Cost"), (right, "Gradient")):
-        axis.axvline(settings.point, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
+        axis.axvline(point, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
         low, high = axis.get_ylim()
-        axis.set(title=title, xlabel="parameter", xlim=grid[[0, -1]], ylim=(low, high + 0.22 * (high - low)))
+        axis.set(title=title, xlabel="parameter", xlim=(grid[0], grid[-1]), ylim=(low, high + 0.22 * (high - low)))
         axis.legend(loc="upper left", ncols=2)
     shown = "" if settings.shown_stiffness is None else f" at stiffness {settings.shown_stiffness:g}"
     caption = (
@@ -70,20 +80,16 @@ def samples(outcome: Outcome):
 
 
 def stiffness(outcome: Outcome):
-    """Root-mean-square error and variance against stiffness."""
+    """Root-mean-square error against stiffness."""
     assert outcome.by_stiffness is not None
-    figure, axes = subplots(1, 2, height=4.2)
-    x, count = np.asarray(outcome.settings.stiffness), outcome.settings.samples_at_stiffness
-    left, right = axes[0]
-    _errors(left, x, outcome.by_stiffness)
-    _marks(right, x, outcome.by_stiffness, "variance", count, ls=(0, (1, 2)))
-    right.set(title="Variance, per rollout", yscale="log")
-    for axis in axes[0]:
-        axis.set_xlabel(stiffness_name(outcome))
-    theme.legend_below(figure, left, 4)
+    figure, axes = subplots(1, 1, height=4.2)
+    axis, settings = axes[0, 0], outcome.settings
+    _errors(axis, np.asarray(settings.stiffness), outcome.by_stiffness)
+    axis.set_xlabel(stiffness_name(outcome))
+    theme.legend_below(figure, axis, 4)
     caption = (
-        f"{_repeats(outcome)}, {count} rollouts each. Left, distance to the true gradient; thin lines are closed forms. Right, "
-        "variance of the estimate times rollouts. An estimate that never varies, because all its samples miss, has no mark there."
+        f"{_repeats(outcome)}, {settings.samples_at_stiffness} rollouts each: distance to the true gradient. Thin lines are "
+        "closed forms, dotted ones join marks that have none."
     )
     return figure, "Error against stiffness", caption
 

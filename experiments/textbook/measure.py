@@ -36,7 +36,7 @@ class Outcome:
     gradient: float  # the truth at the shown stiffness
     by_samples: xr.Dataset
     by_stiffness: xr.Dataset | None
-    curves: xr.Dataset  # of the shown problem, along its parameter: cost and gradient, with and without noise
+    problem: Textbook  # the shown one
     # For the soft step, by stiffness: the exact chance β of a sample to hit the slope, and what first-order samples tell of it.
     hits: list[tuple[float, EmpiricalBias]]
 
@@ -95,7 +95,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
         hits = _hits(settings, hits_key) if settings.problem == "soft_heaviside" else []
     gradient = float(problem.gradient(settings.point, settings.stddev))
-    return Outcome(settings, gradient, over_samples, over_stiffness, _curves(problem, settings), hits)
+    return Outcome(settings, gradient, over_samples, over_stiffness, problem, hits)
 
 
 def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tables: Sequence[Comparison]) -> xr.Dataset:
@@ -119,7 +119,7 @@ def _estimator(settings: EstimatorSettings) -> functools.partial:
     names = [name for name in library.__all__ if name[0].islower() and name not in others]
     if settings.name not in names:
         raise ExperimentError(f'there is no estimator "{settings.name}"; {suggest(settings.name, names)}')
-    options = settings.options
+    options = settings.model_dump(exclude={"name"}, exclude_none=True)
     if settings.rule is not None:
         options["rule"] = _RULES[settings.rule]()
     return functools.partial(getattr(library, settings.name), **options)
@@ -147,19 +147,6 @@ def _exact_error(one: EstimatorSettings, settings: Settings, stiffness: float | 
     is_paid = one.baseline == "zero_noise"
     baseline = problem(jnp.array([point])) if is_paid else 0.0
     return float(jnp.sqrt(problem.zeroth_order_variance(point, stddev, baseline) / (rollouts - is_paid)))
-
-
-def _curves(problem: Textbook, settings: Settings) -> xr.Dataset:
-    reach, stddev = max(4 * settings.stddev, 1.5 * abs(settings.point)), settings.stddev
-    grid = jnp.linspace(-reach, reach, 801)
-    along = {
-        "cost": lambda x: problem(x[None]),
-        "smoothed": lambda x: problem.smoothed(x, stddev),
-        "gradient": lambda x: problem.gradient(x, stddev),
-        "first_order_mean": lambda x: problem.first_order_mean(x, stddev),
-    }
-    curves = {name: ("parameter", np.asarray(jax.jit(jax.vmap(function))(grid))) for name, function in along.items()}
-    return xr.Dataset(curves, coords={"parameter": np.asarray(grid)})
 
 
 def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:

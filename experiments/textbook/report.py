@@ -80,7 +80,7 @@ def _bias(outcome: Outcome) -> str:
         return "No estimator shows a bias."
     share, parts = (outcome.by_samples.bias / abs(outcome.gradient)).where(biased), []
     for label in biased.estimator.values[biased.any("setting")]:
-        worst = int(abs(share.sel(estimator=label)).argmax())
+        worst = int(np.nanargmax(abs(share.sel(estimator=label).values)))
         size = f"{share.sel(estimator=label).values[worst]:+.2g}".replace("-", "−")
         parts.append(f"{label} (by {size} of the gradient with {outcome.settings.num_samples[worst]} rollouts)")
     others = "" if len(parts) == biased.estimator.size else "; the others show no bias"
@@ -97,15 +97,15 @@ def _crossing(outcome: Outcome) -> str | None:
     ahead = (zeroth.rmse_high < first.rmse_low).values
     behind = (zeroth.rmse_low > first.rmse_high).values
     name, count = stiffness_name(outcome), outcome.settings.samples_at_stiffness
-    if not ahead.any() or not behind.any():
-        winner = "zeroth" if ahead.any() else "first" if behind.any() else None
-        return winner and f"With {count} rollouts {winner} order is as close or closer at every {name} of the sweep."
-    if x[ahead].min() > x[behind].max():
+    if ahead.any() and behind.any() and x[ahead].min() > x[behind].max():
         return (
             f"With {count} rollouts first order is closer up to {name} = {power(x[behind].max())}, zeroth order from "
             f"{power(x[ahead].min())} on."
         )
-    return f"With {count} rollouts zeroth order is closer at {ahead.sum()} of {len(x)} values of {name}."
+    return (
+        f"With {count} rollouts zeroth order is closer at {ahead.sum()} and first order at {behind.sum()} of {len(x)} values of "
+        f"{name}."
+    )
 
 
 def _unseen(outcome: Outcome) -> str:

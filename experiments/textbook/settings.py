@@ -1,6 +1,6 @@
 """What an experiment on a textbook problem can be told; imports nothing heavy."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -20,11 +20,6 @@ class EstimatorSettings(SettingsTable):
     """Whether noise is used in pairs."""
     rule: Literal["consistent", "inverse_variance", "concavity"] | None = None
     """How alpha_order chooses its weight; the rules that need no number of the user."""
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Give what is set."""
-        return self.model_dump(exclude={"name"}, exclude_none=True)
 
     @property
     def label(self) -> str:

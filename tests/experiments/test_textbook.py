@@ -47,7 +47,7 @@ def test_the_metrics_hold_measured_and_exact_errors_that_agree(finished):
 def test_the_verdict_says_from_which_stiffness_on_zeroth_order_is_closer(finished):
     verdict = json.loads((finished / "summary.json").read_text())["verdict"]
     assert "the smallest error is that of first order" in verdict
-    assert "first order is closer up to stiffness 1/ν = 3" in verdict or "at every stiffness" in verdict
+    assert "first order is closer up to stiffness 1/ν = 3" in verdict or "zeroth order is closer at" in verdict
     assert sorted(path.stem for path in (finished / "figures").iterdir()) == [
         "missing", "problem", "samples", "stiffness",
     ]  # fmt: skip
@@ -77,10 +77,3 @@ def test_an_estimator_that_there_is_not_is_answered_with_the_nearest(tmp_path, c
     (tmp_path / "steep.toml").write_text(SETTINGS.replace('"zeroth_order"', '"zeroth_ordr"'))
     assert main(["run", str(tmp_path / "steep.toml"), "--output", str(tmp_path)]) == 2
     assert 'did you mean "zeroth_order"?' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["heaviside", "soft_heaviside", "quadratic_sine"])
-def test_the_files_there_are_can_be_read(name):
-    (run,) = load_runs(name, [])
-    assert run.question.endswith("?")
-    assert run.expected
