@@ -47,7 +47,7 @@ def forces(outcome: Outcome):
     settings = outcome.settings
     caption = (
         f"Force on a body held {1e3 * settings.depth:g} mm deep in a cube, over its largest. Dashed, the gradient of the "
-        "volume that both boxes share, scaled alike: it is continuous. Grey lines: places where the force jumps by more than "
+        "volume that both boxes share, scaled alike: it is continuous. Grey lines: the force jumps by more than "
         f"{settings.threshold:.0%} of that."
     )
     return figure, "Force along a path", caption
@@ -86,8 +86,8 @@ def jumps(outcome: Outcome):
     settings = outcome.settings
     caption = (
         "A jump is what remains of a change after its interval was divided by millions; force and torque together, over the "
-        "largest on the path. Contact that begins gently has an impedance that rises from zero: what still jumps is of the "
-        f"geometry. Smoothing is Gaussian, of {1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
+        "largest on the path. Where contact begins gently, what still jumps is of the geometry. Smoothing is Gaussian, of "
+        f"{1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
     )
     return figure, "Largest jump, by body and path", caption
 
@@ -115,9 +115,9 @@ def refinement(outcome: Outcome):
     for axis in axes[0]:
         axis.legend(fontsize=8)
     caption = (
-        "Bodies that touch by points, each a spring of its own with an equal share of the stiffness. Each point's force jumps "
-        "where its nearest face changes; of a slide along the lattice a whole row does so at once, of one askew one point "
-        "after the other. Paths on which some lattice does not jump, or a single point touches, are left out."
+        "Bodies that touch by points, each a spring with an equal share of the stiffness, whose force jumps where its "
+        "nearest face changes: of a slide along the lattice for a whole row at once, of one askew for one point after the "
+        "other. Paths on which some lattice does not jump, or a single point touches, are left out."
     )
     return figure, "A pressure field of ever more points", caption
 
@@ -155,9 +155,9 @@ def slopes(outcome: Outcome):
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
-        f"The body is let go and pushed for 30 ms; the outcome is its height. Noise on the start of {settings.stddev:.1%} of "
-        f"the path, at the place where the box's force jumps. Lines: slopes that {settings.sizes.num_samples} rollouts say, "
-        "and the reference. Right: errors for all bodies, one mark per path."
+        f"The body is let go where the box's force jumps, under noise on the start of {settings.stddev:.1%} of the path; the "
+        f"outcome is its height after 30 ms. Lines: slopes that {settings.sizes.num_samples} rollouts say, and the "
+        "reference. Right: errors for all bodies, one mark per path."
     )
     return figure, "What gradients say across the jump", caption
 

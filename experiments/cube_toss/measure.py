@@ -47,12 +47,8 @@ CONTACTS = {"published": "contact whose force begins continuously", "default": "
 class Point:
     """One method, a key of `METHODS`, at one setting, a time step in s or a tolerance.
 
-    Attributes:
-        derivative: of each throw, in m per m/s.
-        seconds: processor time of one derivative, compiled.
-        first_seconds: wall time of the first call, which compiles unless an earlier setting did.
-        num_steps: of one derivative.
-        has_failed: whether the integration gave up.
+    Derivatives are in m per m/s, one of each throw; seconds are the processor time of one, compiled, and the wall time of the
+    first call, which compiles unless an earlier setting did.
     """
 
     method: str

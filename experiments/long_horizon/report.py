@@ -107,8 +107,8 @@ def _by_growth(outcome: Outcome) -> Table:
         "largest singular value grows at, 1/s", "√variance, 1/s", "largest exponent, 1/s", "smallest",
     )  # fmt: skip
     caption = (
-        "Horizons at which the bias is beyond chance, and its largest over the largest gradient: a few are seen by chance, and "
-        "neighbours together. Rates over the second half of the time, of the product of Jacobians and of one sample; "
+        "Horizons at which the bias is beyond chance, and its largest over the largest gradient: a few are seen by chance, "
+        "and neighbours together. Rates over the second half of the time, of the product of Jacobians and of one sample; "
         "finite-time Lyapunov exponents at the end."
     )
     return Table(columns, rows, caption)

@@ -21,14 +21,9 @@ CONES: dict[Cone, mujoco.mjtCone] = {
 class Case:
     """A motion from uncertain starts.
 
-    Attributes:
-        model: of C MuJoCo, with its own contact, integrator and time step.
-        duration: in s.
-        moved: the two velocities that are uncertain, by index: the parameters of the gradient.
-        stddev: of that uncertainty (m/s or rad/s).
-        outcome: what is differentiated, as weights of the final positions, by index.
-        qpos: start positions that differ from the model's, by index; likewise `qvel`, which is zero elsewhere.
-        ctrl: constant controls; zero unless given.
+    Two velocities, `moved`, are uncertain: the parameters of the gradient, whose standard deviation is in m/s or rad/s. The
+    outcome has weights of the final positions. Start positions differ from the model's, velocities from zero, by index. Controls
+    are constant, zero unless given. The duration is in s.
     """
 
     title: str

@@ -106,13 +106,9 @@ class Reference:
 class Estimate:
     """One way of estimating a gradient: its name, with the derivative that it uses, samples, time step (s) and softening.
 
-    Attributes:
-        error: root of squared bias and variance.
-        spread: quartiles over repetitions of the distance to the reference, over its norm.
-        bias: distance of the mean to the reference, what chance explains taken off; over the reference's norm.
-        bias_error: what chance would make of a bias of zero.
-        variance: of one estimate over repetitions, the trace; over the reference's squared norm.
-        seconds: wall time of one estimate, by the rollouts that it takes, of each repetition.
+    The error is the root of squared bias and variance, over the reference's norm as they are; `spread` are quartiles over
+    repetitions of the distance to the reference. What chance explains is taken off the bias; `bias_error` is what it would make
+    of none. The variance is that of one estimate, the trace; seconds are the wall time of its rollouts, of each repetition.
     """
 
     estimator: str
