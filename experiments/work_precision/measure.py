@@ -92,16 +92,8 @@ def _course(name: str, one: Case, needed: list[Variant], settings: Settings, on_
     right = _truths(one, programs, qvel)
     points = _measured(one, programs, qvel, right, settings)
     reference, estimates = gradient.measured(one, programs, settings)
-    return Course(
-        name=name,
-        title=one.title,
-        timestep=one.timestep,
-        cone=one.cone,
-        points=tuple(points),
-        references={which: truth.found for which, truth in right.items()},
-        estimates=tuple(estimates),
-        gradient_reference=reference,
-    )
+    references = {which: truth.found for which, truth in right.items()}
+    return Course(name, one.title, one.timestep, one.cone, points, references, estimates, reference)
 
 
 @dataclass(frozen=True)

@@ -161,9 +161,9 @@ class Course:
     title: str
     timestep: float
     cone: Cone
-    points: tuple[Point, ...]
+    points: Sequence[Point]
     references: dict[tuple[str, Cone], Reference]
-    estimates: tuple[Estimate, ...]
+    estimates: Sequence[Estimate]
     gradient_reference: GradientReference
 
     def floor(self, library: str) -> float:

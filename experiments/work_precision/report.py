@@ -2,8 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,8 +26,7 @@ from experiments.work_precision.outcome import (
 _One = TypeVar("_One", Point, Estimate)
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """What to take for a gradient: the way, the samples that it needs, and the time that one estimate then takes (s)."""
 
     estimate: Estimate
