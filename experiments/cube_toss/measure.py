@@ -153,15 +153,8 @@ def _point(name: str, task: CubeToss, setting: float) -> Point:
     begun = time.process_time()
     call()
     spent = time.process_time() - begun
-    return Point(
-        method=name,
-        setting=setting,
-        derivative=np.asarray(derivative),
-        seconds=spent / len(_SPEEDS),
-        first_seconds=first,
-        num_steps=float(np.mean(num_steps)),
-        has_failed=bool(np.any(failed)),
-    )
+    steps, has_failed = float(np.mean(num_steps)), bool(np.any(failed))
+    return Point(name, setting, np.asarray(derivative), spent / len(_SPEEDS), first, steps, has_failed)
 
 
 @eqx.filter_jit
