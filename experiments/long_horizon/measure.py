@@ -135,8 +135,8 @@ class Rollouts(eqx.Module):
     noise: Float[np.ndarray, "samples dim"]
     states: Float[np.ndarray, "samples times n"]
     costs: Float[np.ndarray, "samples times"]
-    cost_slopes: Float[np.ndarray, "samples times n"] | None
-    tangents: Float[np.ndarray, "samples times n dim"] | None
+    cost_slopes: Float[np.ndarray, "samples times n"]
+    tangents: Float[np.ndarray, "samples times n dim"]
 
     @property
     def slopes(self) -> Float[np.ndarray, "samples times dim"]:

@@ -98,7 +98,7 @@ def _by_growth(outcome: Outcome) -> Table:
                 continue
             is_seen = each.bias > each.bias_noise
             first = f"{one.times[is_seen][0]:.3g}" if is_seen.any() else "–"
-            most = _percent(each.bias[is_seen].max()) if is_seen.any() else "–"
+            most = _percent(float(each.bias[is_seen].max())) if is_seen.any() else "–"
             rate = _rate(one.times, np.log(each.variance)[None] / 2)[0]
             rates = [quantity(*largest), quantity(rate), *(quantity(float(exponent)) for exponent in exponents)]
             rows.append([one.title, label, f"{is_seen.sum()} of {len(is_seen)}", first, most, *rates])
