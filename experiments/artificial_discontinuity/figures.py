@@ -8,7 +8,7 @@ from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED
 from experiments.artificial_discontinuity.pushes import TILT
 from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
-from experiments.words import quantity
+from experiments.words import percent, quantity
 from mjxgrad.diagnostics import Jumps
 
 _EVENT = "#009e73"
@@ -77,11 +77,10 @@ def jumps(outcome: Outcome):
             ]
             axis.plot(*zip(*shown, strict=True), ls="", label=label, **look)
         axis.axvline(outcome.settings.threshold, color=MUTED, lw=1, ls=(0, (2, 3)))
-        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title)
+        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title, xlabel="over the largest force")
         axis.set_xticks([_LEAST, 1e-3, 1e-2, 0.1, 1], labels=["none", "0.1%", "1%", "10%", "100%"], fontsize=7)
         axis.minorticks_off()
     axes[0, 0].set_yticks(places, bodies)
-    figure.supxlabel("largest jump, over the largest force on the path", fontsize=9.5)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
@@ -106,6 +105,9 @@ def refinement(outcome: Outcome):
             left.plot(counts, [max(one.worst(PLAIN), _LEAST) for one in found], "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
     left.set_xticks(counts, [str(one) for one in counts])
+    low, high = left.get_ylim()
+    ticks = [tick for tick in (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.5, 1) if low < tick < high]
+    left.set_yticks(ticks, [percent(tick) for tick in ticks])
     left.minorticks_off()
     first = lattices[names[0]]
     for colour, one in zip(shades(len(first)), first, strict=True):
