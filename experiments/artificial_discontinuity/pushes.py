@@ -155,13 +155,17 @@ def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Genera
         return _LENGTH - height, -slope
 
     depth = jumps_along(
-        lambda offsets: simulate(offsets, "discrete")[0],
+        lambda offsets: np.asarray(simulate(offsets, "discrete")[0]),
         OFFSETS,
         num_points=settings.sizes.num_rollouts,
         num_refinements=2,
         smallest=_SMALLEST_DEPTH,
     )
-    force = jumps_along(lambda at: _forces(scene, _tilted(at, -_BELOW)), OFFSETS, num_points=settings.sizes.num_points)
+    force = jumps_along(
+        lambda offsets: np.asarray(_forces(scene, _tilted(offsets, -_BELOW))),
+        OFFSETS,
+        num_points=settings.sizes.num_points,
+    )
     edge, stddev = at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0])
     return Mating(label, force, depth, slopes_at(settings, label, "offset", simulate, edge, stddev, rng))
 

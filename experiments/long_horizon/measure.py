@@ -169,7 +169,7 @@ def _measure(settings: Settings, one: Problem, rng: np.random.Generator, workspa
         # A pilot's slopes take out the linear part of the costs; fixed before the reference is drawn, they leave it unbiased.
         counts = max(sizes.num_reference // 8, sizes.batch), sizes.num_reference
         every = [run(one.stddev * rng.normal(size=(count, dim))) for count in counts]
-        pilot, many = (each.at(np.isfinite(each.states).all(axis=(1, 2))) for each in every)
+        pilot, many = (each.at(np.flatnonzero(np.isfinite(each.states).all(axis=(1, 2)))) for each in every)
         reference = reference_gradient(one.stddev, (pilot.noise, pilot.costs), (many.noise, many.costs))
     with workspace.stage(f"{one.title}: estimates", "gradients", len(one.gradients)) as advance_to:
         every = in_threads(lambda gradient: run(noise, gradient), one.gradients, advance_to)

@@ -80,7 +80,7 @@ def _by_horizon(outcome: Outcome) -> Table:
     for one in outcome.found.values():
         places = np.unique(np.linspace(0, len(one.times) - 1, 6).round().astype(int))
         for label, each in one.errors.items():
-            ends = [(each.error[i], *each.interval[:, i]) for i in places]
+            ends = [map(float, (each.error[i], *each.interval[:, i])) for i in places]
             cells = [f"{_percent(error)} ({_percent(low)} to {_percent(high)})" for error, low, high in ends]
             rows.append([one.title, label, *cells])
     heads = ["first time", *(f"{share:.0%} of the time" for share in np.linspace(0, 1, 6)[1:])]

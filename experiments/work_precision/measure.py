@@ -173,7 +173,8 @@ def _measured(
     settings: Settings,
 ) -> list[Point]:
     """Simulate in every way."""
-    batch, cones = len(qvel), [cone for engine, cone in right if engine == C]
+    batch = len(qvel)
+    cones: list[Cone] = [cone for cone in CONES if (C, cone) in right]
     rules: tuple[Integrator, ...] = ("implicitfast", "RK4", "Euler")
     native = [Variant(C, integrator, cone, batch=batch) for cone in cones for integrator in rules]
     native += [Variant(C, cone=case.cone, batch=batch, iterations=count) for count in FEW_ITERATIONS]

@@ -5,7 +5,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import ArrayLike, Bool
+import numpy.typing as npt
+from jaxtyping import Bool
 
 from experiments.work_precision.settings import Settings
 
@@ -195,7 +196,7 @@ class Outcome:
         return [{name: row.get(name, "") for name in names} for row in rows]
 
 
-def pareto_front(costs: ArrayLike, errors: ArrayLike) -> Bool[np.ndarray, " points"]:
+def pareto_front(costs: npt.ArrayLike, errors: npt.ArrayLike) -> Bool[np.ndarray, " points"]:
     """Say which points no other beats in cost and error at once; of equal ones all, of those that are not finite none."""
     cost, error = np.asarray(costs, float), np.asarray(errors, float)
     no_worse = (cost <= cost[:, None]) & (error <= error[:, None])
