@@ -8,7 +8,7 @@ from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED
 from experiments.artificial_discontinuity.pushes import TILT
 from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
-from experiments.words import quantity
+from experiments.words import percent, quantity
 from mjxgrad.diagnostics import Jumps
 
 _EVENT = "#009e73"
@@ -47,7 +47,7 @@ def forces(outcome: Outcome):
     settings = outcome.settings
     caption = (
         f"Force on a body held {1e3 * settings.depth:g} mm deep in a cube, over its largest. Dashed, the gradient of the "
-        "volume that both boxes share, scaled alike: it is continuous. Grey lines: places where the force jumps by more than "
+        "volume that both boxes share, scaled alike: it is continuous. Grey lines: the force jumps by more than "
         f"{settings.threshold:.0%} of that."
     )
     return figure, "Force along a path", caption
@@ -77,17 +77,16 @@ def jumps(outcome: Outcome):
             ]
             axis.plot(*zip(*shown, strict=True), ls="", label=label, **look)
         axis.axvline(outcome.settings.threshold, color=MUTED, lw=1, ls=(0, (2, 3)))
-        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title)
+        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title, xlabel="over the largest force")
         axis.set_xticks([_LEAST, 1e-3, 1e-2, 0.1, 1], labels=["none", "0.1%", "1%", "10%", "100%"], fontsize=7)
         axis.minorticks_off()
     axes[0, 0].set_yticks(places, bodies)
-    figure.supxlabel("largest jump, over the largest force on the path", fontsize=9.5)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
         "A jump is what remains of a change after its interval was divided by millions; force and torque together, over the "
-        "largest on the path. Contact that begins gently has an impedance that rises from zero: what still jumps is of the "
-        f"geometry. Smoothing is Gaussian, of {1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
+        "largest on the path. Where contact begins gently, what still jumps is of the geometry. Smoothing is Gaussian, of "
+        f"{1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
     )
     return figure, "Largest jump, by body and path", caption
 
@@ -106,6 +105,9 @@ def refinement(outcome: Outcome):
             left.plot(counts, [max(one.worst(PLAIN), _LEAST) for one in found], "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
     left.set_xticks(counts, [str(one) for one in counts])
+    low, high = left.get_ylim()
+    ticks = [tick for tick in (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.5, 1) if low < tick < high]
+    left.set_yticks(ticks, [percent(tick) for tick in ticks])
     left.minorticks_off()
     first = lattices[names[0]]
     for colour, one in zip(shades(len(first)), first, strict=True):
@@ -115,9 +117,9 @@ def refinement(outcome: Outcome):
     for axis in axes[0]:
         axis.legend(fontsize=8)
     caption = (
-        "Bodies that touch by points, each a spring of its own with an equal share of the stiffness. Each point's force jumps "
-        "where its nearest face changes; of a slide along the lattice a whole row does so at once, of one askew one point "
-        "after the other. Paths on which some lattice does not jump, or a single point touches, are left out."
+        "Bodies that touch by points, each a spring with an equal share of the stiffness, whose force jumps where its "
+        "nearest face changes: of a slide along the lattice for a whole row at once, of one askew for one point after the "
+        "other. Paths on which some lattice does not jump, or a single point touches, are left out."
     )
     return figure, "A pressure field of ever more points", caption
 
@@ -155,9 +157,9 @@ def slopes(outcome: Outcome):
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     settings = outcome.settings
     caption = (
-        f"The body is let go and pushed for 30 ms; the outcome is its height. Noise on the start of {settings.stddev:.1%} of "
-        f"the path, at the place where the box's force jumps. Lines: slopes that {settings.sizes.num_samples} rollouts say, "
-        "and the reference. Right: errors for all bodies, one mark per path."
+        f"The body is let go where the box's force jumps, under noise on the start of {settings.stddev:.1%} of the path; the "
+        f"outcome is its height after 30 ms. Lines: slopes that {settings.sizes.num_samples} rollouts say, and the "
+        "reference. Right: errors for all bodies, one mark per path."
     )
     return figure, "What gradients say across the jump", caption
 

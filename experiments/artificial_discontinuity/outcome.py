@@ -42,14 +42,10 @@ class Static:
 
 @dataclass(frozen=True)
 class Judged:
-    """A jump of the box's force beside the gradient of the overlap volume, the reference.
+    """A jump of the box's force, over that force, beside the gradient of the overlap volume, the reference.
 
-    Attributes:
-        relative: jump over force.
-        is_geometric: whether it is there when contact begins gently, too.
-        reference_jump: jump of the reference at that place, over itself.
-        reference_change: change of the reference from a penetration depth before to one after, over itself.
-        contacts: their number before and after.
+    Geometric is what is there when contact begins gently, too. The reference jumps at that place and changes from a penetration
+    depth before to one after, both over itself. Contacts are counted before and after.
     """
 
     path: str
@@ -63,14 +59,10 @@ class Judged:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Estimates of the slope of a short push under noise on the start, one body on one path.
+    """Estimates of the slope of a short push under noise on the start, one body on one path, in the order of `WAYS`.
 
-    Attributes:
-        place: mean start.
-        estimates: in the order of `WAYS`, from as many rollouts each, with their standard errors.
-        reference: slope of the mean outcome, by stratified samples; its standard error is over repeats.
-        jump: what the outcome jumps by in the middle of the noise, if it does: all jumps, each times the noise's density.
-        starts: under the noise, in order, with their outcomes.
+    The reference is the slope of the mean outcome, by stratified samples, with its standard error over repeats. The jump is what
+    the outcome jumps by in the middle of the noise, if it does: all jumps, each times the noise's density.
     """
 
     shape: str
@@ -98,12 +90,10 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Mating:
-    """A peg above a hole, by how contact is told: where it ends against where it starts.
+    """A peg above a hole, by how contact is told.
 
-    Attributes:
-        force: jumps of the force on the peg held half-way in, against its offset.
-        depth: jumps of how deep it is in the end (m), against the offset it is dropped at.
-        slopes: estimates across the edge of the hole.
+    Jumps are of the force on the held peg against its offset, and of how deep (m) it is in the end against the offset it is
+    dropped at; slopes are across the edge of the hole.
     """
 
     label: str
@@ -114,15 +104,9 @@ class Mating:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured.
+    """All that was measured: every shape along every path, lattices last; the jumps of the box, and the reference on its grid.
 
-    Attributes:
-        statics: every shape along every path, lattices last.
-        judged: the jumps of the box.
-        reference: gradient of the overlap volume on the box's grid, by path.
-        slopes: of short pushes.
-        matings: a peg and a hole, by geometry.
-        friction: jumps of the friction on a sliding ball against its speed, and its steepest slope.
+    Then slopes of short pushes, a peg and a hole by geometry, and the friction on a sliding ball against its speed.
     """
 
     settings: Settings

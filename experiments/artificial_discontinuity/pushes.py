@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 from scipy.stats import norm
 
 import mjxgrad as mg
@@ -57,7 +57,9 @@ def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index
             # Poses come from SciPy, so that their derivative along the path is a difference; they are smooth.
             little = 1e-6 * path.length
             at, ahead, behind = (path.poses(body, settings.depth, starts + s * little) for s in (0, 1, -1))
-            return _ends(body.scene, jnp.asarray(at), (ahead - behind) / (2 * little), gradient, _NUM_STEPS, 2)
+            return _ends(
+                body.scene, jnp.asarray(at), jnp.asarray(ahead - behind) / (2 * little), gradient, _NUM_STEPS, 2
+            )
 
         rng = np.random.default_rng([settings.seed, index, number])
         found.append(slopes_at(settings, body.label, name, simulate, place, settings.stddev * path.length, rng))
@@ -149,27 +151,23 @@ def _mjcf(label: str) -> str:
 
 def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
     def simulate(offsets: np.ndarray, gradient: str) -> tuple[Array, Array]:
-        height, slope = _ends(scene, _tilted(offsets, _ABOVE), np.eye(3)[0], gradient, _NUM_DROPPED, 1)
+        height, slope = _ends(scene, _tilted(offsets, _ABOVE), jnp.eye(3)[0], gradient, _NUM_DROPPED, 1)
         return _LENGTH - height, -slope
 
     depth = jumps_along(
-        lambda offsets: simulate(offsets, "discrete")[0],
+        lambda offsets: np.asarray(simulate(offsets, "discrete")[0]),
         OFFSETS,
         num_points=settings.sizes.num_rollouts,
         num_refinements=2,
         smallest=_SMALLEST_DEPTH,
     )
-    return Mating(
-        label=label,
-        force=jumps_along(
-            lambda at: _forces(scene, _tilted(at, -_BELOW)), OFFSETS, num_points=settings.sizes.num_points
-        ),
-        depth=depth,
-        slopes=slopes_at(
-            settings, label, "offset", simulate,
-            at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0]), rng,
-        ),
-    )  # fmt: skip
+    force = jumps_along(
+        lambda offsets: np.asarray(_forces(scene, _tilted(offsets, -_BELOW))),
+        OFFSETS,
+        num_points=settings.sizes.num_points,
+    )
+    edge, stddev = at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0])
+    return Mating(label, force, depth, slopes_at(settings, label, "offset", simulate, edge, stddev, rng))
 
 
 def _tilted(offsets: Float[np.ndarray, " offsets"], end: float) -> Float[Array, "offsets 3"]:
@@ -186,7 +184,12 @@ def _forces(scene: mg.Scene, poses: Float[Array, "offsets 3"]) -> Float[Array, "
 
 @eqx.filter_jit
 def _ends(
-    scene: mg.Scene, poses: Float[Array, "starts nq"], tangents: ArrayLike, gradient: str, horizon: int, index: int
+    scene: mg.Scene,
+    poses: Float[Array, "starts nq"],
+    tangents: Float[Array, "*starts nq"],
+    gradient: str,
+    horizon: int,
+    index: int,
 ) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
     """Return a position (m) after some steps from each pose, and the derivative along the tangents."""
 

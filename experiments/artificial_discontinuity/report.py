@@ -82,9 +82,9 @@ def _by_body(outcome: Outcome) -> Table:
         rows.append(row)
     columns = ("body", "rows", *(PATHS[name].title for name in outcome.settings.sizes.paths))
     caption = (
-        "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently, under "
-        "the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold beyond "
-        "the threshold."
+        "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently, "
+        "under the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold "
+        "beyond the threshold."
     )
     return Table(columns, rows, caption, frozenset(emphasised))
 
@@ -104,9 +104,9 @@ def _by_jump(outcome: Outcome) -> Table:
     ]
     columns = ("path", "at", "contacts", "jump over force", "reference jumps by", "changes nearby by", "which is")
     caption = (
-        f"The jumps of the box beyond {threshold:.0%} of the force beside them, of {len(outcome.judged)} in all. The reference "
-        "is the gradient of the overlap volume; nearby is one penetration depth to each side. A jump of which it does at least "
-        "half at once is real; at least half nearby: a real change, made sudden. The onset of a contact is no jump where "
+        f"The jumps of the box beyond {threshold:.0%} of the force beside them, of {len(outcome.judged)} in all, beside the "
+        "gradient of the overlap volume, the reference; nearby is one penetration depth to each side. A jump of which it "
+        "does at least half at once is real; at least half nearby: a real change, made sudden. An onset is no jump where "
         "contact begins gently."
     )
     return Table(columns, rows, caption)
@@ -160,8 +160,8 @@ def _by_mating(outcome: Outcome) -> Table:
         "contact of peg and hole", "jumps of the force", "largest", "jumps of the depth", "largest, mm", "slope", *WAYS
     )  # fmt: skip
     caption = (
-        "Force on the held peg against its offset, jumps over the largest force; the depth that it reaches when let go; slope of "
-        "its mean under noise, where it jumps most."
+        "Force on the held peg against its offset, jumps over the largest force; the depth that it reaches when let go; "
+        "slope of its mean under noise, where it jumps most."
     )
     return Table(columns, rows, caption)
 

@@ -26,15 +26,7 @@ _SCENE = """<mujoco><option gravity="0 0 0" timestep="0.002" tolerance="1e-10"/>
 
 @dataclass(frozen=True)
 class Shape:
-    """A body over the cube; all have the same mass and inertia.
-
-    Attributes:
-        label: for figures and tables.
-        scene: in which it lies over the cube.
-        hull: centres of balls whose convex hull it is, in its frame (m).
-        radius: of these balls (m).
-        is_lattice: whether it is one of those that stand for a pressure field.
-    """
+    """A body over the cube, the convex hull of balls whose centres are in its frame (m); all have the same mass and inertia."""
 
     label: str
     scene: mg.Scene
@@ -96,15 +88,7 @@ _ON_CORNER = Rotation.align_vectors([[0.0, 0.0, -1.0]], [[-1.0, -1.0, -1.0] / np
 
 @dataclass(frozen=True)
 class Path:
-    """How a body is moved: along x, or turned about an axis.
-
-    Attributes:
-        title: for figures and tables.
-        interval: of the parameter, in m or rad.
-        axis: about which it is turned; None where it slides.
-        x: where it is turned (m).
-        start: its orientation at parameter zero.
-    """
+    """How a body is moved: along x, or turned about an axis at some x, from an orientation at parameter zero (m or rad)."""
 
     title: str
     interval: tuple[float, float]

@@ -42,10 +42,10 @@ def error(outcome: Outcome):
         axis.set(xscale="log", yscale="log", xlabel="processor time of one derivative, s")
     axes[0, 0].set_ylabel("relative error of one derivative")
     caption = (
-        "Root-mean-square error of a single derivative over four throws, as a share of the derivative, against processor time "
-        "of one derivative without compilation. Along a line the time step or the tolerance gets smaller to the right. Grey: "
-        "what DiffMJX published for its own simulator, on other hardware and against its own reference. The dotted line is the "
-        "error that the verdict asks for."
+        "Root-mean-square error of a single derivative over four throws, as a share of the derivative, against its processor "
+        "time without compilation. Along a line the time step or the tolerance gets smaller to the right. Grey: what DiffMJX "
+        "published for its own simulator, on other hardware and against its own reference. Dotted: the error that the "
+        "verdict asks for."
     )
     return _finished(figure, axes[0], outcome), "Error against time", caption
 
@@ -67,8 +67,8 @@ def bias(outcome: Outcome):
         axis.minorticks_off()
     axes[0, 0].set_ylabel("error of the derivative, relative")
     caption = (
-        "Mean error over the throws (thick), and single throws (thin). A mean over four throws is what noise on the throw would "
-        "leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
+        "Mean error over the throws (thick), and single throws (thin). A mean over four throws is what noise on the throw "
+        "would leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
     )
     return _finished(figure, axes[0], outcome), "Bias and spread", caption
 

@@ -47,12 +47,8 @@ CONTACTS = {"published": "contact whose force begins continuously", "default": "
 class Point:
     """One method, a key of `METHODS`, at one setting, a time step in s or a tolerance.
 
-    Attributes:
-        derivative: of each throw, in m per m/s.
-        seconds: processor time of one derivative, compiled.
-        first_seconds: wall time of the first call, which compiles unless an earlier setting did.
-        num_steps: of one derivative.
-        has_failed: whether the integration gave up.
+    Derivatives are in m per m/s, one of each throw; seconds are the processor time of one, compiled, and the wall time of the
+    first call, which compiles unless an earlier setting did.
     """
 
     method: str
@@ -157,15 +153,8 @@ def _point(name: str, task: CubeToss, setting: float) -> Point:
     begun = time.process_time()
     call()
     spent = time.process_time() - begun
-    return Point(
-        method=name,
-        setting=setting,
-        derivative=np.asarray(derivative),
-        seconds=spent / len(_SPEEDS),
-        first_seconds=first,
-        num_steps=float(np.mean(num_steps)),
-        has_failed=bool(np.any(failed)),
-    )
+    steps, has_failed = float(np.mean(num_steps)), bool(np.any(failed))
+    return Point(name, setting, np.asarray(derivative), spent / len(_SPEEDS), first, steps, has_failed)
 
 
 @eqx.filter_jit

@@ -81,9 +81,9 @@ def tables(outcome: Outcome) -> list[Table]:
     )  # fmt: skip
     caption = (
         "Error: root mean square over throws, of a single derivative, as a share of the derivative; bias: its mean. "
-        "Reference: difference quotient of adaptive rollouts at tolerance 1e-10. The first call takes all throws and compiles, "
-        "unless an earlier setting did or it was cached. Short steps at events are not counted. In bold the fastest whose "
-        f"method stays below {TARGET:.0%} from there on."
+        "Reference: difference quotient of adaptive rollouts at tolerance 1e-10. The first call takes all throws and "
+        "compiles, unless an earlier setting did or it was cached. Short steps at events are not counted. In bold the "
+        f"fastest whose method stays below {TARGET:.0%} from there on."
     )
     return [Table(columns, rows, caption, frozenset(emphasised))]
 

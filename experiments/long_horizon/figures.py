@@ -42,10 +42,10 @@ def errors(outcome: Outcome):
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8.5)
     sizes, confidence = outcome.settings.sizes, outcome.settings.confidence
     caption = (
-        f"Gradient of the mean cost at the horizon by the policy's noisy parameters, from {sizes.num_samples} rollouts. "
-        f"Lines: root mean squared error over {sizes.num_repeats} repeats, over the largest gradient of all horizons; bands: "
-        f"{confidence:.0%}. Circles: bias, where it is beyond chance. Dashed: horizon from which on zeroth order is as good, "
-        "with its interval. Below: variance of one rollout's gradient, summed over parameters."
+        f"Gradient of the mean cost at the horizon by the policy's noisy parameters, from {sizes.num_samples} rollouts: root "
+        f"mean squared error over {sizes.num_repeats} repeats, over the largest gradient of all horizons, with "
+        f"{confidence:.0%} bands. Circles: bias beyond chance. Dashed: from there on zeroth order is as good, with its "
+        "interval. Below: variance of one rollout's gradient, summed over parameters."
     )
     return figure, "Error, bias and variance against the horizon", caption
 
@@ -85,9 +85,9 @@ def growth(outcome: Outcome):
         last.set(title="The pendulum's steps and its motion", xlabel="time, s")
         last.legend(fontsize=7.5)
     caption = (
-        "Grey: logarithm of the largest singular value of the product of all steps' Jacobians, rollout by rollout; black, its "
-        "median. Half the logarithm of the estimate's variance runs along with it. With the pendulum, both are held against "
-        "integration with error control: where the steps' distance from it nears one the steps are another motion."
+        "Grey: logarithm of the largest singular value of the product of all steps' Jacobians, rollout by rollout; black, "
+        "its median. Half the logarithm of the estimate's variance runs along with it. The pendulum's are held against "
+        "integration with error control: where the steps' distance from it nears one they are another motion."
     )
     return figure, "Why: the product of the Jacobians", caption
 
@@ -113,6 +113,6 @@ def windows(outcome: Outcome):
     caption = (
         "Gradient of the cost's mean over the whole horizon, when derivatives are cut after a window: plain, and with the "
         "value of what comes after, fitted by a quadratic. Circles: bias beyond chance. The rightmost window is the whole "
-        "horizon. A short window has bias in place of variance."
+        "horizon."
     )
     return figure, "Windows, plain and with a value function", caption

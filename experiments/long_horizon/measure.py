@@ -36,13 +36,8 @@ CUT, VALUED = "cut", "with a value function"
 class Errors:
     """Errors of one way to estimate gradients, of some costs or by some windows, over the largest gradient's size.
 
-    Attributes:
-        error: root mean squared error of an estimate.
-        interval: of it.
-        bias: distance of the mean of all estimates from the reference.
-        bias_noise: distance up to which it can be chance.
-        variance: of one sample, summed over parameters, in the gradient's own units.
-        squares: of the errors, by repeat, less the reference's own.
+    Root mean squared, with an interval; the bias of the mean of all estimates, and up to where it can be chance; the variance of
+    one sample, summed over parameters, in the gradient's own units; squared errors by repeat, less the reference's own.
     """
 
     error: Float[np.ndarray, " kinds"]
@@ -55,13 +50,10 @@ class Errors:
 
 @dataclass(frozen=True)
 class Windows:
-    """Estimates of the gradient of the mean cost over the whole horizon, cut into windows; errors over its size.
+    """Errors of the gradient of the mean cost over the whole horizon by windows of some lengths (s), the last the whole horizon.
 
-    Attributes:
-        lengths: of the windows, in s, the last one the whole horizon.
-        errors: by derivative and by `CUT` or `VALUED`.
-        zeroth: of zeroth order.
-        fit: share of the variance of the costs to come that the value function explains, in the median over times.
+    They are by derivative and by `CUT` or `VALUED`, over the gradient's size; `fit` is the share of the variance of the costs to
+    come that the value function explains, in the median over times.
     """
 
     lengths: Float[np.ndarray, " windows"]
@@ -72,16 +64,11 @@ class Windows:
 
 @dataclass(frozen=True)
 class Found:
-    """All that was measured on one problem.
+    """All that was measured on one problem, at the times at which the horizon may end (s).
 
-    Attributes:
-        times: at which the horizon may end (s), and the mean costs at these (m).
-        errors: by estimator, zeroth order last, of the gradient of the mean cost at each time.
-        crossovers: of each first order with zeroth.
-        log_largest: of the product of Jacobians, by rollout.
-        exponents: finite-time Lyapunov exponents, median over rollouts (1/s).
-        windows: what cutting the derivative makes of it.
-        finite: share of rollouts with finite derivatives.
+    Errors are by estimator, zeroth order last, and of the gradient of the mean cost (m) at each time; crossovers are with zeroth.
+    `log_largest` is of the product of Jacobians, by rollout; `exponents` are finite-time Lyapunov exponents, median over rollouts
+    (1/s); `finite` is the share of rollouts with finite derivatives.
     """
 
     title: str
@@ -148,8 +135,8 @@ class Rollouts(eqx.Module):
     noise: Float[np.ndarray, "samples dim"]
     states: Float[np.ndarray, "samples times n"]
     costs: Float[np.ndarray, "samples times"]
-    cost_slopes: Float[np.ndarray, "samples times n"] | None
-    tangents: Float[np.ndarray, "samples times n dim"] | None
+    cost_slopes: Float[np.ndarray, "samples times n"]
+    tangents: Float[np.ndarray, "samples times n dim"]
 
     @property
     def slopes(self) -> Float[np.ndarray, "samples times dim"]:
@@ -182,7 +169,7 @@ def _measure(settings: Settings, one: Problem, rng: np.random.Generator, workspa
         # A pilot's slopes take out the linear part of the costs; fixed before the reference is drawn, they leave it unbiased.
         counts = max(sizes.num_reference // 8, sizes.batch), sizes.num_reference
         every = [run(one.stddev * rng.normal(size=(count, dim))) for count in counts]
-        pilot, many = (each.at(np.isfinite(each.states).all(axis=(1, 2))) for each in every)
+        pilot, many = (each.at(np.flatnonzero(np.isfinite(each.states).all(axis=(1, 2)))) for each in every)
         reference = reference_gradient(one.stddev, (pilot.noise, pilot.costs), (many.noise, many.costs))
     with workspace.stage(f"{one.title}: estimates", "gradients", len(one.gradients)) as advance_to:
         every = in_threads(lambda gradient: run(noise, gradient), one.gradients, advance_to)

@@ -20,14 +20,8 @@ _START_ANGLES = (2.4, 0.5)  # rad from hanging: high enough that the elbow turns
 class Problem(eqx.Module):
     """A motion in segments of some steps each, with a cost at the end of every segment.
 
-    Attributes:
-        control: from parameters and a state to controls.
-        cost: from positions and velocities to a number, in m.
-        observe: likewise to what a value function is fitted on.
-        params: the policy's, without noise.
-        stddev: of the noise on each of them.
-        gradients: of the steps that differ; "onset" is the derivative of a motion whose contacts begin within the step.
-        num_times: segments of the longest horizon.
+    Cost (m) and what a value function is fitted on follow from positions and velocities, controls from parameters and a state;
+    the policy's parameters are under noise. Of the gradients "onset" is that of a motion whose contacts begin within the step.
     """
 
     scene: mg.Scene

@@ -80,7 +80,7 @@ def _by_horizon(outcome: Outcome) -> Table:
     for one in outcome.found.values():
         places = np.unique(np.linspace(0, len(one.times) - 1, 6).round().astype(int))
         for label, each in one.errors.items():
-            ends = [(each.error[i], *each.interval[:, i]) for i in places]
+            ends = [map(float, (each.error[i], *each.interval[:, i])) for i in places]
             cells = [f"{_percent(error)} ({_percent(low)} to {_percent(high)})" for error, low, high in ends]
             rows.append([one.title, label, *cells])
     heads = ["first time", *(f"{share:.0%} of the time" for share in np.linspace(0, 1, 6)[1:])]
@@ -98,7 +98,7 @@ def _by_growth(outcome: Outcome) -> Table:
                 continue
             is_seen = each.bias > each.bias_noise
             first = f"{one.times[is_seen][0]:.3g}" if is_seen.any() else "–"
-            most = _percent(each.bias[is_seen].max()) if is_seen.any() else "–"
+            most = _percent(float(each.bias[is_seen].max())) if is_seen.any() else "–"
             rate = _rate(one.times, np.log(each.variance)[None] / 2)[0]
             rates = [quantity(*largest), quantity(rate), *(quantity(float(exponent)) for exponent in exponents)]
             rows.append([one.title, label, f"{is_seen.sum()} of {len(is_seen)}", first, most, *rates])
@@ -107,8 +107,8 @@ def _by_growth(outcome: Outcome) -> Table:
         "largest singular value grows at, 1/s", "√variance, 1/s", "largest exponent, 1/s", "smallest",
     )  # fmt: skip
     caption = (
-        "Horizons at which the bias is beyond chance, and its largest over the largest gradient: a few are seen by chance, and "
-        "neighbours together. Rates over the second half of the time, of the product of Jacobians and of one sample; "
+        "Horizons at which the bias is beyond chance, and its largest over the largest gradient: a few are seen by chance, "
+        "and neighbours together. Rates over the second half of the time, of the product of Jacobians and of one sample; "
         "finite-time Lyapunov exponents at the end."
     )
     return Table(columns, rows, caption)

@@ -21,14 +21,9 @@ CONES: dict[Cone, mujoco.mjtCone] = {
 class Case:
     """A motion from uncertain starts.
 
-    Attributes:
-        model: of C MuJoCo, with its own contact, integrator and time step.
-        duration: in s.
-        moved: the two velocities that are uncertain, by index: the parameters of the gradient.
-        stddev: of that uncertainty (m/s or rad/s).
-        outcome: what is differentiated, as weights of the final positions, by index.
-        qpos: start positions that differ from the model's, by index; likewise `qvel`, which is zero elsewhere.
-        ctrl: constant controls; zero unless given.
+    Two velocities, `moved`, are uncertain: the parameters of the gradient, whose standard deviation is in m/s or rad/s. The
+    outcome has weights of the final positions. Start positions differ from the model's, velocities from zero, by index. Controls
+    are constant, zero unless given. The duration is in s.
     """
 
     title: str
@@ -165,91 +160,65 @@ def _ball(friction: float, height: float) -> mujoco.MjModel:
 def _landing(name: str, title: str, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
     """One of gymnasium's bodies landing, as in the experiment on the sawtooth, but thrown down so that it lands sooner."""
     given = landing_case(name)
-    qvel = {**given.qvel, given.moved: -1.0}
-    return Case(title, given.model, duration=0.24, moved=moved, stddev=0.1, outcome=outcome, qpos=given.qpos, qvel=qvel)
+    return Case(title, given.model, 0.24, moved, 0.1, outcome, given.qpos, {**given.qvel, given.moved: -1.0})
 
 
 def _push() -> Case:
     """`mjcf/push.xml` with a contact a hundred times as stiff as the stiffest published: the balls knock."""
     model = mujoco.MjModel.from_xml_path(str(scene_path("push")))
     model.pair_solref[:] = (-1e5, 0.0)
-    return Case(
-        "Stiff pushing",
-        model,
-        duration=0.4,
-        moved=(0, 1),
-        stddev=0.1,
-        outcome={0: 0.3, 1: 1.0},
-        qpos={0: -0.02},
-        qvel={0: 0.5},
-        ctrl=(0.3,),
-    )
+    return Case("Stiff pushing", model, 0.4, (0, 1), 0.1, {0: 0.3, 1: 1.0}, {0: -0.02}, {0: 0.5}, (0.3,))
+
+
+def _pendulum() -> Case:
+    model = mujoco.MjModel.from_xml_string(_PENDULUM)
+    return Case("Double pendulum, no contact", model, 0.8, (0, 1), 0.3, {0: 1.0, 1: 0.5}, {0: 1.5, 1: 1.0})
+
+
+def _bounce() -> Case:
+    """Thrown down obliquely without spin: it bounces once, under the default contact."""
+    model, qvel = _ball(friction=0.5, height=0.15), {0: 1.0, 2: -1.5}
+    return Case("Bouncing ball, one contact", model, 0.16, (0, 2), 0.1, {0: 1.0, 2: 1.0}, qvel=qvel)
+
+
+def _slide() -> Case:
+    """Slides without spin, askew to the axes of the friction pyramid, until it rolls."""
+    model, qvel = _ball(friction=0.3, height=0.0499), {0: 1.0, 1: 0.4}
+    return Case("Sliding ball, friction", model, 0.2, (0, 1), 0.1, {0: 1.0, 1: 1.0}, qvel=qvel)
+
+
+def _cube() -> Case:
+    """The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("cube_toss")))
+    return Case("Tumbling cube", model, 0.3, (1, 2), 0.05, {1: 1.0, 2: 1.0}, {2: 0.12}, {1: 0.3, 2: -0.5})
+
+
+def _arm() -> Case:
+    """Three links under position servos with damping, which a coarse Euler step does not survive; the hand strikes the floor.
+
+    Later the servos hold the arm wherever it came from, and no gradient is left.
+    """
+    model, qpos = mujoco.MjModel.from_xml_string(_ARM), {0: 0.1, 1: 0.5, 2: 0.2}
+    title = "Servo arm on the floor, articulated"
+    return Case(title, model, 0.16, (0, 1), 0.3, {0: 1.0, 1: 0.5}, qpos, ctrl=(0.7, 0.4, 0.0))
+
+
+def _heap() -> Case:
+    xml = _HEAP.format(balls="".join(_HEAP_BALL.format(*place) for place in _HEAP_PLACES))
+    model = mujoco.MjModel.from_xml_string(xml)
+    return Case("Four falling balls, many bodies", model, 0.24, (6, 8), 0.1, {7: 1.0, 9: 1.0, 16: 0.5})
 
 
 _BUILDERS: dict[str, Callable[[], Case]] = {
-    "pendulum": lambda: Case(
-        "Double pendulum, no contact",
-        mujoco.MjModel.from_xml_string(_PENDULUM),
-        duration=0.8,
-        moved=(0, 1),
-        stddev=0.3,
-        outcome={0: 1.0, 1: 0.5},
-        qpos={0: 1.5, 1: 1.0},
-    ),
-    # Thrown down obliquely without spin: it bounces once, under the default contact.
-    "bounce": lambda: Case(
-        "Bouncing ball, one contact",
-        _ball(friction=0.5, height=0.15),
-        duration=0.16,
-        moved=(0, 2),
-        stddev=0.1,
-        outcome={0: 1.0, 2: 1.0},
-        qvel={0: 1.0, 2: -1.5},
-    ),
-    # Slides without spin, askew to the axes of the friction pyramid, until it rolls.
-    "slide": lambda: Case(
-        "Sliding ball, friction",
-        _ball(friction=0.3, height=0.0499),
-        duration=0.2,
-        moved=(0, 1),
-        stddev=0.1,
-        outcome={0: 1.0, 1: 1.0},
-        qvel={0: 1.0, 1: 0.4},
-    ),
-    # The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands.
-    "cube": lambda: Case(
-        "Tumbling cube",
-        mujoco.MjModel.from_xml_path(str(scene_path("cube_toss"))),
-        duration=0.3,
-        moved=(1, 2),
-        stddev=0.05,
-        outcome={1: 1.0, 2: 1.0},
-        qpos={2: 0.12},
-        qvel={1: 0.3, 2: -0.5},
-    ),
-    # Three links under position servos with damping, which a coarse Euler step does not survive; the hand strikes the floor.
-    # Later the servos hold the arm wherever it came from, and no gradient is left.
-    "arm": lambda: Case(
-        "Servo arm on the floor, articulated",
-        mujoco.MjModel.from_xml_string(_ARM),
-        duration=0.16,
-        moved=(0, 1),
-        stddev=0.3,
-        outcome={0: 1.0, 1: 0.5},
-        qpos={0: 0.1, 1: 0.5, 2: 0.2},
-        ctrl=(0.7, 0.4, 0.0),
-    ),
+    "pendulum": _pendulum,
+    "bounce": _bounce,
+    "slide": _slide,
+    "cube": _cube,
+    "arm": _arm,
     "hopper": lambda: _landing("hopper", "Hopper landing", (0, 1), {0: 1.0, 1: 1.0}),
     "half_cheetah": lambda: _landing("half_cheetah", "Half cheetah landing", (0, 1), {0: 1.0, 1: 1.0, 2: 0.3}),
     "push": _push,
-    "heap": lambda: Case(
-        "Four falling balls, many bodies",
-        mujoco.MjModel.from_xml_string(_HEAP.format(balls="".join(_HEAP_BALL.format(*at) for at in _HEAP_PLACES))),
-        duration=0.24,
-        moved=(6, 8),
-        stddev=0.1,
-        outcome={7: 1.0, 9: 1.0, 16: 0.5},
-    ),
+    "heap": _heap,
     "walker2d": lambda: _landing("walker2d", "Walker2d landing", (0, 1), {0: 1.0, 1: 1.0}),
     "ant": lambda: _landing("ant", "Ant landing", (0, 2), {0: 1.0, 2: 1.0}),
 }

@@ -93,15 +93,13 @@ def motion(course: Course, outcome: Outcome):
     ]
     handles.append(Line2D([], [], mec=REFERENCE, mfc="none", marker="o", ls="", ms=9, label="none on JAX is better"))
     caption = (
-        f"Error of the state after the motion's whole time, root mean square over {outcome.settings.sizes.batch} starts, against "
-        "wall time per simulated second and state, those starts simulated in one batch. Error: the larger of the distance of "
-        "positions (mj_differentiatePos, in m and rad, Euclidean) over the way gone and that of velocities over the speed. Along "
-        "a line the time step gets smaller to the right; bars are the range over repetitions. Left: the solver run to "
-        f"{TIGHT_TOLERANCE:g} (float32: {SINGLE_TOLERANCE:g}), the scene's own cone; the broad grey line is what no other beats, "
-        "rings what no other on JAX does. Right: loose tolerances at the two coarsest steps, few iterations, and the other "
-        "cone, compared with its own reference. Dotted: how far the reference itself moved when its step was last halved; "
-        "below it nothing is known; it is left out where it is far below all errors. Grey: the errors that settings are "
-        "recommended for. Compilation is apart, in the table."
+        f"Error of the final state, root mean square over {outcome.settings.sizes.batch} starts in one batch, against wall "
+        "time: the larger of the distance of positions (m and rad, Euclidean) over the way gone and that of velocities over "
+        "the speed. Along a line the time step gets smaller to the right; bars are the range over repetitions. Left: the "
+        f"solver run to {TIGHT_TOLERANCE:g} (float32: {SINGLE_TOLERANCE:g}), the scene's own cone; no other beats the broad "
+        "grey line, none on JAX the rings. Right: loose tolerances at the two coarsest steps, few iterations, and the other "
+        "cone beside its own reference. Dotted: how far the reference moved when its step was last halved; grey: errors that "
+        "settings are recommended for."
     )
     return _finished(figure, axes[0], handles, outcome, course, "motion", caption)
 
@@ -134,12 +132,11 @@ def gradient(course: Course, outcome: Outcome):
         if label in present
     ]
     caption = (
-        "Error of a gradient estimate, root mean square over 64 repetitions of its distance to the reference over the "
-        "reference's norm, against the wall time of its rollouts (left) and their number (right). Two velocities of the start "
-        "are the parameters, Gaussian noise on them smooths the outcome, a weighted sum of final positions. Thick: the "
-        "scene's own time step and contact, bars from the lower to the upper quartile; thin: other steps and softer contacts, "
-        "whose error against the true scene levels off at their bias. Zeroth order takes more rollouts with more parameters; "
-        "these are two. Derivatives are taken forward, as the library does for up to three."
+        "Error of a gradient estimate, root mean square over 64 repetitions, over the reference's norm, against the wall "
+        "time of its rollouts (left) and their number (right). Two velocities of the start are the parameters, under "
+        "Gaussian noise; the outcome is a weighted sum of final positions. Thick: the scene's own time step and contact, "
+        "bars from the lower to the upper quartile; thin: other steps and softer contacts, whose error against the true "
+        "scene levels off at their bias."
     )
     return _finished(figure, axes[0], handles, outcome, course, "gradient", caption)
 

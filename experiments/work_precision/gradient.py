@@ -192,8 +192,8 @@ def _estimates(
     size = float(np.linalg.norm(right))
     keys = jax.random.split(jax.random.key(settings.seed), _REPEATS)
     dim = noise.shape[1]
-    arrays = (jnp.asarray(each) for each in (record.costs, record.gradients, noise))
-    objective = Recorded(*arrays, jnp.full(dim, case.stddev), dim)
+    arrays = {"costs": record.costs, "gradients": record.gradients, "noise": noise, "stddev": np.full(dim, case.stddev)}
+    objective = Recorded(**{name: jnp.asarray(each) for name, each in arrays.items()}, dim=dim)
     found = []
     for num_samples in settings.sizes.num_samples:
         values = np.asarray(_repeated(objective, keys, function, num_samples))

@@ -20,6 +20,7 @@ from experiments.work_precision.outcome import (
     C,
     Cone,
     Course,
+    Integrator,
     Knobs,
     Outcome,
     Point,
@@ -92,16 +93,8 @@ def _course(name: str, one: Case, needed: list[Variant], settings: Settings, on_
     right = _truths(one, programs, qvel)
     points = _measured(one, programs, qvel, right, settings)
     reference, estimates = gradient.measured(one, programs, settings)
-    return Course(
-        name=name,
-        title=one.title,
-        timestep=one.timestep,
-        cone=one.cone,
-        points=tuple(points),
-        references={which: truth.found for which, truth in right.items()},
-        estimates=tuple(estimates),
-        gradient_reference=reference,
-    )
+    references = {which: truth.found for which, truth in right.items()}
+    return Course(name, one.title, one.timestep, one.cone, points, references, estimates, reference)
 
 
 @dataclass(frozen=True)
@@ -115,8 +108,8 @@ class Truth:
 
     def errors(self, ends: Ends) -> tuple[float, float]:
         """Compare a batch of ends, or its first states: root-mean-square distances, relative; NaN if one is not finite."""
-        right = tuple(each[: len(ends[0])] for each in self.ends)
-        return _relative(self.case, right, ends, self.scales)
+        count = len(ends[0])
+        return _relative(self.case, (self.ends[0][:count], self.ends[1][:count]), ends, self.scales)
 
     def distance(self, ends: Ends) -> float:
         """Give the larger of both errors."""
@@ -180,8 +173,9 @@ def _measured(
     settings: Settings,
 ) -> list[Point]:
     """Simulate in every way."""
-    batch, cones = len(qvel), [cone for cone in CONES if (C, cone) in right]
-    rules = ("implicitfast", "RK4", "Euler")
+    batch = len(qvel)
+    cones: list[Cone] = [cone for cone in CONES if (C, cone) in right]
+    rules: tuple[Integrator, ...] = ("implicitfast", "RK4", "Euler")
     native = [Variant(C, integrator, cone, batch=batch) for cone in cones for integrator in rules]
     native += [Variant(C, cone=case.cone, batch=batch, iterations=count) for count in FEW_ITERATIONS]
     native += [Variant(C, cone=case.cone)]

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Bool
 
 from experiments.work_precision.settings import Settings
@@ -106,13 +107,9 @@ class Reference:
 class Estimate:
     """One way of estimating a gradient: its name, with the derivative that it uses, samples, time step (s) and softening.
 
-    Attributes:
-        error: root of squared bias and variance.
-        spread: quartiles over repetitions of the distance to the reference, over its norm.
-        bias: distance of the mean to the reference, what chance explains taken off; over the reference's norm.
-        bias_error: what chance would make of a bias of zero.
-        variance: of one estimate over repetitions, the trace; over the reference's squared norm.
-        seconds: wall time of one estimate, by the rollouts that it takes, of each repetition.
+    The error is the root of squared bias and variance, over the reference's norm as they are; `spread` are quartiles over
+    repetitions of the distance to the reference. What chance explains is taken off the bias; `bias_error` is what it would make
+    of none. The variance is that of one estimate, the trace; seconds are the wall time of its rollouts, of each repetition.
     """
 
     estimator: str
@@ -165,9 +162,9 @@ class Course:
     title: str
     timestep: float
     cone: Cone
-    points: tuple[Point, ...]
+    points: Sequence[Point]
     references: dict[tuple[str, Cone], Reference]
-    estimates: tuple[Estimate, ...]
+    estimates: Sequence[Estimate]
     gradient_reference: GradientReference
 
     def floor(self, library: str) -> float:
@@ -199,7 +196,7 @@ class Outcome:
         return [{name: row.get(name, "") for name in names} for row in rows]
 
 
-def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> Bool[np.ndarray, " points"]:
+def pareto_front(costs: npt.ArrayLike, errors: npt.ArrayLike) -> Bool[np.ndarray, " points"]:
     """Say which points no other beats in cost and error at once; of equal ones all, of those that are not finite none."""
     cost, error = np.asarray(costs, float), np.asarray(errors, float)
     no_worse = (cost <= cost[:, None]) & (error <= error[:, None])

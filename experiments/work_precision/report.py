@@ -2,8 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,8 +26,7 @@ from experiments.work_precision.outcome import (
 _One = TypeVar("_One", Point, Estimate)
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """What to take for a gradient: the way, the samples that it needs, and the time that one estimate then takes (s)."""
 
     estimate: Estimate
@@ -168,9 +166,9 @@ def summary(outcome: Outcome) -> Table:
         rows.append(row)
     caption = (
         "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one "
-        f"state in a batch of {outcome.settings.sizes.batch}, and the same for the fastest ways of mjx.step and of C MuJoCo on "
-        f"{_threads()}; of the gradient with its rollouts, as many as bias and variance call for, and the time they "
-        "take. A dash: no setting that was tried gets there; a question mark: the reference is not known so well."
+        f"state in a batch of {outcome.settings.sizes.batch}, beside the fastest of mjx.step and of C MuJoCo on "
+        f"{_threads()}; of the gradient, with its rollouts, as many as bias and variance call for, and their time. A dash: "
+        "no setting gets there; a question mark: the reference is not known so well."
     )
     return Table(columns, rows, caption)
 
@@ -203,12 +201,11 @@ def tables(outcome: Outcome) -> list[Table]:
         "reference gradient: chance; step; other way",
     )  # fmt: skip
     caption = (
-        "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated alone "
-        f"and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads()}). A "
-        "dash: not tried on this scene. The figures are about batches, which MJX is made for, and so are estimators. "
-        f"Seconds to trace and compile one program, {num_compilers()} at a time. Then how far the other cone's motion ends, "
-        "and MJX's from C MuJoCo's; last what is known of the reference gradient: standard error, change with the last "
-        "halving of the step, distance to the same gradient by differences of smoothed outcomes."
+        "Milliseconds per simulated second of one state at the scene's own time step (Euler; MJX in float32), simulated "
+        f"alone and in a batch of {outcome.settings.sizes.batch} (C MuJoCo on one thread and on {_threads()}); a dash: not "
+        f"tried. Seconds to trace and compile one program, {num_compilers()} at a time. How far the other cone's motion "
+        "ends, and MJX's from C MuJoCo's. The reference gradient: standard error, change with the last halving of the step, "
+        "distance to the same gradient by differences of smoothed outcomes."
     )
     return [Table(columns, rows, caption)]
 
