@@ -60,7 +60,7 @@ def tables(outcome: Outcome) -> list[Table]:
         base = scene.variants[0]
         times = [f"{1e6 * float(np.median(cost.seconds)) / scene.steps_per_run:.3g}" for cost in base.costs]
         compiling = [f"{cost.compile_seconds:.1f}" for cost in base.costs]
-        whole.append([scene.name, str(base.num_pairs), str(base.num_rows), *times, *compiling])
+        whole.append([scene.name, str(len(base.scene.pairs)), str(base.num_rows), *times, *compiling])
         for variant in scene.variants[1:]:
             if not variant.is_unchanged:
                 emphasised.add((len(groups), 8))
