@@ -1,5 +1,7 @@
 """The pictures of an experiment on leaving out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.lines import Line2D
 
@@ -63,7 +65,7 @@ def _look(variant: VariantOutcome) -> tuple[str, str]:
     return _LOOKS[places.get(variant.name, 2)]
 
 
-def _shares(variant: VariantOutcome) -> list[tuple[float, float, float]]:
+def _shares(variant: VariantOutcome) -> list[Sequence[float]]:
     """Give what each panel shows: lower end, dot and upper end; NaN where it was not measured."""
     step, gradient, unknown = variant.step, variant.gradient, (np.nan,) * 3
     return [
