@@ -129,17 +129,13 @@ def record(
         held = middle + reach * random.uniform(-1, 1, (-(-horizon // _HOLD), model.nu))
         controls.append(np.repeat(held, _HOLD, axis=0)[:horizon])
     states = np.asarray(mujoco.rollout.rollout(model, data, initial, np.array(controls))[0])
-    states = jnp.asarray(np.concatenate([initial[:, None], states], axis=1))
-    return mg.Trajectory(
-        qpos=states[..., 1 : 1 + nq],
-        qvel=states[..., 1 + nq : 1 + nq + model.nv],
-        ctrl=jnp.asarray(np.array(controls)),
-        observations=None,
-        final=jax.tree.map(lambda x: jnp.broadcast_to(x, (num_rollouts, *jnp.shape(x))), mg.initial_state(scene)),
-        diverged=jnp.zeros(num_rollouts, bool),
-        first_bad_step=jnp.full(num_rollouts, -1, jnp.int32),
-        unsolved=jnp.zeros(num_rollouts, jnp.int32),
-    )
+    states = np.concatenate([initial[:, None], states], axis=1)
+
+    def trajectory(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> mg.Trajectory:
+        bad, final = jnp.array(-1, jnp.int32), mg.initial_state(scene)
+        return mg.Trajectory(qpos, qvel, ctrl, observations=None, final=final, diverged=bad >= 0, first_bad_step=bad)
+
+    return jax.vmap(trajectory)(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + model.nv], np.array(controls))
 
 
 def segments(recorded: mg.Trajectory, *, batch: int, horizon: int, seed: int) -> _Starts:
