@@ -10,7 +10,7 @@ from experiments.ablation.variants import NEEDED, REACHED
 from experiments.parallel import num_compilers
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
-_TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
+_TITLES = ("Time of a step", "Time of a gradient", "Operations of a step", "Compile time")
 _LOOKS = (
     (ZEROTH, "all that no motion needs"),
     (FIRST, "and what recorded motions did not reach"),
@@ -36,7 +36,7 @@ def ratios(outcome: Outcome):
     for axis, title in zip(axes[0], _TITLES, strict=True):
         axis.axvline(1.0, color=REFERENCE, lw=1)
         axis.set_title(title)
-        axis.set_xlim(0, max(1.12, axis.get_xlim()[1]))
+        axis.set_xlim(0, max(1.12, 1.03 * axis.get_xlim()[1]))
         axis.set_xlabel("share")
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
