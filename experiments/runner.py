@@ -147,6 +147,8 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_short(one)}" for key, one in value.items() if one is not None) + "}"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 

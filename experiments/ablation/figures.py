@@ -1,5 +1,7 @@
 """The pictures of an experiment on leaving out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.lines import Line2D
 
@@ -8,7 +10,7 @@ from experiments.ablation.variants import NEEDED, REACHED
 from experiments.parallel import num_compilers
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 
-_TITLES = ("time of a step", "time of a gradient", "operations of a step", "compile time")
+_TITLES = ("Time of a step", "Time of a gradient", "Operations of a step", "Compile time")
 _LOOKS = (
     (ZEROTH, "all that no motion needs"),
     (FIRST, "and what recorded motions did not reach"),
@@ -34,7 +36,7 @@ def ratios(outcome: Outcome):
     for axis, title in zip(axes[0], _TITLES, strict=True):
         axis.axvline(1.0, color=REFERENCE, lw=1)
         axis.set_title(title)
-        axis.set_xlim(0, max(1.12, axis.get_xlim()[1]))
+        axis.set_xlim(0, max(1.12, 1.03 * axis.get_xlim()[1]))
         axis.set_xlabel("share")
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
@@ -63,7 +65,7 @@ def _look(variant: VariantOutcome) -> tuple[str, str]:
     return _LOOKS[places.get(variant.name, 2)]
 
 
-def _shares(variant: VariantOutcome) -> list[tuple[float, float, float]]:
+def _shares(variant: VariantOutcome) -> list[Sequence[float]]:
     """Give what each panel shows: lower end, dot and upper end; NaN where it was not measured."""
     step, gradient, unknown = variant.step, variant.gradient, (np.nan,) * 3
     return [

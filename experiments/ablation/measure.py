@@ -24,6 +24,7 @@ from experiments.workspace import Workspace
 
 _OWN = Path(__file__).parents[2] / "mjcf"
 _GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+_DURATION, _CONTROL_SHARE = 1.0, 0.5  # of recorded rollouts: s, and of the range of the controls
 _HOLD = 10  # steps for which a control is held
 _VELOCITY_STDDEV = 0.5  # of the start (m/s or rad/s)
 _EPSILON_STEPS = 4  # roundings by which starts are moved, to see what rounding alone changes
@@ -66,9 +67,9 @@ def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
         record(
             everything,
             num_rollouts=sizes.num_recorded,
-            duration=settings.duration,
+            duration=_DURATION,
             least_steps=2 * sizes.horizon,
-            control_share=settings.control_share,
+            control_share=_CONTROL_SHARE,
             seed=settings.seed + i,
         )
         for i in range(2)
@@ -92,16 +93,7 @@ def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
     # All have been compiled, so that nothing else runs while they are timed.
     steps, slopes = motions.compare(sizes.repeats), gradients.compare(sizes.repeats)
     outcomes = [
-        VariantOutcome(
-            name=v.name,
-            what=v.what,
-            num_pairs=len(v.scene.pairs),
-            num_rows=int(v.scene.data._impl.nefc),
-            num_bodies=int(v.scene.model.nbody),
-            step=steps[v.name],
-            gradient=slopes.get(v.name),
-            checks=checks.get(v.name, ()),
-        )
+        VariantOutcome(**vars(v), step=steps[v.name], gradient=slopes.get(v.name), checks=checks.get(v.name, ()))
         for v in found
     ]
     return SceneOutcome(name, outcomes, sizes.batch * sizes.horizon)
@@ -136,18 +128,14 @@ def record(
         start[1 + nq : 1 + nq + model.nv] = _VELOCITY_STDDEV * random.normal(size=model.nv)
         held = middle + reach * random.uniform(-1, 1, (-(-horizon // _HOLD), model.nu))
         controls.append(np.repeat(held, _HOLD, axis=0)[:horizon])
-    states, _ = mujoco.rollout.rollout(model, data, initial, np.array(controls))
-    states = jnp.asarray(np.concatenate([initial[:, None], states], axis=1))
-    return mg.Trajectory(
-        qpos=states[..., 1 : 1 + nq],
-        qvel=states[..., 1 + nq : 1 + nq + model.nv],
-        ctrl=jnp.asarray(np.array(controls)),
-        observations=None,
-        final=jax.tree.map(lambda x: jnp.broadcast_to(x, (num_rollouts, *jnp.shape(x))), mg.initial_state(scene)),
-        diverged=jnp.zeros(num_rollouts, bool),
-        first_bad_step=jnp.full(num_rollouts, -1, jnp.int32),
-        unsolved=jnp.zeros(num_rollouts, jnp.int32),
-    )
+    states = np.asarray(mujoco.rollout.rollout(model, data, initial, np.array(controls))[0])
+    states = np.concatenate([initial[:, None], states], axis=1)
+
+    def trajectory(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> mg.Trajectory:
+        bad, final = jnp.array(-1, jnp.int32), mg.initial_state(scene)
+        return mg.Trajectory(qpos, qvel, ctrl, observations=None, final=final, diverged=bad >= 0, first_bad_step=bad)
+
+    return jax.vmap(trajectory)(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + model.nv], np.array(controls))
 
 
 def segments(recorded: mg.Trajectory, *, batch: int, horizon: int, seed: int) -> _Starts:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.ablation.settings import Settings
+from experiments.ablation.variants import Variant
 from mjxgrad.diagnostics import OmissionCheck
 
 # Two programs round differently in every operation of every step, the moved start only once.
@@ -64,26 +65,16 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class VariantOutcome:
-    """One variant of a scene.
+class VariantOutcome(Variant):
+    """What a variant costs.
 
     Attributes:
-        name: of the group that is left out.
-        what: was left out, in a few words.
-        num_pairs: of geoms that are tested for contact.
-        num_rows: of constraints.
-        num_bodies: world included.
         step: cost of the motion.
         gradient: cost of its gradient; None if not measured.
         checks: what the full model says of the motions from which it was told what is not reached, and of other motions of the
             kind; empty where a group alone is left out.
     """
 
-    name: str
-    what: str
-    num_pairs: int
-    num_rows: int
-    num_bodies: int
     step: Cost
     gradient: Cost | None
     checks: Sequence[OmissionCheck]
@@ -133,9 +124,9 @@ class Outcome:
                     "scene": scene.name,
                     "left_out": variant.name,
                     "what": variant.what,
-                    "pairs": variant.num_pairs,
+                    "pairs": len(variant.scene.pairs),
                     "rows": variant.num_rows,
-                    "bodies": variant.num_bodies,
+                    "bodies": int(variant.scene.model.nbody),
                 }
                 missed = [len(check.missed) for check in variant.checks] or ("", "")
                 row |= dict(zip(("missed_recorded", "missed_others"), missed, strict=True))

@@ -12,14 +12,14 @@ def verdict(outcome: Outcome) -> str:
     """Say what leaving out gains, and whether it changes anything."""
     gains = [
         _gain(outcome, NEEDED, "what no motion needs"),
-        _gain(outcome, REACHED, "what recorded motions did not reach, either"),
+        _gain(outcome, REACHED, "what recorded motions did not reach either"),
     ]
     safe = [(scene.name, scene.find(NEEDED)) for scene in outcome.scenes]
     changed = [name for name, v in safe if v is not None and not v.is_unchanged]
     safety = (
         f"Motion or gradient change by more than rounding in {joined(changed)}."
         if changed
-        else "Without what no motion needs motions and gradients stay the same, bit for bit or to rounding, in every scene."
+        else "Without what no motion needs, motions and gradients stay the same, bit for bit or to rounding, in every scene."
     )
     return " ".join([*filter(None, gains), safety])
 
@@ -34,7 +34,7 @@ def _gain(outcome: Outcome, name: str, subject: str) -> str:
     others = (
         f" and {ends[1]}; {len(having)} of {len(outcome.scenes)} scenes have something of it" if len(having) > 1 else ""
     )
-    return f"Without {subject} a step takes {ends[0]}{others}."
+    return f"Without {subject}, a step takes {ends[0]}{others}."
 
 
 def findings(outcome: Outcome) -> list[str]:
@@ -60,7 +60,7 @@ def tables(outcome: Outcome) -> list[Table]:
         base = scene.variants[0]
         times = [f"{1e6 * float(np.median(cost.seconds)) / scene.steps_per_run:.3g}" for cost in base.costs]
         compiling = [f"{cost.compile_seconds:.1f}" for cost in base.costs]
-        whole.append([scene.name, str(base.num_pairs), str(base.num_rows), *times, *compiling])
+        whole.append([scene.name, str(len(base.scene.pairs)), str(base.num_rows), *times, *compiling])
         for variant in scene.variants[1:]:
             if not variant.is_unchanged:
                 emphasised.add((len(groups), 8))

@@ -1,8 +1,6 @@
 """What an experiment on leaving out can be told; imports nothing heavy."""
 
-from typing import Annotated, Literal
-
-from pydantic import Field
+from typing import Literal
 
 from experiments.settings import RunSettings, SettingsTable
 
@@ -41,10 +39,6 @@ class Settings(RunSettings):
     """The numbers that go with the size: those of the file's table of that name."""
     scenes: tuple[SceneName, ...] = ()
     """Which scenes; those of the size, if none is given."""
-    duration: Annotated[float, Field(gt=0)] = 1.0
-    """Of each recorded rollout (s)."""
-    control_share: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Of the range of the controls, over which they are drawn for the recorded rollouts."""
 
     @property
     def chosen(self) -> tuple[SceneName, ...]:

@@ -32,6 +32,11 @@ class Variant:
     scene: mg.Scene
     what: str
 
+    @property
+    def num_rows(self) -> int:
+        """Of constraints."""
+        return int(self.scene.data._impl.nefc)
+
 
 def variants(path: Path, recorded: mg.Trajectory) -> list[Variant]:
     """Build a scene with everything, without each group that it has, and without all that it does not need.

@@ -89,7 +89,7 @@ def _image(axis: Axes, values: np.ndarray, colours: Sequence[str]) -> None:
 
 def _scales(axis: Axes, across: str, up: str, count: int) -> None:
     """Ticks at a few of the values that the squares stand for."""
-    at = np.unique(np.linspace(0, count - 1, 4).round().astype(int))
+    at = np.unique(np.linspace(0, count - 1, 3).round().astype(int))
     for name, put in ((across, axis.set_xticks), (up, axis.set_yticks)):
         values = AXES[name](np.linspace(0, 1, count))[at]
         put(at, [_short(value) for value in values])

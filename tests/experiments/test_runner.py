@@ -138,6 +138,20 @@ def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch)
     assert [path.name for path in (copied / "runs").iterdir()] == ["steep"]
 
 
+@pytest.mark.parametrize(("can_draw", "status"), [(False, 0), (True, 2)])
+def test_a_report_that_lacks_its_video_is_made_again_once_it_can_be_drawn(copied, monkeypatch, can_draw, status):
+    """A run that is reached raises here."""
+
+    def reached(*_):
+        raise ValueError("reached")
+
+    facts = copied / "runs" / "steep" / "environment.json"
+    facts.write_text(facts.read_text().replace('"lacks_video": false', '"lacks_video": true'))
+    monkeypatch.setattr(video, "can_draw", lambda: can_draw)
+    monkeypatch.setattr(measure, "measure", reached)
+    assert run(copied / "steep.toml", copied / "runs") == status
+
+
 def test_a_library_refusal_is_a_sentence_and_debug_shows_the_traceback(copied, monkeypatch, capsys):
     def refuse(*_):
         raise mg.DivergedError("the rollout diverged at step 3")
