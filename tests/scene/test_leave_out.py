@@ -106,7 +106,7 @@ def test_mistakes_are_named(wanted, message):
 
 
 def test_a_listed_pair_is_not_left_out_by_name():
-    with pytest.raises(ValueError, match="listed as <pair> in the MJCF, got 'bob – floor'; remove it there"):
+    with pytest.raises(ValueError, match="listed as <pair> in the MJCF, got 'floor – bob'; remove it there"):
         mg.load_scene(PAIRED, leave_out=mg.LeaveOut(pairs=(("floor", "bob"),)))
 
 
