@@ -80,7 +80,8 @@ class GradientEstimate(eqx.Module):
     def variance(self) -> Float[Array, "*batch"]:
         """Trace of the covariance, per rollout."""
         first = jnp.ndim(self.num_samples)  # what stands before is of `jax.vmap`
-        return sum(leaf.sum(axis=tuple(range(first, leaf.ndim))) for leaf in jax.tree.leaves(self.covariance_diagonal))
+        leaves = jax.tree.leaves(self.covariance_diagonal)
+        return jnp.stack([leaf.sum(axis=tuple(range(first, leaf.ndim))) for leaf in leaves]).sum(axis=0)
 
     @property
     def finite_fraction(self) -> Float[Array, "*batch"]:

@@ -306,8 +306,8 @@ def _start(static: PyTree, arrays: PyTree, params: Float[Array, " dim"]) -> Carr
     method, options = eqx.combine(arrays, static)
     nan = jnp.full((), jnp.nan, params.dtype)
     best, recent = Best(params, nan, nan + jnp.inf, nan), Recent.empty(options.convergence, params.dtype)
-    counts = [jnp.zeros((), jnp.int32)] * 5
-    return Carry(params, method.init(params), best, recent, *counts, jax.tree.map(jnp.asarray, Stopped.running))
+    zero, stopped = jnp.zeros((), jnp.int32), jax.tree.map(jnp.asarray, Stopped.running)
+    return Carry(params, method.init(params), best, recent, zero, zero, zero, zero, zero, stopped)
 
 
 def _segment(
