@@ -81,18 +81,18 @@ def verdict(outcome: Outcome) -> str:
     """Say how the libraries stand at the largest target, over all scenes."""
     target = max(outcome.settings.targets)
     times = []
-    for other, name in ((MJX, "of mjx.step"), (C, f"of C MuJoCo on {_threads()}")):
+    for other, name in ((MJX, "mjx.step"), (C, f"C MuJoCo on {_threads()}")):
         pairs = [(_best(course, MG, target), _best(course, other, target)) for course in outcome.courses]
         if ratios := [one.cost / two.cost for one, two in pairs if one is not None and two is not None]:
             reach = f" ({min(ratios):.2g} to {max(ratios):.2g} on {len(ratios)} scenes)" if len(ratios) > 1 else ""
-            times.append(f"{np.median(ratios):.2g} times that {name}{reach}")
+            times.append(f"{np.median(ratios):.2g} times as long as {name}{reach}")
     found = [cheapest(course.estimates, target) for course in outcome.courses]
     counts = Counter(choice.estimate.estimator for choice in found if choice is not None)
     ways = [f"{name} (on {count} {'scene' if count == 1 else 'scenes'})" for name, count in counts.most_common()]
     lost = found.count(None)
     sentences = []
     if times:
-        sentences.append(f"For {percent(target)} error of the motion mg.step takes a time of {joined(times)}.")
+        sentences.append(f"For {percent(target)} error of the motion mg.step takes {joined(times)}.")
     if ways:
         sentences.append(f"{percent(target)} error of the gradient is soonest reached by {'; '.join(ways)}.")
     if lost and sentences:
