@@ -135,7 +135,8 @@ def record(
         bad, final = jnp.array(-1, jnp.int32), mg.initial_state(scene)
         return mg.Trajectory(qpos, qvel, ctrl, observations=None, final=final, diverged=bad >= 0, first_bad_step=bad)
 
-    return jax.vmap(trajectory)(states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + model.nv], np.array(controls))
+    parts = (states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + model.nv], np.array(controls))
+    return jax.vmap(trajectory)(*map(jnp.asarray, parts))
 
 
 def segments(recorded: mg.Trajectory, *, batch: int, horizon: int, seed: int) -> _Starts:

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure as Picture
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Outcome, mean_and_error
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
@@ -47,7 +47,8 @@ def summary(outcome: Outcome):
     axes[0, 0].set_xlim(left=_SMALLEST)
     axes[0, 1].set_xlim(-0.04, 1.04)
     axes[0, 0].set_yticks(rows, [cell.label for cell in cells])
-    axes[0, 0].invert_yaxis()
+    axes[0, 0].set_ylim(len(cells) - 0.5, -0.5)
+    axes[0, 2].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
     axes[0, 1].set(title="Weight of the first order", xlabel="α")
     axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
