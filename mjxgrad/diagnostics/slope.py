@@ -26,14 +26,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 Simulate = Callable[[Float[Array, ""], str], Float[Array, "*outcome"]]
 
-_OfOutcome = Float[np.ndarray, "*outcome"]
-_OfEach = Float[np.ndarray, "gradients *outcome"]
-_Judged = Bool[np.ndarray, "gradients *outcome"]
-
-# Fewest phases from which eight blocks for the error bar can be had, with four points each.
+# Fewest phases from which four local slopes and eight blocks for the error bar can be had, with four points each.
 _FEWEST_PHASES = 32
+_NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
+# Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
+_IRREGULAR = 0.5
 _ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
 
 
@@ -52,6 +51,8 @@ class SlopeComparison(eqx.Module):
         mean: of each derivative over the interval, weighted as the slope is.
         mean_error: its standard error.
         spread: standard deviation of each derivative over the phases.
+        local_slopes: of the outcome over each quarter of the interval.
+        num_teeth: how often the outcome crosses its own trend, halved: about the number of teeth in the interval.
         num_finite: phases at which outcome and derivatives are finite; only these count.
         resolution: what rounding of the outcome leaves of a slope; smaller errors are none.
     """
@@ -60,41 +61,62 @@ class SlopeComparison(eqx.Module):
     parameters: Float[np.ndarray, " phases"]
     outcomes: Float[np.ndarray, "phases *outcome"]
     derivatives: Float[np.ndarray, "gradients phases *outcome"]
-    slope: _OfOutcome
-    slope_error: _OfOutcome
-    mean: _OfEach
-    mean_error: _OfEach
-    spread: _OfEach
+    slope: Float[np.ndarray, "*outcome"]
+    slope_error: Float[np.ndarray, "*outcome"]
+    mean: Float[np.ndarray, "gradients *outcome"]
+    mean_error: Float[np.ndarray, "gradients *outcome"]
+    spread: Float[np.ndarray, "gradients *outcome"]
+    local_slopes: Float[np.ndarray, "windows *outcome"]
+    num_teeth: Float[np.ndarray, "*outcome"]
     num_finite: Int[np.ndarray, "*outcome"]
-    resolution: _OfOutcome
+    resolution: Float[np.ndarray, "*outcome"]
 
     @property
-    def standard_error(self) -> _OfEach:
+    def standard_error(self) -> Float[np.ndarray, "gradients *outcome"]:
         """Of `error`: both parts as if independent, which they nearly are, one being about jumps and one about flanks."""
         return np.hypot(self.mean_error, self.slope_error)
 
     @property
-    def error(self) -> _OfEach:
+    def irregularity(self) -> Float[np.ndarray, "*outcome"]:
+        """How far the slopes of the quarters are off a straight line through them, over `scale`.
+
+        Small where a slope exists to be compared with; of order one where the outcome is torn, by chaos or by real
+        discontinuities, or where a quarter holds too few teeth.
+        """
+        place = np.arange(_NUM_WINDOWS) - (_NUM_WINDOWS - 1) / 2
+        centred = self.local_slopes - self.local_slopes.mean(axis=0)
+        tilt = np.tensordot(place, centred, axes=1) / (place**2).sum()
+        rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
+        size = np.abs(rest).max(axis=0)
+        return np.asarray(np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale)
+
+    @property
+    def is_regular(self) -> Bool[np.ndarray, "*outcome"]:
+        """Where `irregularity` is at most a half; elsewhere the interval spans too few teeth, or the motion is chaotic."""
+        return np.asarray(self.irregularity <= _IRREGULAR)
+
+    @property
+    def error(self) -> Float[np.ndarray, "gradients *outcome"]:
         """Mean of each derivative less the slope."""
         return self.mean - self.slope
 
     @property
-    def scale(self) -> _OfOutcome:
+    def scale(self) -> Float[np.ndarray, "*outcome"]:
         """What errors are measured by: the larger of the slope and the error of the first derivative named."""
         # Where both are nothing but rounding, no error is to look large beside it.
         return np.asarray(np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution))
 
     @property
-    def relative_error(self) -> _OfEach:
+    def relative_error(self) -> Float[np.ndarray, "gradients *outcome"]:
         """Size of `error` beyond rounding, over `scale`."""
         size = np.abs(self.error)
         return np.where(size > self.resolution, size, 0 * size) / self.scale
 
-    def is_close(self, tolerance: float = 0.05) -> _Judged:
+    def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
         """Say where the mean of a derivative is the slope to within `tolerance` times `scale`."""
         return self.relative_error <= tolerance
 
-    def is_off(self, tolerance: float = 0.05) -> _Judged:
+    def is_off(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
         """Say where it is not, beyond two standard errors. What is neither close nor off needs more rollouts."""
         return np.abs(self.error) - 2 * self.standard_error > np.maximum(tolerance * self.scale, self.resolution)
 
@@ -196,7 +218,7 @@ def compare_to_slope(
     flat, flat_slopes = y.reshape(len(x), -1), slopes.reshape(len(slopes), len(x), -1)
     columns = [_column(place, flat[:, j], flat_slopes[:, :, j]) for j in range(flat.shape[1])]
     parts = [np.array([column[i] for column in columns]) for i in range(len(columns[0]))]
-    slope, slope_error, mean, mean_error, spread, num_finite = (
+    slope, slope_error, local_slopes, num_teeth, mean, mean_error, spread, num_finite = (
         np.moveaxis(part, 0, -1).reshape((*part.shape[1:], *y.shape[1:])) for part in parts
     )
     # Of an outcome that is zero throughout: not zero, for errors are divided by it.
@@ -211,6 +233,8 @@ def compare_to_slope(
         mean=mean,
         mean_error=mean_error,
         spread=spread,
+        local_slopes=local_slopes * 2 / width,
+        num_teeth=num_teeth,
         num_finite=num_finite.astype(int),
         resolution=np.asarray(_ROUNDINGS * epsilon * size / width),
     )
@@ -231,17 +255,32 @@ def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients p
     count = int(is_finite.sum())
     if count < _FEWEST_PHASES:
         nothing = np.full(len(slopes), np.nan)
-        return np.nan, np.nan, nothing, nothing, nothing, count
+        return np.nan, np.nan, np.full(_NUM_WINDOWS, np.nan), np.nan, nothing, nothing, nothing, count
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
-    # Its product with an outcome is the slope of the weighted straight line.
-    centred = u - (weight @ u) / weight.sum()
-    lever = weight * centred / (weight @ centred**2)
+    lever = _lever(u, weight)
     # A trend of degree 3, for curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
+    slope_error = _clustered(lever * rest)
     kernel = weight**2 / (weight**2).sum()
     errors = np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes])
-    return lever @ y, _clustered(lever * rest), slopes @ kernel, errors, slopes.std(axis=1, ddof=1), count
+    teeth = np.count_nonzero(np.diff(np.signbit(rest))) / 2
+    return (
+        lever @ y,
+        slope_error,
+        _local_slopes(u, y),
+        teeth,
+        slopes @ kernel,
+        errors,
+        slopes.std(axis=1, ddof=1),
+        count,
+    )
+
+
+def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Give the numbers whose product with an outcome is the slope of the weighted straight line."""
+    centred = u - (weight @ u) / weight.sum()
+    return weight * centred / (weight @ centred**2)
 
 
 def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
@@ -265,3 +304,11 @@ def _clustered(terms: np.ndarray) -> float:
     blocks = np.array_split(terms, min(_MOST_BLOCKS, len(terms) // _POINTS_PER_BLOCK))
     sums = np.array([block.sum() for block in blocks])
     return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)))
+
+
+def _local_slopes(u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " windows"]:
+    found = []
+    for at, value in zip(np.array_split(u, _NUM_WINDOWS), np.array_split(y, _NUM_WINDOWS), strict=True):
+        half = (at[-1] - at[0]) / 2 * len(at) / (len(at) - 1)
+        found.append(_lever(at, 1 - ((at - (at[0] + at[-1]) / 2) / half) ** 2) @ value)
+    return np.array(found)
