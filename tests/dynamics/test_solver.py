@@ -10,9 +10,9 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import newton
 from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.jacobian import DenseRows
-from mjxgrad.dynamics.newton import Problem
-from mjxgrad.dynamics.sparse import SparseRows
+from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
+from mjxgrad.dynamics.kinematics import Inertia
+from mjxgrad.dynamics.newton import System
 
 _BALL = """
 <mujoco>
@@ -110,10 +110,10 @@ def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
     single = [jnp.asarray(x, jnp.float32) for x in (np.diag(mass), force, np.eye(2), reference, weight)]
     inertia, force, entries, reference, weight = single
     rows = Rows(reference, weight, jnp.zeros_like(weight), ())
-    jacobian = SparseRows.of(DenseRows(entries), jnp.ones(2, bool), 2)
+    system = System(Inertia(inertia), force, JoinedRows((DenseRows(entries),)), jnp.ones(2, bool), rows)
     start = jnp.array([expected[0], 0.0], jnp.float32)
     tolerance = jnp.asarray(1e-6, jnp.float32)
-    found, _ = newton.minimise(RowLayout(0, 0, 2), Problem(inertia, force, jacobian, rows), start, tolerance, 100)
+    found, _ = newton.minimise(RowLayout(0, 0, 2), 100, system, start, tolerance)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
