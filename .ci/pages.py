@@ -6,7 +6,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
-TEXTS = ("README.md", "mjxgrad/README.md", "experiments/*.md", "experiments/gallery/*")
+TEXTS = ("README.md", "mjxgrad/*.md", "experiments/*.md", "experiments/gallery/*")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -21,6 +21,7 @@ from mjxgrad.objective.base import (
     unchanged,
     value_and_gradient,
 )
+from mjxgrad.objective.parameters import flattened
 from mjxgrad.task import Outcome, Task, as_pytree
 
 
@@ -158,7 +159,7 @@ class ClosedLoop(ActionNoise):
 
     def ravel(self, policy_params: PyTree) -> Float[Array, " dim"]:
         """Flatten the policy's parameters."""
-        return ravel_pytree(policy_params)[0]
+        return _flat(policy_params)[0]
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
         actions, start = self.split(noise)
@@ -219,7 +220,8 @@ def closed_loop(
         task: what is controlled, and what it costs.
         policy: takes its parameters and a state, gives controls of shape (nu,).
         stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
-        params: an example of the policy's parameters; only its structure and shapes count.
+        params: an example of the policy's parameters, of a dict or an equinox module too; of its floating-point arrays only
+            the shapes count, what else it holds is kept.
             Without it the policy is handed the flat vector itself.
 
     Returns:
@@ -233,7 +235,7 @@ def closed_loop(
         reinforcement learning. Machine Learning 8, 1992, theorem 1.
     """
     stddev = _action_stddev(task, stddev)
-    flat, unravel = (None, unchanged) if params is None else ravel_pytree(params)
+    flat, unravel = (None, unchanged) if params is None else _flat(params)
     return ClosedLoop(
         task=task,
         policy=as_pytree(policy),
@@ -241,6 +243,14 @@ def closed_loop(
         unravel=unravel,
         dim=None if flat is None else flat.size,
     )
+
+
+def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
+    if all(map(eqx.is_array_like, jax.tree.leaves(params))):
+        return ravel_pytree(params)  # whose way back equals another of the same structure
+    vector, restore = flattened(params)
+    assert restore is not None
+    return vector, restore
 
 
 @dataclasses.dataclass(frozen=True)
