@@ -17,14 +17,10 @@ WAYS = ("first order, discrete", "first order, event", "zeroth order")
 
 @dataclass(frozen=True)
 class Static:
-    """Force on a body held along a path: three components (N), and the torque over half an edge (N).
+    """Jumps of the force on a body held along a path, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`; torque is over half an edge (N).
 
-    Attributes:
-        num_rows: constraint rows of the shape, the measure of a step's cost.
-        is_lattice: whether the shape stands for a pressure field; its own contact is gentle, and it is not smoothed.
-        jumps: of the force, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`.
-        contacts: number of different contact points on the grid, as MJX finds them.
-        copies: how many contacts there are beside these, in the same places.
+    A lattice's own contact is gentle, and it is not smoothed. Contacts are different points on the grid, as MJX finds them, and
+    copies those beside them in the same places.
     """
 
     shape: str
