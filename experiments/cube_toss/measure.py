@@ -28,7 +28,6 @@ from mjxgrad.integration import adaptive_rollout
 _SPEEDS = PUBLISHED_SPEED + 0.005 * (np.arange(4) / 4 - 0.5)
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10
-_NUM_SUBSTEPS = 8
 
 # From a throw, its speed and a time step or tolerance to a derivative, the number of steps, and whether it failed.
 Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]
@@ -115,11 +114,7 @@ class Outcome:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Take the derivative of every throw by every method.
-
-    Raises:
-        ExperimentError: if a time step does not divide the throw, or the reference fails.
-    """
+    """Take the derivative of every throw by every method."""
     for timestep in (*settings.timesteps, *settings.refined_timesteps):
         if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
             raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
@@ -153,13 +148,16 @@ def _point(name: str, task: CubeToss, setting: float) -> Point:
     begun = time.process_time()
     call()
     spent = time.process_time() - begun
-    steps, has_failed = float(np.mean(num_steps)), bool(np.any(failed))
-    return Point(name, setting, np.asarray(derivative), spent / len(_SPEEDS), first, steps, has_failed)
+    seconds, steps = spent / len(_SPEEDS), float(np.mean(num_steps))
+    return Point(name, setting, np.asarray(derivative), seconds, first, steps, bool(np.any(failed)))
 
 
 @eqx.filter_jit
 def _taken(derivative: Derivative, task: CubeToss, setting: Array):
-    """Take the throws one after the other; one program per method, whatever the contact and the time step."""
+    """Take the throws one after the other, for under `jax.vmap` all would take the short steps at every event.
+
+    One program per method serves every contact and time step.
+    """
     return jax.lax.map(lambda speed: derivative(task, speed, setting), jnp.asarray(_SPEEDS))
 
 
@@ -195,14 +193,9 @@ def _quotient(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Ar
 
 
 def substepped_step(
-    model: mjx.Model, data: mjx.Data, *, num_substeps: int, gradient: Gradient = "discrete"
+    model: mjx.Model, data: mjx.Data, *, num_substeps: int = 8, gradient: Gradient = "discrete"
 ) -> mjx.Data:
-    """Advance by one time step, in short steps if a contact or limit begins or ends in it.
-
-    A step holds an event if a distance changes its sign, judged by the distances at its beginning and the velocities at its
-    end. Under `jax.vmap` every member takes the short steps in every step and throws them away. Fields that are not of the
-    state are those of the last step taken, long or short.
-    """
+    """Advance by one time step, in short steps if a contact or limit begins or ends in it: if a distance changes its sign."""
     after = mg.step(model, data, gradient=gradient)
     short = at_time_step(model, model.opt.timestep / num_substeps)
 
@@ -216,7 +209,7 @@ def substepped_step(
 
 
 def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:
-    """Whether some distance changes its sign in a step."""
+    """Whether some distance changes its sign, judged by distances at the step's beginning and velocities at its end."""
     # Contacts and kinematics of a stepped data are those of the state before; its position is not.
     blocks = assembly.gather(model, after.replace(qpos=before.qpos))
     if not any(block.rows_each for block in blocks):
@@ -230,9 +223,7 @@ _DERIVATIVES: dict[str, Derivative] = {
     "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
     "event": functools.partial(_by_steps, functools.partial(mg.step, gradient="event")),
     "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),
-    "substeps": functools.partial(
-        _by_steps, functools.partial(substepped_step, num_substeps=_NUM_SUBSTEPS, gradient="event")
-    ),
+    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, gradient="event")),
     "adaptive": _adaptive,
     "quotient": _quotient,
 }

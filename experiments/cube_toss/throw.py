@@ -18,7 +18,8 @@ PUBLISHED_SPEED = -2.0  # m/s, upwards
 PUBLISHED_DERIVATIVE = 0.17267  # m per m/s
 _DRIFT = -0.1  # m/s, sideways
 
-# (solref, solimp): what DiffMJX was timed on, and what MuJoCo takes if nothing is said.
+# (solref, solimp): what DiffMJX was timed on, whose force begins without a jump, and what MuJoCo takes if
+# nothing is said.
 _CONTACTS = {
     "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
     "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),
@@ -26,11 +27,7 @@ _CONTACTS = {
 
 
 class CubeToss(eqx.Module):
-    """The throw; see `cube_toss`.
-
-    Attributes:
-        scene: the cube and the floor.
-    """
+    """The throw; see `cube_toss`."""
 
     scene: Scene
 
@@ -45,20 +42,7 @@ class CubeToss(eqx.Module):
 
 
 def cube_toss(contact: str = "published", *, timestep: float | None = None) -> CubeToss:
-    """Load the throw.
-
-    Args:
-        contact: "published", which begins without a jump of force, or "default", MuJoCo's own, which jumps.
-        timestep: in s; None takes the scene's, 1 ms.
-
-    Returns:
-        The task.
-
-    Raises:
-        ValueError: if there is no such contact.
-    """
-    if contact not in _CONTACTS:
-        raise ValueError(f"contact must be one of {', '.join(map(repr, _CONTACTS))}, got {contact!r}")
+    """Load the throw, with contact whose force begins without a jump or with one; `timestep` (s) is the scene's if None."""
     scene = load_scene(scene_path("cube_toss"), timestep=timestep)
     solref, solimp = (jnp.array([row]) for row in _CONTACTS[contact])
     return CubeToss(scene.with_model(pair_solref=solref, pair_solimp=solimp))
