@@ -5,8 +5,8 @@ from these records, so that nothing is simulated, or compiled, anew for another 
 """
 
 import functools
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -70,19 +70,6 @@ class Recorded(Objective):
         )
 
 
-@dataclass(frozen=True)
-class Record:
-    """Rollouts at one time step and softness with one derivative, or none, whose gradients are then zero.
-
-    The seconds are those of one rollout, of each repetition.
-    """
-
-    costs: Float[np.ndarray, " rollouts"]
-    gradients: Float[np.ndarray, "rollouts dim"]
-    seconds: tuple[float, ...]
-    compile_seconds: float
-
-
 def measured(
     case: Case, programs: dict[Variant, Program], settings: Settings
 ) -> tuple[GradientReference, list[Estimate]]:
@@ -98,11 +85,15 @@ def measured(
     estimates = []
     for timestep, softening in ways:
         knobs = Knobs(timestep, TIGHT_TOLERANCE, softening)
-        every = {name: _record(one, noise, knobs, settings) for name, one in {None: simulate, **derivatives}.items()}
-        for name, (function, derivative) in ESTIMATORS.items():
-            if derivative in every:
-                about = {"estimator": name, "timestep": timestep, "softening": softening}
-                estimates += _estimates(case, function, every[derivative], noise, reference, settings, about)
+        every = {
+            name: (one, *_record(one, noise, knobs, settings)) for name, one in {None: simulate, **derivatives}.items()
+        }
+        used = [(name, function, *every[one]) for name, (function, one) in ESTIMATORS.items() if one in every]
+        for (name, function, program, record, taken), count in itertools.product(used, sizes.num_samples):
+            errors = _estimate(function, count, record, np.array(reference.value), settings.seed)
+            seconds = tuple(count * one for one in taken)
+            about = name, count, timestep, softening
+            estimates.append(Estimate(*about, *errors, seconds, program.compile_seconds))
     return reference, estimates
 
 
@@ -167,7 +158,8 @@ def _in_chunks(program: Program, run: Callable, noise: np.ndarray) -> np.ndarray
     return np.concatenate([run(qvel) for qvel in starts])[: len(noise)]
 
 
-def _record(program: Program, noise: np.ndarray, knobs: Knobs, settings: Settings) -> Record:
+def _record(program: Program, noise: np.ndarray, knobs: Knobs, settings: Settings) -> tuple[Recorded, list[float]]:
+    """Simulate at one time step and softness; gradients are zero without a derivative. The times of one rollout go with it."""
     case, batch = program.case, program.variant.batch
     first = case.start[1] + np.resize(noise, (batch, noise.shape[1])) @ case.directions
     _, taken = repeated(program, first, knobs, settings.sizes)
@@ -176,53 +168,32 @@ def _record(program: Program, noise: np.ndarray, knobs: Knobs, settings: Setting
     else:
         both = _in_chunks(program, lambda qvel: np.column_stack(program.timed(qvel, knobs)[0]), noise)
         costs, gradients = both[:, 0], both[:, 1:]
-    return Record(costs, gradients, tuple(one / batch for one in taken), program.compile_seconds)
-
-
-def _estimates(
-    case: Case,
-    function: str,
-    record: Record,
-    noise: np.ndarray,
-    reference: GradientReference,
-    settings: Settings,
-    about: dict,
-) -> list[Estimate]:
-    right = np.array(reference.value)
-    size = float(np.linalg.norm(right))
-    keys = jax.random.split(jax.random.key(settings.seed), _REPEATS)
     dim = noise.shape[1]
-    arrays = {"costs": record.costs, "gradients": record.gradients, "noise": noise, "stddev": np.full(dim, case.stddev)}
-    objective = Recorded(**{name: jnp.asarray(each) for name, each in arrays.items()}, dim=dim)
-    found = []
-    for num_samples in settings.sizes.num_samples:
-        values = np.asarray(_repeated(objective, keys, function, num_samples))
-        # What it has in the mean, and the error of that, from all rollouts where it is linear in them.
-        if function == "zeroth_order":
-            centre, chance = smoothed_gradient(record.costs, noise, case.stddev)
-        elif function == "first_order":
-            centre, chance = _over_scrambles(record.gradients)
-        else:
-            centre, chance = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
-        offset, chance = (float(np.linalg.norm(each) / size) for each in (centre - right, chance))
-        variance = float(values.var(axis=0, ddof=1).sum() / size**2)
-        is_finite = np.isfinite([offset, chance, variance]).all()
-        bias = float(np.sqrt(max(0.0, offset**2 - chance**2))) if is_finite else np.inf
-        low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
-        found.append(
-            Estimate(
-                **about,
-                num_samples=num_samples,
-                error=float(np.hypot(bias, np.sqrt(variance))) if is_finite else np.inf,
-                spread=(low, high),
-                bias=bias,
-                bias_error=chance,
-                variance=variance,
-                seconds=tuple(num_samples * one for one in record.seconds),
-                compile_seconds=record.compile_seconds,
-            )
-        )
-    return found
+    arrays = {"costs": costs, "gradients": gradients, "noise": noise, "stddev": np.full(dim, case.stddev)}
+    record = Recorded(**{name: jnp.asarray(each) for name, each in arrays.items()}, dim=dim)
+    return record, [one / batch for one in taken]
+
+
+def _estimate(
+    function: str, num_samples: int, record: Recorded, right: np.ndarray, seed: int
+) -> tuple[float, tuple[float, float], float, float, float]:
+    """Give an estimator's error, spread, bias with its error, and variance, over the size of the right gradient."""
+    size, keys = float(np.linalg.norm(right)), jax.random.split(jax.random.key(seed), _REPEATS)
+    values = np.asarray(_repeated(record, keys, function, num_samples))
+    # What it has in the mean, and the error of that, from all rollouts where it is linear in them.
+    if function == "zeroth_order":
+        centre, chance = smoothed_gradient(np.asarray(record.costs), np.asarray(record.noise), float(record.stddev[0]))
+    elif function == "first_order":
+        centre, chance = _over_scrambles(np.asarray(record.gradients))
+    else:
+        centre, chance = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    offset, chance = (float(np.linalg.norm(each) / size) for each in (centre - right, chance))
+    variance = float(values.var(axis=0, ddof=1).sum() / size**2)
+    is_finite = np.isfinite([offset, chance, variance]).all()
+    bias = float(np.sqrt(max(0.0, offset**2 - chance**2))) if is_finite else np.inf
+    low, high = np.quantile(np.linalg.norm(values - right, axis=1) / size, (0.25, 0.75)).tolist()
+    error = float(np.hypot(bias, np.sqrt(variance))) if is_finite else np.inf
+    return error, (low, high), bias, chance, variance
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

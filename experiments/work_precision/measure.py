@@ -1,5 +1,6 @@
 """From settings to numbers: first of all the error of the motion against run time."""
 
+import functools
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import mjxgrad as mg
+from experiments.parallel import in_threads
 from experiments.work_precision import gradient
 from experiments.work_precision.cases import CONES, Case, case
 from experiments.work_precision.outcome import (
@@ -88,8 +90,10 @@ def variants(one: Case, settings: Settings, has_asides: bool) -> list[Variant]:
 
 
 def _course(name: str, one: Case, needed: list[Variant], settings: Settings, on_each: Callable[[], None]) -> Course:
-    programs = compiled(one, needed, on_each)
-    qvel = _starts(one, settings.sizes.batch, settings.seed)
+    built = in_threads(functools.partial(compiled, one), needed, lambda _: on_each())
+    programs = dict(zip(needed, built, strict=True))
+    noise = np.random.default_rng(settings.seed).normal(size=(settings.sizes.batch, len(one.moved)))
+    qvel = one.start[1] + one.stddev * noise @ one.directions
     right = _truths(one, programs, qvel)
     points = _measured(one, programs, qvel, right, settings)
     reference, estimates = gradient.measured(one, programs, settings)
@@ -99,7 +103,7 @@ def _course(name: str, one: Case, needed: list[Variant], settings: Settings, on_
 
 @dataclass(frozen=True)
 class Truth:
-    """The final state that motions are compared with, and in what units: way gone and speed, root mean square over states."""
+    """The final states that motions are compared with, in units of the way gone and of speed, root mean square over states."""
 
     case: Case
     ends: Ends
@@ -110,16 +114,6 @@ class Truth:
         """Compare a batch of ends, or its first states: root-mean-square distances, relative; NaN if one is not finite."""
         count = len(ends[0])
         return _relative(self.case, (self.ends[0][:count], self.ends[1][:count]), ends, self.scales)
-
-    def distance(self, ends: Ends) -> float:
-        """Give the larger of both errors."""
-        return max(self.errors(ends))
-
-
-def _starts(case: Case, batch: int, seed: int) -> Float[np.ndarray, "batch nv"]:
-    """Draw start velocities."""
-    noise = np.random.default_rng(seed).normal(size=(batch, len(case.moved)))
-    return case.start[1] + case.stddev * noise @ case.directions
 
 
 def _truths(
@@ -145,7 +139,7 @@ def _truths(
         else:
             finer = programs.get(replace(euler, integrator="RK4"), programs[euler])
             shared = _truth(case, qvel, finer, _FINEST, found.get((MG, case.cone)))
-            apart = native.distance(shared.ends)
+            apart = max(native.errors(shared.ends))
         shared = replace(shared, found=replace(shared.found, distance_to_c=apart))
         found |= {(C, cone): native, (MG, cone): shared}
     return found
@@ -161,7 +155,7 @@ def _truth(
     way, speed = _rms(differences(case.model, start, runs[0])), np.sqrt((_rms(qvel) ** 2 + _rms(runs[0][1]) ** 2) / 2)
     scales = way, float(speed)
     error, coarser = (max(_relative(case, fine, coarse, scales)) for fine, coarse in itertools.pairwise(runs))
-    distance = 0.0 if own_cone is None else own_cone.distance(runs[0])
+    distance = 0.0 if own_cone is None else max(own_cone.errors(runs[0]))
     return Truth(case, runs[0], scales, Reference(error, coarser, distance))
 
 
@@ -205,10 +199,7 @@ def _knobs(case: Case, variant: Variant, settings: Settings) -> list[Knobs]:
 
 
 def differences(model: mujoco.MjModel, start: Ends, end: Ends) -> Float[np.ndarray, "batch nv"]:
-    """Give position differences as `mj_differentiatePos` does, in m and rad, one per degree of freedom.
-
-    They take each start to its end; NaN where one is not finite.
-    """
+    """Give what takes each start to its end, as `mj_differentiatePos` does, in m and rad; NaN where one is not finite."""
     found = np.full((len(end[0]), model.nv), np.nan)
     for row, one, other in zip(found, start[0], end[0], strict=True):
         if np.isfinite(one).all() and np.isfinite(other).all():

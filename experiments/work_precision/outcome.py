@@ -87,20 +87,12 @@ class Point:
 
 @dataclass(frozen=True)
 class Reference:
-    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'.
+    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'."""
 
-    Attributes:
-        error: distance between the finest run and the one at twice its step.
-        coarser_error: likewise between the runs at two and four times the step.
-        distance: from the same engine's reference with the scene's own cone: what the cone makes of the motion.
-        distance_to_c: of MJX's contacts from C MuJoCo's: after the same steps where both are the same motion, else of their
-            references.
-    """
-
-    error: float
-    coarser_error: float
-    distance: float
-    distance_to_c: float = 0.0
+    error: float  # between the finest run and the one at twice its step
+    coarser_error: float  # likewise between the runs at two and four times the step
+    distance: float  # from the same engine's reference with the scene's own cone
+    distance_to_c: float = 0.0  # after the same steps where both engines' motion is the same, else of their references
 
 
 @dataclass(frozen=True)
@@ -192,8 +184,7 @@ class Outcome:
                 on_front = pareto_front([one.cost for one in measured], [one.error for one in measured])
                 for one, is_best in zip(measured, on_front, strict=True):
                     rows.append({"scene": course.name, "of": kind, **_flat(one), "on_front": bool(is_best)})
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        return [{name: row.get(name, "") for name in names} for row in rows]
+        return rows
 
 
 def pareto_front(costs: npt.ArrayLike, errors: npt.ArrayLike) -> Bool[np.ndarray, " points"]:
