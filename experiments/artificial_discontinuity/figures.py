@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import linregress
 
-from experiments.artificial_discontinuity.outcome import PLAIN, WAYS, Outcome, Static
+from experiments.artificial_discontinuity.outcome import PLAIN, WAYS, Outcome
 from experiments.artificial_discontinuity.pushes import TILT
 from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, shades, subplots
@@ -64,10 +64,12 @@ def refinement(outcome: Outcome):
     lattices = {name: [one for one in outcome.statics if one.is_lattice and one.path == name] for name in names}
     counts = outcome.settings.sizes.lattices
     for colour, (name, found) in zip(shades(len(names)), lattices.items(), strict=True):
-        power, error = falls_as(counts, found)
-        if np.isfinite(power):
-            label = f"{PATHS[name].title}: power {quantity(-power, error)}"
-            left.plot(counts, [max(one.worst(PLAIN), _LEAST) for one in found], "o-", color=colour, ms=4, label=label)
+        sizes = [one.worst(PLAIN) for one in found]
+        # Where only a single point touches nothing is refined, and without a jump there is no logarithm.
+        if len(found) >= 3 and min(sizes) > 0 and all(one.contacts.max() >= 2 for one in found):
+            fit = linregress(np.log(counts), np.log(sizes))
+            label = f"{PATHS[name].title}: power {quantity(float(fit.slope), float(fit.stderr))}"
+            left.plot(counts, np.maximum(sizes, _LEAST), "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
     left.set_xticks(counts, [str(one) for one in counts])
     low, high = left.get_ylim()
@@ -87,18 +89,6 @@ def refinement(outcome: Outcome):
         "other. Paths on which some lattice does not jump, or a single point touches, are left out."
     )
     return figure, "A pressure field of ever more points", caption
-
-
-def falls_as(counts: tuple[int, ...], lattices: list[Static]) -> tuple[float, float]:
-    """Give the power of the number of points along an edge by which the largest jump falls, and its standard error.
-
-    NaN for fewer than three lattices, and where one of them does not jump or only a single point touches: there nothing is
-    refined, and without a jump there is no logarithm.
-    """
-    if len(lattices) < 3 or any(one.worst(PLAIN) == 0 or one.contacts.max() < 2 for one in lattices):
-        return np.nan, np.nan
-    fit = linregress(np.log(counts), np.log([one.worst(PLAIN) for one in lattices]))
-    return -float(fit.slope), float(fit.stderr)
 
 
 def slopes(outcome: Outcome):

@@ -32,16 +32,14 @@ class Static:
     copies: Int[np.ndarray, " points"]
 
     def worst(self, force: str) -> float:
-        """Give the largest jump over the largest force on the path; zero without any."""
         return worst(self.jumps[force])
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A jump of the box's force, over that force, beside the gradient of the overlap volume, the reference.
+    """A jump of the box's force, over that force, beside the gradient of the overlap volume, the reference, over itself.
 
-    Geometric is what is there when contact begins gently, too. The reference jumps at that place and changes from a penetration
-    depth before to one after, both over itself. Contacts are counted before and after.
+    Geometric is what is there when contact begins gently, too. Changes are over a penetration depth to each side.
     """
 
     path: str
@@ -74,7 +72,6 @@ class Slopes:
 
     @property
     def bias(self) -> Float[np.ndarray, " ways"]:
-        """Estimates less the reference."""
         return self.estimates - self.reference
 
     @property
@@ -86,11 +83,7 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Mating:
-    """A peg above a hole, by how contact is told.
-
-    Jumps are of the force on the held peg against its offset, and of how deep (m) it is in the end against the offset it is
-    dropped at; slopes are across the edge of the hole.
-    """
+    """A peg and a hole: force on the held peg, and depth (m) of the dropped one, against its offset; slopes across the edge."""
 
     label: str
     force: Jumps
@@ -100,10 +93,7 @@ class Mating:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured: every shape along every path, lattices last; the jumps of the box, and the reference on its grid.
-
-    Then slopes of short pushes, a peg and a hole by geometry, and the friction on a sliding ball against its speed.
-    """
+    """Every shape along every path, lattices last; the reference is on the box's grid, friction against the sliding speed."""
 
     settings: Settings
     statics: list[Static]
@@ -120,7 +110,6 @@ class Outcome:
         return {label: [one for one in self.statics if one.shape == label] for label in labels}
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per body and path, for metrics.csv."""
         return [
             {
                 "shape": one.shape,

@@ -69,7 +69,6 @@ class Course:
 
     @property
     def scale(self) -> float:
-        """Give the size of the derivative."""
         return float(np.abs(self.reference).mean())
 
     def of(self, method: str) -> list[Point]:
@@ -77,7 +76,6 @@ class Course:
         return sorted((point for point in self.points if point.method == method), key=lambda point: point.setting)
 
     def errors(self, point: Point) -> Float[np.ndarray, " throws"]:
-        """Give the error of every throw."""
         return (point.derivative - self.reference) / self.scale
 
     def error(self, point: Point) -> float:
@@ -93,7 +91,6 @@ class Outcome:
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Give the rows of metrics.csv."""
         return [
             {
                 "contact": course.contact,

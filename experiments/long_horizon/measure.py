@@ -144,7 +144,6 @@ class Rollouts(eqx.Module):
         return np.einsum("stn,stnd->std", self.cost_slopes, self.tangents)
 
     def at(self, rows: np.ndarray) -> "Rollouts":
-        """Give some of them."""
         return jax.tree.map(lambda x: x[rows], self)
 
 

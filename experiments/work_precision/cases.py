@@ -44,12 +44,10 @@ class Case:
 
     @property
     def controls(self) -> Float[np.ndarray, " nu"]:
-        """Controls, constant in time."""
         return np.array(self.ctrl) if self.ctrl else np.zeros(self.model.nu)
 
     @property
     def weights(self) -> Float[np.ndarray, " nq"]:
-        """Weights of the final positions in the outcome."""
         return _filled(np.zeros(self.model.nq), self.outcome)
 
     @property
@@ -59,12 +57,10 @@ class Case:
 
     @property
     def timestep(self) -> float:
-        """The scene's own, in s."""
         return self.model.opt.timestep
 
     @property
     def cone(self) -> Cone:
-        """The scene's own."""
         return next(name for name, cone in CONES.items() if cone == self.model.opt.cone)
 
 

@@ -76,12 +76,10 @@ class Point:
 
     @property
     def cost(self) -> float:
-        """Median wall time per simulated second of one state."""
         return float(np.median(self.seconds))
 
     @property
     def line(self) -> tuple[Any, ...]:
-        """What it has in common with the points that differ in time step alone."""
         return self.variant, self.knobs.tolerance
 
 
@@ -93,6 +91,11 @@ class Reference:
     coarser_error: float  # likewise between the runs at two and four times the step
     distance: float  # from the same engine's reference with the scene's own cone
     distance_to_c: float = 0.0  # after the same steps where both engines' motion is the same, else of their references
+
+    @property
+    def converges(self) -> bool:
+        """Whether halving the step still brought it nearer, or there is nothing left but rounding."""
+        return self.error < 0.75 * self.coarser_error or self.error < 1e-9
 
 
 @dataclass(frozen=True)
@@ -118,12 +121,10 @@ class Estimate:
 
     @property
     def cost(self) -> float:
-        """Median wall time of one estimate."""
         return float(np.median(self.seconds))
 
     @property
     def line(self) -> tuple[Any, ...]:
-        """What it has in common with the estimates that differ in the number of samples alone."""
         return self.estimator, self.timestep, self.softening
 
 
@@ -140,6 +141,11 @@ class GradientReference:
     step_error: float
     difference: float
     difference_error: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both ways agree within three standard errors; the difference's own bias, a per cent, granted."""
+        return self.difference < 3 * self.difference_error + 0.02
 
 
 @dataclass(frozen=True)
