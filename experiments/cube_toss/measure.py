@@ -1,4 +1,9 @@
-"""From settings to numbers: derivatives of the throw, their error and their time."""
+"""A cube is thrown down on a plane; where does it end, and what does the derivative of that by the throw cost?
+
+References:
+    Paulus, Geist, Schumacher, Musil, Rappenecker, Martius. Hard Contacts with Soft Gradients: Refining Differentiable
+    Simulators for Learning and Control (DiffMJX). arXiv:2506.14186; the cube of its timing experiment.
+"""
 
 import functools
 import time
@@ -10,11 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 import mjxgrad as mg
 from experiments.cube_toss.settings import Settings
-from experiments.cube_toss.throw import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 from experiments.failure import ExperimentError
 from experiments.motion import advance, at_time_step
 from experiments.workspace import Workspace
@@ -23,11 +27,47 @@ from mjxgrad._rollout import data_of
 from mjxgrad.dynamics import Gradient, assembly
 from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration import adaptive_rollout
+from mjxgrad.tasks import scene_path
+
+DURATION = 1.0  # s
+PUBLISHED_SPEED = -2.0  # m/s, upwards
+PUBLISHED_DERIVATIVE = 0.17267  # m per m/s
+_DRIFT = -0.1  # m/s, sideways
+
+# (solref, solimp): what DiffMJX was timed on, whose force begins without a jump, and what MuJoCo takes if
+# nothing is said.
+_CONTACTS = {
+    "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
+    "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),
+}
 
 # Throws at slightly different speed, over which the error is taken, for single derivatives depend on chance (m/s).
 _SPEEDS = PUBLISHED_SPEED + 0.005 * (np.arange(4) / 4 - 0.5)
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10
+
+
+class CubeToss(eqx.Module):
+    """The throw; see `cube_toss`."""
+
+    scene: mg.Scene
+
+    def start(self, speed: Float[ArrayLike, ""]) -> mg.State:
+        """Return the state at a throw upwards at a speed in m/s."""
+        qvel = jnp.zeros_like(self.scene.data.qvel).at[1].set(_DRIFT).at[2].set(speed)
+        return mg.initial_state(self.scene, qvel=qvel)
+
+    def outcome(self, qpos: Float[Array, "*states 7"]) -> Float[Array, "*states"]:
+        """Return how far sideways the cube is, in m."""
+        return qpos[..., 1]
+
+
+def cube_toss(contact: str = "published", *, timestep: float | None = None) -> CubeToss:
+    """Load the throw, with contact whose force begins without a jump or with one; `timestep` (s) is the scene's if None."""
+    scene = mg.load_scene(scene_path("cube_toss"), timestep=timestep)
+    solref, solimp = (jnp.array([row]) for row in _CONTACTS[contact])
+    return CubeToss(scene.with_model(pair_solref=solref, pair_solimp=solimp))
+
 
 # From a throw, its speed and a time step or tolerance to a derivative, the number of steps, and whether it failed.
 Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from experiments.cube_toss.measure import CONTACTS, METHODS, Course, Outcome, Point
-from experiments.cube_toss.throw import PUBLISHED_DERIVATIVE
+from experiments.cube_toss.measure import CONTACTS, METHODS, PUBLISHED_DERIVATIVE, Course, Outcome, Point
 from experiments.report import Table
 from experiments.words import joined, percent, quantity
 
