@@ -34,8 +34,7 @@ PUBLISHED_SPEED = -2.0  # m/s, upwards
 PUBLISHED_DERIVATIVE = 0.17267  # m per m/s
 _DRIFT = -0.1  # m/s, sideways
 
-# (solref, solimp): what DiffMJX was timed on, whose force begins without a jump, and what MuJoCo takes if
-# nothing is said.
+# (solref, solimp): what DiffMJX was timed on, whose force begins without a jump, and what MuJoCo takes if nothing is said.
 _CONTACTS = {
     "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
     "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),

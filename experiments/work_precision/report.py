@@ -155,24 +155,14 @@ def tables(outcome: Outcome) -> list[Table]:
     """Tabulate time for one state and for a batch, compilation, and what cone and contact model make of the motion."""
     rows = []
     for course in outcome.courses:
-        compiling = [
-            np.median(
-                [p.compile_seconds for p in course.points if (p.library, p.variant.integrator) == (name, "Euler")]
-            )
-            for name in (MG, MJX)
-        ]
+        euler = [one for one in course.points if one.variant.integrator == "Euler"]
+        compiling = [np.median([one.compile_seconds for one in euler if one.library == name]) for name in (MG, MJX)]
         others = [one for (engine, cone), one in course.references.items() if engine == MG and cone != course.cone]
         found = course.gradient_reference
-        rows.append(
-            [
-                course.title,
-                *(_alone_and_together(course, name) for name in (MG, MJX, C)),
-                *(f"{seconds:.1f}" for seconds in compiling),
-                _share(others[0].distance) if others else "–",
-                _share(course.references[MG, course.cone].distance_to_c),
-                "; ".join(map(_share, (found.standard_error, found.step_error, found.difference))),
-            ]
-        )
+        row = [course.title, *(_alone_and_together(course, name) for name in (MG, MJX, C))]
+        row += [f"{seconds:.1f}" for seconds in compiling]
+        row += [_share(others[0].distance) if others else "–", _share(course.references[MG, course.cone].distance_to_c)]
+        rows.append([*row, "; ".join(map(_share, (found.standard_error, found.step_error, found.difference)))])
     columns = (
         "scene", "mg.step: alone; in batch", "mjx.step: alone; in batch", "C MuJoCo: alone; in batch",
         "to compile mg.step, s", "mjx.step, s", "cone changes the motion by", "MJX from C MuJoCo",
