@@ -24,15 +24,9 @@ def at_time_step(model: mjx.Model, timestep: ArrayLike) -> mjx.Model:
 
 
 def advance(step: Callable[[mjx.Data], mjx.Data], data: mjx.Data, num_steps: Int[ArrayLike, ""]) -> mjx.Data:
-    """Step many times, the state alone carried along. `mg.rollout` would compile anew for every number of steps.
+    """Step many times, the state alone carried along; `mg.rollout` would compile anew for every number of steps.
 
-    Args:
-        step: from data to data one time step later.
-        data: the start.
-        num_steps: may be traced, and the whole is then for forward mode alone.
-
-    Returns:
-        The start's data with the last state.
+    The number may be traced, and the whole is then for forward mode alone.
     """
 
     def once(_: Array, state: dict[str, Array]) -> dict[str, Array]:
@@ -52,17 +46,7 @@ def motion(
     gradient: str,
     onset: mg.Onset | None = None,
 ) -> Float[Array, "times *outcome"]:
-    """Read a motion at equal intervals, the first `steps_between` steps after the start.
-
-    Args:
-        model: of the scene, as `at_time_step` gives it.
-        data: the start.
-        read: from positions and velocities to what is kept.
-        num_times: how often to read.
-        steps_between: steps from one reading to the next; as for `advance`.
-        gradient: which derivative the steps have.
-        onset: of contacts within the step; None is MuJoCo's motion.
-    """
+    """Read a motion at equal intervals, the first `steps_between` steps after the start; `gradient` and `onset` as in `ARMS`."""
 
     def step(data: mjx.Data) -> mjx.Data:
         return mg.step(model, data, gradient=gradient, onset=onset)  # pyright: ignore[reportArgumentType]

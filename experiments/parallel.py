@@ -27,11 +27,7 @@ def num_compilers(*, besides: int = 0) -> int:
 def in_threads(
     function: Callable[[_Item], _Result], items: Iterable[_Item], advance_to: Callable[[int], None] = lambda _: None
 ) -> list[_Result]:
-    """Call a function that compiles on every item; results keep the order, and `advance_to` is told how many there are.
-
-    Raises:
-        Exception: the first that a call raised.
-    """
+    """Call a function that compiles on every item; results keep the order, and `advance_to` is told how many there are."""
     done = []
     with ThreadPoolExecutor(num_compilers()) as pool:
         for result in pool.map(function, items):

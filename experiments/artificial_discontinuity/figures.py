@@ -4,27 +4,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import linregress
 
-from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, SMOOTHED, WAYS, C, Outcome, Static
+from experiments.artificial_discontinuity.outcome import PLAIN, WAYS, Outcome
 from experiments.artificial_discontinuity.pushes import TILT
 from experiments.artificial_discontinuity.shapes import PATHS
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, shades, subplots
 from experiments.words import percent, quantity
 from mjxgrad.diagnostics import Jumps
 
-_EVENT = "#009e73"
 _LEAST = 1e-4
-# How the jumps of each force are drawn.
-_FORCES = {
-    PLAIN: ({"marker": "o", "color": FIRST, "ms": 6}, "MuJoCo's default contact"),
-    GENTLE: ({"marker": "D", "color": _EVENT, "ms": 7, "mfc": "none"}, "contact that begins gently"),
-    SMOOTHED: ({"marker": "s", "color": ZEROTH, "ms": 8, "mfc": "none"}, "default contact, smoothed"),
-    C: ({"marker": "x", "color": REFERENCE, "ms": 5}, "default contact in C MuJoCo"),
-}
 
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"forces": forces, "jumps": jumps, "refinement": refinement, "slopes": slopes, "mating": mating}
+    return {"forces": forces, "refinement": refinement, "slopes": slopes, "mating": mating}
 
 
 def forces(outcome: Outcome):
@@ -43,7 +35,7 @@ def forces(outcome: Outcome):
         top.set_title(PATHS[name].title)
         bottom.set_xlabel(f"{'angle' if PATHS[name].axis else 'position'}, {PATHS[name].unit}")
     axes[0, 0].plot([], [], color=FIRST, lw=1.0, ls=(0, (2, 2)), label="by overlap volume")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
+    legend_below(figure, axes[0, 0], 4)
     settings = outcome.settings
     caption = (
         f"Force on a body held {1e3 * settings.depth:g} mm deep in a cube, over its largest. Dashed, the gradient of the "
@@ -64,33 +56,6 @@ def _mark(axis: Axes, jumps: Jumps, smallest: float = 0.0, unit: float = 1.0) ->
         axis.axvline(unit * place, color=REFERENCE, lw=0.6, alpha=0.35, zorder=0)
 
 
-def jumps(outcome: Outcome):
-    """Largest relative jump by body and path: as it is, smoothed, and in C MuJoCo."""
-    names, bodies = outcome.settings.sizes.paths, list(outcome.by_shape)
-    figure, axes = subplots(1, len(names), height=0.9 + 0.3 * len(bodies), sharey=True)
-    places = np.arange(len(bodies))[::-1]
-    for axis, name in zip(axes[0], names, strict=True):
-        statics = [one for one in outcome.statics if one.path == name]
-        for force, (look, label) in _FORCES.items():
-            shown = [
-                (max(one.worst(force), _LEAST), y) for one, y in zip(statics, places, strict=True) if force in one.jumps
-            ]
-            axis.plot(*zip(*shown, strict=True), ls="", label=label, **look)
-        axis.axvline(outcome.settings.threshold, color=MUTED, lw=1, ls=(0, (2, 3)))
-        axis.set(xscale="log", xlim=(0.6 * _LEAST, 3), title=PATHS[name].title, xlabel="over the largest force")
-        axis.set_xticks([_LEAST, 1e-3, 1e-2, 0.1, 1], labels=["none", "0.1%", "1%", "10%", "100%"], fontsize=7)
-        axis.minorticks_off()
-    axes[0, 0].set_yticks(places, bodies)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
-    settings = outcome.settings
-    caption = (
-        "A jump is what remains of a change after its interval was divided by millions; force and torque together, over the "
-        "largest on the path. Where contact begins gently, what still jumps is of the geometry. Smoothing is Gaussian, of "
-        f"{1e3 * settings.smoothing:g} mm. Dotted, {settings.threshold:.0%}."
-    )
-    return figure, "Largest jump, by body and path", caption
-
-
 def refinement(outcome: Outcome):
     """Largest jump of the lattices against points along an edge, and the force along the first path."""
     figure, axes = subplots(1, 2, height=3.7)
@@ -99,10 +64,12 @@ def refinement(outcome: Outcome):
     lattices = {name: [one for one in outcome.statics if one.is_lattice and one.path == name] for name in names}
     counts = outcome.settings.sizes.lattices
     for colour, (name, found) in zip(shades(len(names)), lattices.items(), strict=True):
-        power, error = falls_as(counts, found)
-        if np.isfinite(power):
-            label = f"{PATHS[name].title}: power {quantity(-power, error)}"
-            left.plot(counts, [max(one.worst(PLAIN), _LEAST) for one in found], "o-", color=colour, ms=4, label=label)
+        sizes = [one.worst(PLAIN) for one in found]
+        # Where only a single point touches nothing is refined, and without a jump there is no logarithm.
+        if len(found) >= 3 and min(sizes) > 0 and all(one.contacts.max() >= 2 for one in found):
+            fit = linregress(np.log(counts), np.log(sizes))
+            label = f"{PATHS[name].title}: power {quantity(float(fit.slope), float(fit.stderr))}"
+            left.plot(counts, np.maximum(sizes, _LEAST), "o-", color=colour, ms=4, label=label)
     left.set(xscale="log", yscale="log", xlabel="points along an edge", title="Largest jump, over the largest force")
     left.set_xticks(counts, [str(one) for one in counts])
     low, high = left.get_ylim()
@@ -124,26 +91,14 @@ def refinement(outcome: Outcome):
     return figure, "A pressure field of ever more points", caption
 
 
-def falls_as(counts: tuple[int, ...], lattices: list[Static]) -> tuple[float, float]:
-    """Give the power of the number of points along an edge by which the largest jump falls, and its standard error.
-
-    NaN for fewer than three lattices, and where one of them does not jump or only a single point touches: there nothing is
-    refined, and without a jump there is no logarithm.
-    """
-    if len(lattices) < 3 or any(one.worst(PLAIN) == 0 or one.contacts.max() < 2 for one in lattices):
-        return np.nan, np.nan
-    fit = linregress(np.log(counts), np.log([one.worst(PLAIN) for one in lattices]))
-    return -float(fit.slope), float(fit.stderr)
-
-
 def slopes(outcome: Outcome):
-    """Outcome of a push against its start for the box and for balls, and all errors of the estimates."""
-    figure, axes = subplots(1, 3, height=3.9, width_ratios=(1, 1, 1.5))
+    """Outcome of a push against its start for the box and for balls."""
+    figure, axes = subplots(1, 2, height=3.9)
     pushed = {one.shape: one for one in reversed(outcome.slopes)}
     # The box, and a body that does not jump; where none other was pushed, the box on another path.
     shown = [pushed[next(iter(outcome.by_shape))], pushed.get(_rounded(outcome), outcome.slopes[-1])]
-    lines = (*zip(WAYS, (FIRST, _EVENT, ZEROTH), ("-", "-", "-"), strict=True), ("reference", REFERENCE, (0, (2, 2))))
-    for axis, one in zip(axes[0], shown, strict=False):
+    lines = (*zip(WAYS, (FIRST, ONSET, ZEROTH), ("-", "-", "-"), strict=True), ("reference", REFERENCE, (0, (2, 2))))
+    for axis, one in zip(axes[0], shown, strict=True):
         path = PATHS[one.path]
         axis.plot(one.starts, 1e3 * one.outcomes, ".", color=REFERENCE, ms=2.5)
         axis.set(title=f"{one.shape}, {path.title}", xlabel=f"start, {path.unit}")
@@ -153,30 +108,14 @@ def slopes(outcome: Outcome):
             heights = 1e3 * (one.outcomes.mean() + estimate * reach)
             axis.plot(one.place + reach, heights, color=colour, lw=2, ls=style, label=label)
     axes[0, 0].set_ylabel("height after 30 ms, mm")
-    _errors(outcome, axes[0, 2])
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
+    legend_below(figure, axes[0, 0], 4)
     settings = outcome.settings
     caption = (
         f"The body is let go where the box's force jumps, under noise on the start of {settings.stddev:.1%} of the path; the "
         f"outcome is its height after 30 ms. Lines: slopes that {settings.sizes.num_samples} rollouts say, and the "
-        "reference. Right: errors for all bodies, one mark per path."
+        "reference."
     )
     return figure, "What gradients say across the jump", caption
-
-
-def _errors(outcome: Outcome, axis: Axes) -> None:
-    """Draw the error of each estimate over the reference, body by body."""
-    bodies = list(dict.fromkeys(one.shape for one in outcome.slopes))
-    looks = ((FIRST, "o", 0.0), (_EVENT, "^", -0.18), (ZEROTH, "s", -0.36))
-    for one in outcome.slopes:
-        scale = max(abs(one.reference), np.abs(one.estimates[:2]).max(), 1e-12)
-        y = len(bodies) - bodies.index(one.shape)
-        for error, (colour, marker, shift) in zip(np.abs(one.bias) / scale, looks, strict=True):
-            axis.plot(np.clip(error, 1e-3, None), y + shift, marker, color=colour, ms=4.5, mec="none", alpha=0.75)
-    axis.set_yticks(len(bodies) - np.arange(len(bodies)), bodies)
-    axis.set(xscale="log", title="Error, over the larger of slope and first order", xlabel="one mark per path")
-    axis.set_xticks([1e-3, 1e-2, 0.1, 1], labels=["≤ 0.1%", "1%", "10%", "100%"])
-    axis.minorticks_off()
 
 
 def mating(outcome: Outcome):
@@ -193,7 +132,7 @@ def mating(outcome: Outcome):
         lower.set_xlabel("offset, mm")
     axes[0, 0].set_ylabel("held in the hole: force, N")
     axes[1, 0].set_ylabel("let go: depth at the end, mm")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8.5)
+    legend_below(figure, axes[0, 0], 3)
     caption = (
         f"A peg tilted by {TILT:g} rad, in and above a hole that is wider by 3 mm on each side. Points on the peg meet the "
         "boxes of the hole, points on the rim the box of the peg; where only one part has points the other's corners meet "

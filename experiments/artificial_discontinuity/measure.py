@@ -43,10 +43,11 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("held bodies", "bodies", len(shapes)) as advance_to:
         found = in_threads(lambda body: [_static(settings, body, name) for name in sizes.paths], shapes, advance_to)
     statics = [one for each in found for one in each]
-    box = found[0]
+    box, cube = found[0], shapes[0]
     with workspace.stage("overlap volumes", "paths", len(sizes.paths)):
-        reference = {one.path: _overlap(settings, shapes[0], one.path, one.jumps[PLAIN].parameters) for one in box}
-        judged = [found for one in box for found in _judged(settings, shapes[0], one)]
+        poses = {one.path: PATHS[one.path].poses(cube, settings.depth, one.jumps[PLAIN].parameters) for one in box}
+        reference = {path: overlap_force(each) for path, each in poses.items()}
+        judged = [found for one in box for found in _judged(settings, cube, one)]
     # Bodies are let go where the box's force jumps most, or in the middle of a path.
     places = {one.path: at_largest(one.jumps[PLAIN], float(np.mean(PATHS[one.path].interval))) for one in box}
     pushed = [bodies[name] for name in sizes.pushed]
@@ -128,7 +129,8 @@ def _judged(settings: Settings, body: Shape, static: Static) -> list[Judged]:
     found, jumps, path = [], static.jumps[PLAIN], PATHS[static.path]
     away = settings.depth if path.unit == "m" else settings.depth / HALF
     for at, relative in zip(jumps.places, jumps.relative, strict=True):
-        near, far = (_overlap(settings, body, static.path, at + np.array([-step, step])) for step in (1e-7, away))
+        sides = (path.poses(body, settings.depth, at + np.array([-step, step])) for step in (1e-7, away))
+        near, far = map(overlap_force, sides)
         left, right = np.clip(np.searchsorted(jumps.parameters, at) + np.array([-1, 0]), 0, len(static.contacts) - 1)
         found.append(
             Judged(
@@ -147,10 +149,6 @@ def _judged(settings: Settings, body: Shape, static: Static) -> list[Judged]:
 def _turn(pair: Float[np.ndarray, "2 3"]) -> float:
     larger = np.linalg.norm(pair, axis=1).max()
     return float(np.linalg.norm(pair[1] - pair[0]) / larger) if larger > 0 else 0.0
-
-
-def _overlap(settings: Settings, body: Shape, path: str, parameters: np.ndarray) -> Float[np.ndarray, "points 3"]:
-    return overlap_force(PATHS[path].poses(body, settings.depth, parameters))
 
 
 def overlap_force(poses: Float[np.ndarray, "points 7"]) -> Float[np.ndarray, "points 3"]:

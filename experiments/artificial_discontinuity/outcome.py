@@ -17,14 +17,10 @@ WAYS = ("first order, discrete", "first order, event", "zeroth order")
 
 @dataclass(frozen=True)
 class Static:
-    """Force on a body held along a path: three components (N), and the torque over half an edge (N).
+    """Jumps of the force on a body held along a path, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`; torque is over half an edge (N).
 
-    Attributes:
-        num_rows: constraint rows of the shape, the measure of a step's cost.
-        is_lattice: whether the shape stands for a pressure field; its own contact is gentle, and it is not smoothed.
-        jumps: of the force, by `PLAIN`, `GENTLE`, `SMOOTHED` and `C`.
-        contacts: number of different contact points on the grid, as MJX finds them.
-        copies: how many contacts there are beside these, in the same places.
+    A lattice's own contact is gentle, and it is not smoothed. Contacts are different points on the grid, as MJX finds them, and
+    copies those beside them in the same places.
     """
 
     shape: str
@@ -36,16 +32,14 @@ class Static:
     copies: Int[np.ndarray, " points"]
 
     def worst(self, force: str) -> float:
-        """Give the largest jump over the largest force on the path; zero without any."""
         return worst(self.jumps[force])
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A jump of the box's force, over that force, beside the gradient of the overlap volume, the reference.
+    """A jump of the box's force, over that force, beside the gradient of the overlap volume, the reference, over itself.
 
-    Geometric is what is there when contact begins gently, too. The reference jumps at that place and changes from a penetration
-    depth before to one after, both over itself. Contacts are counted before and after.
+    Geometric is what is there when contact begins gently, too. Changes are over a penetration depth to each side.
     """
 
     path: str
@@ -78,7 +72,6 @@ class Slopes:
 
     @property
     def bias(self) -> Float[np.ndarray, " ways"]:
-        """Estimates less the reference."""
         return self.estimates - self.reference
 
     @property
@@ -90,11 +83,7 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Mating:
-    """A peg above a hole, by how contact is told.
-
-    Jumps are of the force on the held peg against its offset, and of how deep (m) it is in the end against the offset it is
-    dropped at; slopes are across the edge of the hole.
-    """
+    """A peg and a hole: force on the held peg, and depth (m) of the dropped one, against its offset; slopes across the edge."""
 
     label: str
     force: Jumps
@@ -104,10 +93,7 @@ class Mating:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured: every shape along every path, lattices last; the jumps of the box, and the reference on its grid.
-
-    Then slopes of short pushes, a peg and a hole by geometry, and the friction on a sliding ball against its speed.
-    """
+    """Every shape along every path, lattices last; the reference is on the box's grid, friction against the sliding speed."""
 
     settings: Settings
     statics: list[Static]
@@ -124,7 +110,6 @@ class Outcome:
         return {label: [one for one in self.statics if one.shape == label] for label in labels}
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per body and path, for metrics.csv."""
         return [
             {
                 "shape": one.shape,

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm
@@ -17,6 +18,7 @@ from experiments.artificial_discontinuity.shapes import PATHS, Shape
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import jumps_along
+from mjxgrad.tasks import scene_path
 
 _NUM_STEPS = 15  # of 2 ms: the body is still in contact, or has just left it
 # Of the outcome's largest jump near the start; smaller ones are teeth of the time step.
@@ -24,24 +26,12 @@ _SMALLEST = 1e-3
 
 # A peg and a hole, whose contact is told by boxes, by points on the peg alone, or by points on both.
 TILT = 0.1  # rad
-_HOLE, _PEG, _LENGTH = 0.022, 0.019, 0.04  # m, half widths and half length of the peg
-_POINT = 0.003  # m
+_LENGTH = 0.04  # m, half length of the peg
 _BELOW = 0.02  # m, how deep the peg's end is where the force is read
 _ABOVE = 0.002  # m, how high above the hole it is let go
 OFFSETS = (0.0, 0.016)  # m
 _NUM_DROPPED = 100  # of 2 ms
 _SMALLEST_DEPTH = 0.02  # of the depth; smaller jumps are teeth of the time step
-
-_HOLE_AND_PEG = """<mujoco><option timestep="0.002" tolerance="1e-10"/>
-<default><geom condim="1" mass="0"/><default class="hole"><geom contype="1" conaffinity="0"/></default>
-<default class="rim"><geom contype="2" conaffinity="0" size="{point}"/></default>
-<default class="peg"><geom contype="0" conaffinity="{peg}"/></default>
-<default class="point"><geom contype="0" conaffinity="1" size="{point}"/></default></default>
-<worldbody><geom class="hole" type="box" size=".05 .02 .05" pos="{left} 0 -.05"/>
-<geom class="hole" type="box" size=".05 .02 .05" pos="{right} 0 -.05"/>
-{rim}<body><joint type="slide" axis="1 0 0" damping=".5"/><joint type="slide" axis="0 0 1" damping=".5"/>
-<joint type="hinge" axis="0 1 0" damping="1e-4"/><inertial pos="0 0 0" mass=".1" diaginertia="1e-4 1e-4 1e-4"/>
-<geom class="peg" type="box" size="{width} .01 {length}"/>{points}</body></worldbody></mujoco>"""
 
 # From starts and the name of a gradient to outcomes and derivatives.
 Simulate = Callable[[np.ndarray, str], tuple[Any, Any]]
@@ -69,17 +59,7 @@ def push_slopes(settings: Settings, body: Shape, places: dict[str, float], index
 def slopes_at(
     settings: Settings, label: str, path: str, simulate: Simulate, place: float, stddev: float, rng: np.random.Generator
 ) -> Slopes:
-    """Estimate a slope under noise on the start by first and zeroth order, with a reference.
-
-    Args:
-        settings: of the run.
-        label: of what is simulated.
-        path: name of the parameter.
-        simulate: outcomes and derivatives.
-        place: mean start.
-        stddev: of the noise, in the start's unit.
-        rng: of the samples.
-    """
+    """Estimate a slope under noise about a start, in its unit, by first and zeroth order, with a reference."""
     sizes = settings.sizes
     noise = rng.normal(size=sizes.num_samples)
     # One place in each of equal shares of the noise, so that the reference's error is far below the estimates'.
@@ -120,33 +100,24 @@ def slopes_at(
 
 def matings(settings: Settings, workspace: Workspace) -> list[Mating]:
     """Hold the peg in the hole, and drop it beside it."""
-    scenes = {label: mg.load_scene(_mjcf(label)) for label in settings.sizes.geometries}
-    for label, scene in scenes.items():
+    scenes = {label: mg.load_scene(_peg_and_hole(label)) for label in settings.sizes.geometries}
+    jobs = []
+    for i, (label, scene) in enumerate(scenes.items()):
         workspace.check(scene, name=f"mating, {label}")
-
-    jobs = [
-        (label, scene, np.random.default_rng([settings.seed, 100 + i]))
-        for i, (label, scene) in enumerate(scenes.items())
-    ]
+        jobs.append((label, scene, np.random.default_rng([settings.seed, 100 + i])))
     with workspace.stage("mating", "geometries", len(scenes)) as advance_to:
         return in_threads(lambda job: _mate(settings, *job), jobs, advance_to)
 
 
-def _mjcf(label: str) -> str:
-    """Write a scene: points of either part meet the box of the other one, and boxes meet where there are no points."""
-    points = [(s * (_PEG - _POINT), t * (_LENGTH - _POINT)) for s in (-1, 1) for t in (-1, 1)]
-    rim = [(s * (_HOLE + _POINT), -_POINT) for s in (-1, 1)]
-    has_points, has_rim = label != "boxes", label == "points on both"
-    return _HOLE_AND_PEG.format(
-        peg=2 if has_points else 1,
-        point=_POINT,
-        left=-_HOLE - 0.05,
-        right=_HOLE + 0.05,
-        width=_PEG,
-        length=_LENGTH,
-        points="".join(f'<geom class="point" pos="{x} 0 {z}"/>' for x, z in points) if has_points else "",
-        rim="".join(f'<geom class="rim" pos="{x} 0 {z}"/>' for x, z in rim) if has_rim else "",
-    )
+def _peg_and_hole(label: str) -> mujoco.MjModel:
+    """Leave out the points of `mjcf/peg_and_hole.xml`, the rim's or all; boxes meet where there are none."""
+    spec = mujoco.MjSpec.from_file(str(scene_path("peg_and_hole")))
+    left_out = {"boxes": ("point", "rim"), "points on the peg": ("rim",), "points on both": ()}[label]
+    for geom in [one for one in spec.geoms if one.classname.name in left_out]:
+        spec.delete(geom)
+    if label == "boxes":
+        next(one for one in spec.geoms if one.classname.name == "peg").conaffinity = 1
+    return spec.compile()
 
 
 def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Generator) -> Mating:
@@ -161,11 +132,8 @@ def _mate(settings: Settings, label: str, scene: mg.Scene, rng: np.random.Genera
         num_refinements=2,
         smallest=_SMALLEST_DEPTH,
     )
-    force = jumps_along(
-        lambda offsets: np.asarray(_forces(scene, _tilted(offsets, -_BELOW))),
-        OFFSETS,
-        num_points=settings.sizes.num_points,
-    )
+    num_points = settings.sizes.num_points
+    force = jumps_along(lambda at: np.asarray(_forces(scene, _tilted(at, -_BELOW))), OFFSETS, num_points=num_points)
     edge, stddev = at_largest(depth, float(np.mean(OFFSETS))), settings.stddev * (OFFSETS[1] - OFFSETS[0])
     return Mating(label, force, depth, slopes_at(settings, label, "offset", simulate, edge, stddev, rng))
 

@@ -82,9 +82,10 @@ def _by_body(outcome: Outcome) -> Table:
         rows.append(row)
     columns = ("body", "rows", *(PATHS[name].title for name in outcome.settings.sizes.paths))
     caption = (
-        "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently, "
-        "under the default one smoothed, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. In bold "
-        "beyond the threshold."
+        "Largest jump over the largest force on the path: under MuJoCo's default contact, under one that begins gently (what "
+        "still jumps is of the geometry), under the default one smoothed by a Gaussian of "
+        f"{1e3 * outcome.settings.smoothing:g} mm, and in C MuJoCo; lattices have a contact of their own, in mjxgrad and in C. A "
+        "jump is what remains of a change after its interval was divided by millions. In bold beyond the threshold."
     )
     return Table(columns, rows, caption, frozenset(emphasised))
 

@@ -98,12 +98,10 @@ class Path:
 
     @property
     def unit(self) -> str:
-        """Of the parameter."""
         return "rad" if self.axis else "m"
 
     @property
     def length(self) -> float:
-        """Of the interval."""
         return self.interval[1] - self.interval[0]
 
     def poses(

@@ -21,12 +21,10 @@ class ImpedanceSettings(SettingsTable):
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """Give them in MuJoCo's order."""
         return self.first, self.last, self.width
 
     @property
     def label(self) -> str:
-        """Give a name for headings."""
         if self.first == self.last:
             return f"{self.first:g} throughout"
         return f"{self.first:g} to {self.last:g} in {1e3 * self.width:g} mm"

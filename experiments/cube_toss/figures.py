@@ -4,14 +4,14 @@ import numpy as np
 
 from experiments.cube_toss.measure import CONTACTS, METHODS, Course, Outcome, Point
 from experiments.cube_toss.report import TARGET
-from experiments.theme import FIRST, MUTED, ZEROTH, Drawings, power, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, ZEROTH, Drawings, legend_below, power, subplots
 from experiments.words import capitalised
 
 _LOOKS = {
     "discrete": {"color": FIRST, "marker": "o"},
     "event": {"color": ZEROTH, "marker": "s"},
-    "continuous": {"color": "#009e73", "marker": "D"},
-    "substeps": {"color": "#cc79a7", "marker": "^"},
+    "continuous": {"color": ONSET, "marker": "D"},
+    "substeps": {"color": DEFAULT, "marker": "^"},
     "adaptive": {"color": "#e69f00", "marker": "v"},
     "quotient": {"color": "#56b4e9", "marker": "P"},
 }
@@ -80,5 +80,5 @@ def _finite(course: Course, method: str) -> list[Point]:
 def _finished(figure, axes: np.ndarray, outcome: Outcome):
     for axis, course in zip(axes, outcome.courses, strict=True):
         axis.set_title(capitalised(CONTACTS[course.contact]))
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8.5)
+    legend_below(figure, axes[0], 3)
     return figure

@@ -1,4 +1,9 @@
-"""From settings to numbers: derivatives of the throw, their error and their time."""
+"""A cube is thrown down on a plane; where does it end, and what does the derivative of that by the throw cost?
+
+References:
+    Paulus, Geist, Schumacher, Musil, Rappenecker, Martius. Hard Contacts with Soft Gradients: Refining Differentiable
+    Simulators for Learning and Control (DiffMJX). arXiv:2506.14186; the cube of its timing experiment.
+"""
 
 import functools
 import time
@@ -10,11 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 import mjxgrad as mg
 from experiments.cube_toss.settings import Settings
-from experiments.cube_toss.throw import DURATION, PUBLISHED_SPEED, CubeToss, cube_toss
 from experiments.failure import ExperimentError
 from experiments.motion import advance, at_time_step
 from experiments.workspace import Workspace
@@ -23,12 +27,46 @@ from mjxgrad._rollout import data_of
 from mjxgrad.dynamics import Gradient, assembly
 from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration import adaptive_rollout
+from mjxgrad.tasks import scene_path
+
+DURATION = 1.0  # s
+PUBLISHED_SPEED = -2.0  # m/s, upwards
+PUBLISHED_DERIVATIVE = 0.17267  # m per m/s
+_DRIFT = -0.1  # m/s, sideways
+
+# (solref, solimp): what DiffMJX was timed on, whose force begins without a jump, and what MuJoCo takes if nothing is said.
+_CONTACTS = {
+    "published": ((0.005, 1.0), (0.0, 0.95, 0.001, 0.5, 2.0)),
+    "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),
+}
 
 # Throws at slightly different speed, over which the error is taken, for single derivatives depend on chance (m/s).
 _SPEEDS = PUBLISHED_SPEED + 0.005 * (np.arange(4) / 4 - 0.5)
 # Half the step of the reference's difference quotient (m/s), and its tolerance.
 _STEP, _TOLERANCE = 1e-4, 1e-10
-_NUM_SUBSTEPS = 8
+
+
+class CubeToss(eqx.Module):
+    """The throw; see `cube_toss`."""
+
+    scene: mg.Scene
+
+    def start(self, speed: Float[ArrayLike, ""]) -> mg.State:
+        """Return the state at a throw upwards at a speed in m/s."""
+        qvel = jnp.zeros_like(self.scene.data.qvel).at[1].set(_DRIFT).at[2].set(speed)
+        return mg.initial_state(self.scene, qvel=qvel)
+
+    def outcome(self, qpos: Float[Array, "*states 7"]) -> Float[Array, "*states"]:
+        """Return how far sideways the cube is, in m."""
+        return qpos[..., 1]
+
+
+def cube_toss(contact: str = "published", *, timestep: float | None = None) -> CubeToss:
+    """Load the throw, with contact whose force begins without a jump or with one; `timestep` (s) is the scene's if None."""
+    scene = mg.load_scene(scene_path("cube_toss"), timestep=timestep)
+    solref, solimp = (jnp.array([row]) for row in _CONTACTS[contact])
+    return CubeToss(scene.with_model(pair_solref=solref, pair_solimp=solimp))
+
 
 # From a throw, its speed and a time step or tolerance to a derivative, the number of steps, and whether it failed.
 Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]
@@ -70,7 +108,6 @@ class Course:
 
     @property
     def scale(self) -> float:
-        """Give the size of the derivative."""
         return float(np.abs(self.reference).mean())
 
     def of(self, method: str) -> list[Point]:
@@ -78,7 +115,6 @@ class Course:
         return sorted((point for point in self.points if point.method == method), key=lambda point: point.setting)
 
     def errors(self, point: Point) -> Float[np.ndarray, " throws"]:
-        """Give the error of every throw."""
         return (point.derivative - self.reference) / self.scale
 
     def error(self, point: Point) -> float:
@@ -94,7 +130,6 @@ class Outcome:
     courses: tuple[Course, ...]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Give the rows of metrics.csv."""
         return [
             {
                 "contact": course.contact,
@@ -115,11 +150,7 @@ class Outcome:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Take the derivative of every throw by every method.
-
-    Raises:
-        ExperimentError: if a time step does not divide the throw, or the reference fails.
-    """
+    """Take the derivative of every throw by every method."""
     for timestep in (*settings.timesteps, *settings.refined_timesteps):
         if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
             raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
@@ -153,13 +184,16 @@ def _point(name: str, task: CubeToss, setting: float) -> Point:
     begun = time.process_time()
     call()
     spent = time.process_time() - begun
-    steps, has_failed = float(np.mean(num_steps)), bool(np.any(failed))
-    return Point(name, setting, np.asarray(derivative), spent / len(_SPEEDS), first, steps, has_failed)
+    seconds, steps = spent / len(_SPEEDS), float(np.mean(num_steps))
+    return Point(name, setting, np.asarray(derivative), seconds, first, steps, bool(np.any(failed)))
 
 
 @eqx.filter_jit
 def _taken(derivative: Derivative, task: CubeToss, setting: Array):
-    """Take the throws one after the other; one program per method, whatever the contact and the time step."""
+    """Take the throws one after the other, for under `jax.vmap` all would take the short steps at every event.
+
+    One program per method serves every contact and time step.
+    """
     return jax.lax.map(lambda speed: derivative(task, speed, setting), jnp.asarray(_SPEEDS))
 
 
@@ -195,14 +229,9 @@ def _quotient(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Ar
 
 
 def substepped_step(
-    model: mjx.Model, data: mjx.Data, *, num_substeps: int, gradient: Gradient = "discrete"
+    model: mjx.Model, data: mjx.Data, *, num_substeps: int = 8, gradient: Gradient = "discrete"
 ) -> mjx.Data:
-    """Advance by one time step, in short steps if a contact or limit begins or ends in it.
-
-    A step holds an event if a distance changes its sign, judged by the distances at its beginning and the velocities at its
-    end. Under `jax.vmap` every member takes the short steps in every step and throws them away. Fields that are not of the
-    state are those of the last step taken, long or short.
-    """
+    """Advance by one time step, in short steps if a contact or limit begins or ends in it: if a distance changes its sign."""
     after = mg.step(model, data, gradient=gradient)
     short = at_time_step(model, model.opt.timestep / num_substeps)
 
@@ -216,7 +245,7 @@ def substepped_step(
 
 
 def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:
-    """Whether some distance changes its sign in a step."""
+    """Whether some distance changes its sign, judged by distances at the step's beginning and velocities at its end."""
     # Contacts and kinematics of a stepped data are those of the state before; its position is not.
     blocks = assembly.gather(model, after.replace(qpos=before.qpos))
     if not any(block.rows_each for block in blocks):
@@ -230,9 +259,7 @@ _DERIVATIVES: dict[str, Derivative] = {
     "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
     "event": functools.partial(_by_steps, functools.partial(mg.step, gradient="event")),
     "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),
-    "substeps": functools.partial(
-        _by_steps, functools.partial(substepped_step, num_substeps=_NUM_SUBSTEPS, gradient="event")
-    ),
+    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, gradient="event")),
     "adaptive": _adaptive,
     "quotient": _quotient,
 }

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from experiments.cube_toss.measure import CONTACTS, METHODS, Course, Outcome, Point
-from experiments.cube_toss.throw import PUBLISHED_DERIVATIVE
+from experiments.cube_toss.measure import CONTACTS, METHODS, PUBLISHED_DERIVATIVE, Course, Outcome, Point
 from experiments.report import Table
 from experiments.words import joined, percent, quantity
 
@@ -68,14 +67,9 @@ def tables(outcome: Outcome) -> list[Table]:
         for point in course.points:
             if point is first:
                 emphasised.add((len(rows), 3))
-            cells = (
-                _percent(course.error(point)),
-                _percent(float(course.errors(point).mean())),
-                f"{point.seconds:.3g}",
-            )
-            name = METHODS[point.method]
-            last = f"{point.first_seconds:.0f}", f"{point.num_steps:.0f}"
-            rows.append([course.contact, name, f"{point.setting:g}", *cells, *last])
+            errors = map(_percent, (course.error(point), float(course.errors(point).mean())))
+            costs = f"{point.seconds:.3g}", f"{point.first_seconds:.0f}", f"{point.num_steps:.0f}"
+            rows.append([course.contact, METHODS[point.method], f"{point.setting:g}", *errors, *costs])
     columns = (
         "contact", "method", "time step (s) or tolerance", "error", "bias", "processor time, s", "first call, s", "steps"
     )  # fmt: skip

@@ -5,14 +5,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from experiments.long_horizon.measure import CUT, ZEROTH, Errors, Outcome
-from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, Drawings, legend_below, subplots
 from experiments.theme import ZEROTH as BLUE
 from experiments.words import capitalised
 
 COLOURS = {
     "first order, discrete": FIRST,
-    "first order, event": "#cc79a7",
-    "first order, onset": "#009e73",
+    "first order, event": DEFAULT,
+    "first order, onset": ONSET,
     ZEROTH: BLUE,
 }
 
@@ -38,8 +38,7 @@ def errors(outcome: Outcome):
         lower.set(yscale="log", xlabel="horizon, s")
     axes[0, 0].set_ylabel("error over the largest gradient")
     axes[1, 0].set_ylabel("variance of one sample, m²")
-    handles, labels = axes[0, -1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8.5)
+    legend_below(figure, axes[0, -1], len(COLOURS))
     sizes, confidence = outcome.settings.sizes, outcome.settings.confidence
     caption = (
         f"Gradient of the mean cost at the horizon by the policy's noisy parameters, from {sizes.num_samples} rollouts: root "
@@ -108,8 +107,7 @@ def windows(outcome: Outcome):
         axis.set_xticks(found.lengths, [f"{seconds:.2g}" for seconds in found.lengths])
         axis.xaxis.set_minor_locator(NullLocator())
     axes[0, 0].set_ylabel("error over the gradient")
-    handles, labels = axes[0, -1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8.5)
+    legend_below(figure, axes[0, -1], 3)
     caption = (
         "Gradient of the cost's mean over the whole horizon, when derivatives are cut after a window: plain, and with the "
         "value of what comes after, fitted by a quadratic. Circles: bias beyond chance. The rightmost window is the whole "

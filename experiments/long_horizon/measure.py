@@ -144,7 +144,6 @@ class Rollouts(eqx.Module):
         return np.einsum("stn,stnd->std", self.cost_slopes, self.tangents)
 
     def at(self, rows: np.ndarray) -> "Rollouts":
-        """Give some of them."""
         return jax.tree.map(lambda x: x[rows], self)
 
 
@@ -217,9 +216,7 @@ def _windows(
     whole = reference_gradient(one.stddev, (many.noise[:count], total[:count]), (many.noise[count:], total[count:]))
     return Windows(
         lengths=one.interval * np.array(_lengths(one)),
-        errors={
-            (label, kind): errors_of(each, whole) for label, (cut, _) in cuts.items() for kind, each in cut.items()
-        },
+        errors={(label, kind): errors_of(x, whole) for label, (cut, _) in cuts.items() for kind, x in cut.items()},
         zeroth=errors_of(zeroth(one.stddev, own.noise, own.costs.mean(axis=1, keepdims=True), num_samples), whole),
         fit=next(iter(cuts.values()))[1],
     )
@@ -237,13 +234,7 @@ def zeroth(
 def reference_gradient(
     stddev: float, pilot: tuple[np.ndarray, np.ndarray], many: tuple[np.ndarray, np.ndarray]
 ) -> Reference:
-    """Give the gradient of mean costs from values alone, and its standard error.
-
-    Args:
-        stddev: of the noise.
-        pilot: noise and costs of other rollouts, whose mean and slopes are taken out.
-        many: noise and costs.
-    """
+    """Give the gradient of mean costs from noise and costs alone, and its standard error; the pilot's slopes are taken out."""
     noise, costs = pilot
     slopes = np.linalg.lstsq(noise, costs - costs.mean(axis=0), rcond=None)[0]
     rest = many[1] - costs.mean(axis=0) - many[0] @ slopes

@@ -92,7 +92,7 @@ def _pendulum(num_times: int) -> Problem:
         scene=scene,
         start=mg.initial_state(scene, jnp.array(_START_ANGLES)),
         control=jax.tree_util.Partial(_torques),
-        cost=_tip,
+        cost=lambda x: 0.3 * (jnp.sin(x[0]) + jnp.sin(x[0] + x[1])),  # how far sideways the tip is, in m
         observe=_angles,
         params=jnp.zeros(4),
         stddev=0.05,
@@ -108,11 +108,6 @@ def _torques(params: Float[Array, " 4"], state: State) -> Float[Array, " 2"]:
     return params[:2] + params[2:] * jnp.sin(state.qpos)
 
 
-def _tip(x: Float[Array, " 4"]) -> Float[Array, ""]:
-    """Give how far sideways the tip is, in m."""
-    return 0.3 * (jnp.sin(x[0]) + jnp.sin(x[0] + x[1]))
-
-
 def _angles(x: Float[Array, " 4"]) -> Float[Array, " 6"]:
     angles = jnp.stack([x[0], x[0] + x[1]])
     return jnp.concatenate([jnp.sin(angles), jnp.cos(angles), 0.1 * x[2:]])
@@ -124,8 +119,8 @@ def _hopper(num_times: int) -> Problem:
         scene=task.scene,
         start=task.state,
         control=jax.tree_util.Partial(_posture, task.policy, task.start_params),
-        cost=_reach,
-        observe=_unchanged,
+        cost=lambda x: -x[0] - x[1],  # less the torso's distance forward and its height, in m
+        observe=lambda x: x,
         params=jnp.zeros(3),
         stddev=0.05,
         title="hopper",
@@ -138,12 +133,3 @@ def _hopper(num_times: int) -> Problem:
 def _posture(policy, posture, params: Float[Array, " 3"], state: State) -> Float[Array, " 3"]:
     """Give the posture's actions with the parameters added to its offsets."""
     return policy(eqx.tree_at(lambda p: p.offset, posture, posture.offset + params), state)
-
-
-def _reach(x: Float[Array, " 12"]) -> Float[Array, ""]:
-    """Give less the torso's distance forward and its height, in m."""
-    return -x[0] - x[1]
-
-
-def _unchanged(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    return x

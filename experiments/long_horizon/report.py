@@ -17,9 +17,10 @@ def verdict(outcome: Outcome) -> str:
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what diverged, and how far the pendulum's steps are its motion."""
-    lost = [(one.title, 1 - one.finite) for one in outcome.found.values() if one.finite < 1]
     found = [
-        f"{capitalised(title)}: derivatives of {share:.1%} of the rollouts are not finite." for title, share in lost
+        f"{capitalised(one.title)}: derivatives of {1 - one.finite:.1%} of the rollouts are not finite."
+        for one in outcome.found.values()
+        if one.finite < 1
     ]
     if outcome.adaptive is None:
         return found
@@ -38,8 +39,8 @@ def findings(outcome: Outcome) -> list[str]:
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate errors at some horizons, what grows, and windows."""
-    return [_by_horizon(outcome), _by_growth(outcome), _by_window(outcome)]
+    """Tabulate what grows, and windows; errors by horizon are in metrics.csv."""
+    return [_by_growth(outcome), _by_window(outcome)]
 
 
 def _crossing(outcome: Outcome, one: Found) -> str:
@@ -73,19 +74,6 @@ def _window(one: Found) -> str:
         f"windows of {windows.lengths[at]:.3g} s{kind} are best on the {one.title} ({_percent(least)} off, the whole horizon "
         f"{_percent(whole)}, zeroth order {_percent(zeroth)})"
     )
-
-
-def _by_horizon(outcome: Outcome) -> Table:
-    rows = []
-    for one in outcome.found.values():
-        places = np.unique(np.linspace(0, len(one.times) - 1, 6).round().astype(int))
-        for label, each in one.errors.items():
-            ends = [map(float, (each.error[i], *each.interval[:, i])) for i in places]
-            cells = [f"{_percent(error)} ({_percent(low)} to {_percent(high)})" for error, low, high in ends]
-            rows.append([one.title, label, *cells])
-    heads = ["first time", *(f"{share:.0%} of the time" for share in np.linspace(0, 1, 6)[1:])]
-    caption = "Root mean squared error with its interval, over the largest gradient of all horizons."
-    return Table(("problem", "estimator", *heads), rows, caption)
 
 
 def _by_growth(outcome: Outcome) -> Table:

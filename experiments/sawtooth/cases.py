@@ -8,11 +8,20 @@ from typing import Any
 import gymnasium
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
 
 from experiments.motion import Read
+from mjxgrad.tasks import scene_path
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+# From positions and velocities to what is read of a motion.
+_READ: dict[str, Read] = {
+    "planar": lambda qpos, qvel: qpos[:3],
+    "free": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], 2 * (qpos[3] * qpos[5] - qpos[6] * qpos[4])]),
+    "ball": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], qvel[4]]),
+    "two_balls": lambda qpos, qvel: jnp.array([qpos[0], qpos[1], qpos[7], qpos[8]]),
+    "arm": lambda qpos, qvel: qpos[:2],
+}
 
 
 @dataclass(frozen=True)
@@ -35,30 +44,9 @@ def case(name: str) -> Case:
     return _BUILDERS[name]()
 
 
-def _planar(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 3"]:
-    return qpos[:3]
-
-
-def _free(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 3"]:
-    w, x, y, z = qpos[3:7]
-    return jnp.array([qpos[0], qpos[2], 2 * (w * y - z * x)])
-
-
-def _ball(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 3"]:
-    return jnp.array([qpos[0], qpos[2], qvel[4]])
-
-
-def _two_balls(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 4"]:
-    return jnp.array([qpos[0], qpos[1], qpos[7], qpos[8]])
-
-
-def _arm(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> Float[Array, " 2"]:
-    return qpos[:2]
-
-
 def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **other: Any) -> Case:
     """One of gymnasium's robots, dropped while it moves forwards."""
-    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": _planar}
+    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": _READ["planar"]}
     model = mujoco.MjModel.from_xml_path(str(_ASSETS / file))
     return Case(title, model, interval=(0.0, 0.03), duration=0.5, qpos=qpos, qvel={0: speed}, **planar | other)
 
@@ -66,13 +54,21 @@ def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **
 _BALL = """<mujoco model="ball">
   <option timestep="0.002" cone="{cone}"/>
   <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1" euler="0 {slope} 0" condim="{condim}"/>
-    <body name="ball" pos="0 0 0.1">
+    <geom name="floor" type="plane" size="5 5 0.1" euler="0 {slope} 0" condim="{condim}" friction="{friction}"/>
+    <body name="ball" pos="0 0 {height}">
       <freejoint/>
-      <geom name="ball" type="sphere" size="0.05" condim="{condim}"/>
+      <geom name="ball" type="sphere" size="0.05" condim="{condim}" friction="{friction}"/>
     </body>
   </worldbody>
 </mujoco>"""
+
+
+def ball(
+    cone: str = "pyramidal", condim: int = 3, slope: float = 0.0, friction: float = 1.0, height: float = 0.1
+) -> mujoco.MjModel:
+    """Build a ball of 5 cm at a height (m) over a plane that is inclined by some degrees."""
+    xml = _BALL.format(cone=cone, condim=condim, slope=slope, friction=friction, height=height)
+    return mujoco.MjModel.from_xml_string(xml)
 
 
 def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
@@ -80,54 +76,30 @@ def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
     place = f"plane inclined by {slope:g}°" if slope else "level plane"
     return Case(
         f"Ball, {place}, {cone}, condim {condim}",
-        mujoco.MjModel.from_xml_string(_BALL.format(cone=cone, condim=condim, slope=slope)),
+        ball(cone, condim, slope),
         moved=2,
         interval=(0.0, 0.03),
         labels=("x", "height", "spin (1/s per m)"),
-        read=_ball,
+        read=_READ["ball"],
         duration=0.24,
         qvel={0: 1.0, 2: -1.5, 3: 2.0, 4: -10.0, 5: 5.0},
     )
 
 
-_TWO_BALLS = """<mujoco model="two balls">
-  <option timestep="0.002" gravity="0 0 0" cone="{cone}"/>
-  <worldbody>
-    <body name="first" pos="-0.2 0 0"><freejoint/><geom type="sphere" size="0.05"/></body>
-    <body name="second"><freejoint/><geom type="sphere" size="0.05"/></body>
-  </worldbody>
-</mujoco>"""
-
-
 def _two_balls_case(cone: str) -> Case:
     """An oblique hit, with its impact parameter moved."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("two_balls")))
+    model.opt.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
     return Case(
         f"Two balls, oblique, {cone}",
-        mujoco.MjModel.from_xml_string(_TWO_BALLS.format(cone=cone)),
+        model,
         moved=1,
         interval=(0.03, 0.06),
         labels=("first, along", "first, across", "second, along", "second, across"),
-        read=_two_balls,
+        read=_READ["two_balls"],
         duration=0.24,
         qvel={0: 1.5, 5: 3.0},
     )
-
-
-_ARM = """<mujoco model="arm">
-  <option timestep="0.002"/>
-  <default><joint type="hinge" axis="0 1 0" damping="0.02"/></default>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1"/>
-    <body name="upper" pos="0 0 0.5">
-      <joint name="shoulder"/>
-      <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" contype="0" conaffinity="0"/>
-      <body name="lower" pos="0.4 0 0">
-        <joint name="elbow"/>
-        <geom type="capsule" fromto="0 0 0 0.35 0 0" size="0.03"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>"""
 
 
 _BUILDERS = {
@@ -144,7 +116,7 @@ _BUILDERS = {
         speed=0.3,
         moved=2,
         labels=("x", "z", "pitch (sine)"),
-        read=_free,
+        read=_READ["free"],
     ),
     "ball_frictionless": lambda: _ball_case("pyramidal", 1),
     "ball": lambda: _ball_case("pyramidal", 3),
@@ -157,11 +129,11 @@ _BUILDERS = {
     "two_balls_elliptic": lambda: _two_balls_case("elliptic"),
     "arm": lambda: Case(
         "Two-link arm",
-        mujoco.MjModel.from_xml_string(_ARM),
+        mujoco.MjModel.from_xml_path(str(scene_path("falling_arm"))),
         moved=0,
         interval=(0.0, 0.06),
         labels=("shoulder (rad)", "elbow (rad)"),
-        read=_arm,
+        read=_READ["arm"],
         duration=0.4,
         qpos={0: 0.3, 1: 0.4},
     ),

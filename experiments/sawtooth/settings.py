@@ -6,28 +6,15 @@ from pydantic import Field
 
 from experiments.settings import Positive, RunSettings
 
-CaseName = Literal[
-    "hopper",
-    "walker2d",
-    "half_cheetah",
-    "ant",
-    "ball_frictionless",
-    "ball",
-    "ball_elliptic",
-    "ball_torsion",
-    "ball_rolling",
-    "ball_inclined",
-    "ball_inclined_rolling",
-    "two_balls",
-    "two_balls_elliptic",
-    "arm",
-]
+RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
+BallName = Literal["ball_frictionless", "ball", "ball_elliptic", "ball_torsion", "ball_rolling"]
+OtherName = Literal["ball_inclined", "ball_inclined_rolling", "two_balls", "two_balls_elliptic", "arm"]
 
 
 class Settings(RunSettings):
     """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
 
-    cases: Annotated[tuple[CaseName, ...], Field(min_length=1)]
+    cases: Annotated[tuple[Literal[RobotName, BallName, OtherName], ...], Field(min_length=1)]
     """Which motions, each with its own contact, limits and integrator."""
     timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)
     """In s, besides the motion's own."""

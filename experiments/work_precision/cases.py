@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from experiments.sawtooth.cases import ball
 from experiments.sawtooth.cases import case as landing_case
 from experiments.work_precision.outcome import Cone
 from mjxgrad.tasks import scene_path
@@ -43,12 +44,10 @@ class Case:
 
     @property
     def controls(self) -> Float[np.ndarray, " nu"]:
-        """Controls, constant in time."""
         return np.array(self.ctrl) if self.ctrl else np.zeros(self.model.nu)
 
     @property
     def weights(self) -> Float[np.ndarray, " nq"]:
-        """Weights of the final positions in the outcome."""
         return _filled(np.zeros(self.model.nq), self.outcome)
 
     @property
@@ -58,12 +57,10 @@ class Case:
 
     @property
     def timestep(self) -> float:
-        """The scene's own, in s."""
         return self.model.opt.timestep
 
     @property
     def cone(self) -> Cone:
-        """The scene's own."""
         return next(name for name, cone in CONES.items() if cone == self.model.opt.cone)
 
 
@@ -78,83 +75,8 @@ def case(name: str) -> Case:
     return _BUILDERS[name]()
 
 
-_PENDULUM = """
-<mujoco model="pendulum">
-  <option timestep="0.005"/>
-  <default><joint type="hinge" axis="0 1 0"/><geom type="capsule" size="0.03" contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body name="upper">
-      <joint name="upper"/>
-      <geom fromto="0 0 0 0 0 -0.4"/>
-      <body name="lower" pos="0 0 -0.4">
-        <joint name="lower"/>
-        <geom fromto="0 0 0 0 0 -0.4"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-_BALL = """
-<mujoco model="ball">
-  <option timestep="0.002"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1" condim="3" friction="{friction} 0.005 0.0001"/>
-    <body name="ball" pos="0 0 {height}">
-      <freejoint/>
-      <geom name="ball" type="sphere" size="0.05" condim="3" friction="{friction} 0.005 0.0001"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-_ARM = """
-<mujoco model="arm">
-  <option timestep="0.004"/>
-  <default>
-    <joint type="hinge" axis="0 1 0"/>
-    <geom type="capsule" size="0.03" density="500"/>
-    <position kp="40" kv="2"/>
-  </default>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1" friction="0.6"/>
-    <body name="upper" pos="0 0 0.5">
-      <joint name="shoulder"/>
-      <geom fromto="0 0 0 0.4 0 0" contype="0" conaffinity="0"/>
-      <body name="lower" pos="0.4 0 0">
-        <joint name="elbow"/>
-        <geom fromto="0 0 0 0.3 0 0" contype="0" conaffinity="0"/>
-        <body name="hand" pos="0.3 0 0">
-          <joint name="wrist"/>
-          <geom name="hand" type="sphere" pos="0.08 0 0" size="0.05"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position name="shoulder" joint="shoulder"/>
-    <position name="elbow" joint="elbow"/>
-    <position name="wrist" joint="wrist" kp="4" kv="0.05"/>
-  </actuator>
-</mujoco>
-"""
-
-_HEAP = """
-<mujoco model="heap">
-  <option timestep="0.004"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1"/>
-    {balls}
-  </worldbody>
-</mujoco>
-"""
-_HEAP_BALL = '<body pos="{} {} {}"><freejoint/><geom type="sphere" size="0.05"/></body>'
-# A column that leans, so that each ball rolls off the one below.
-_HEAP_PLACES = ((0.0, 0.0, 0.06), (0.03, 0.01, 0.17), (0.0, 0.03, 0.28), (-0.02, 0.01, 0.39))
-
-
-def _ball(friction: float, height: float) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(_BALL.format(friction=friction, height=height))
+def _scene(name: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(scene_path(name)))
 
 
 def _landing(name: str, title: str, moved: tuple[int, int], outcome: Mapping[int, float]) -> Case:
@@ -165,60 +87,41 @@ def _landing(name: str, title: str, moved: tuple[int, int], outcome: Mapping[int
 
 def _push() -> Case:
     """`mjcf/push.xml` with a contact a hundred times as stiff as the stiffest published: the balls knock."""
-    model = mujoco.MjModel.from_xml_path(str(scene_path("push")))
+    model = _scene("push")
     model.pair_solref[:] = (-1e5, 0.0)
     return Case("Stiff pushing", model, 0.4, (0, 1), 0.1, {0: 0.3, 1: 1.0}, {0: -0.02}, {0: 0.5}, (0.3,))
 
 
-def _pendulum() -> Case:
-    model = mujoco.MjModel.from_xml_string(_PENDULUM)
-    return Case("Double pendulum, no contact", model, 0.8, (0, 1), 0.3, {0: 1.0, 1: 0.5}, {0: 1.5, 1: 1.0})
-
-
 def _bounce() -> Case:
     """Thrown down obliquely without spin: it bounces once, under the default contact."""
-    model, qvel = _ball(friction=0.5, height=0.15), {0: 1.0, 2: -1.5}
+    model, qvel = ball(friction=0.5, height=0.15), {0: 1.0, 2: -1.5}
     return Case("Bouncing ball, one contact", model, 0.16, (0, 2), 0.1, {0: 1.0, 2: 1.0}, qvel=qvel)
 
 
 def _slide() -> Case:
     """Slides without spin, askew to the axes of the friction pyramid, until it rolls."""
-    model, qvel = _ball(friction=0.3, height=0.0499), {0: 1.0, 1: 0.4}
+    model, qvel = ball(friction=0.3, height=0.0499), {0: 1.0, 1: 0.4}
     return Case("Sliding ball, friction", model, 0.2, (0, 1), 0.1, {0: 1.0, 1: 1.0}, qvel=qvel)
 
 
-def _cube() -> Case:
-    """The thrown cube of `mjcf/cube_toss.xml`, edge first, thrown harder so that it soon lands."""
-    model = mujoco.MjModel.from_xml_path(str(scene_path("cube_toss")))
-    return Case("Tumbling cube", model, 0.3, (1, 2), 0.05, {1: 1.0, 2: 1.0}, {2: 0.12}, {1: 0.3, 2: -0.5})
-
-
 def _arm() -> Case:
-    """Three links under position servos with damping, which a coarse Euler step does not survive; the hand strikes the floor.
-
-    Later the servos hold the arm wherever it came from, and no gradient is left.
-    """
-    model, qpos = mujoco.MjModel.from_xml_string(_ARM), {0: 0.1, 1: 0.5, 2: 0.2}
-    title = "Servo arm on the floor, articulated"
-    return Case(title, model, 0.16, (0, 1), 0.3, {0: 1.0, 1: 0.5}, qpos, ctrl=(0.7, 0.4, 0.0))
+    """Short, for later the servos hold the arm wherever it came from, and no gradient is left."""
+    title, qpos = "Servo arm on the floor, articulated", {0: 0.1, 1: 0.5, 2: 0.2}
+    return Case(title, _scene("servo_arm"), 0.16, (0, 1), 0.3, {0: 1.0, 1: 0.5}, qpos, ctrl=(0.7, 0.4, 0.0))
 
 
-def _heap() -> Case:
-    xml = _HEAP.format(balls="".join(_HEAP_BALL.format(*place) for place in _HEAP_PLACES))
-    model = mujoco.MjModel.from_xml_string(xml)
-    return Case("Four falling balls, many bodies", model, 0.24, (6, 8), 0.1, {7: 1.0, 9: 1.0, 16: 0.5})
-
-
+_FREE, _CUBE, _HEAP = "Double pendulum, no contact", "Tumbling cube", "Four falling balls, many bodies"
 _BUILDERS: dict[str, Callable[[], Case]] = {
-    "pendulum": _pendulum,
+    "pendulum": lambda: Case(_FREE, _scene("free_pendulum"), 0.8, (0, 1), 0.3, {0: 1.0, 1: 0.5}, {0: 1.5, 1: 1.0}),
     "bounce": _bounce,
     "slide": _slide,
-    "cube": _cube,
+    # Edge first, thrown harder so that it soon lands.
+    "cube": lambda: Case(_CUBE, _scene("cube_toss"), 0.3, (1, 2), 0.05, {1: 1.0, 2: 1.0}, {2: 0.12}, {1: 0.3, 2: -0.5}),
     "arm": _arm,
     "hopper": lambda: _landing("hopper", "Hopper landing", (0, 1), {0: 1.0, 1: 1.0}),
     "half_cheetah": lambda: _landing("half_cheetah", "Half cheetah landing", (0, 1), {0: 1.0, 1: 1.0, 2: 0.3}),
     "push": _push,
-    "heap": _heap,
+    "heap": lambda: Case(_HEAP, _scene("ball_heap"), 0.24, (6, 8), 0.1, {7: 1.0, 9: 1.0, 16: 0.5}),
     "walker2d": lambda: _landing("walker2d", "Walker2d landing", (0, 1), {0: 1.0, 1: 1.0}),
     "ant": lambda: _landing("ant", "Ant landing", (0, 2), {0: 1.0, 2: 1.0}),
 }

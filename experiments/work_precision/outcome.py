@@ -76,31 +76,26 @@ class Point:
 
     @property
     def cost(self) -> float:
-        """Median wall time per simulated second of one state."""
         return float(np.median(self.seconds))
 
     @property
     def line(self) -> tuple[Any, ...]:
-        """What it has in common with the points that differ in time step alone."""
         return self.variant, self.knobs.tolerance
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'.
+    """What motions are compared with, of C MuJoCo's contacts or of MJX's; its errors are measured as the points'."""
 
-    Attributes:
-        error: distance between the finest run and the one at twice its step.
-        coarser_error: likewise between the runs at two and four times the step.
-        distance: from the same engine's reference with the scene's own cone: what the cone makes of the motion.
-        distance_to_c: of MJX's contacts from C MuJoCo's: after the same steps where both are the same motion, else of their
-            references.
-    """
+    error: float  # between the finest run and the one at twice its step
+    coarser_error: float  # likewise between the runs at two and four times the step
+    distance: float  # from the same engine's reference with the scene's own cone
+    distance_to_c: float = 0.0  # after the same steps where both engines' motion is the same, else of their references
 
-    error: float
-    coarser_error: float
-    distance: float
-    distance_to_c: float = 0.0
+    @property
+    def converges(self) -> bool:
+        """Whether halving the step still brought it nearer, or there is nothing left but rounding."""
+        return self.error < 0.75 * self.coarser_error or self.error < 1e-9
 
 
 @dataclass(frozen=True)
@@ -126,12 +121,10 @@ class Estimate:
 
     @property
     def cost(self) -> float:
-        """Median wall time of one estimate."""
         return float(np.median(self.seconds))
 
     @property
     def line(self) -> tuple[Any, ...]:
-        """What it has in common with the estimates that differ in the number of samples alone."""
         return self.estimator, self.timestep, self.softening
 
 
@@ -148,6 +141,11 @@ class GradientReference:
     step_error: float
     difference: float
     difference_error: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both ways agree within three standard errors; the difference's own bias, a per cent, granted."""
+        return self.difference < 3 * self.difference_error + 0.02
 
 
 @dataclass(frozen=True)
@@ -192,8 +190,7 @@ class Outcome:
                 on_front = pareto_front([one.cost for one in measured], [one.error for one in measured])
                 for one, is_best in zip(measured, on_front, strict=True):
                     rows.append({"scene": course.name, "of": kind, **_flat(one), "on_front": bool(is_best)})
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        return [{name: row.get(name, "") for name in names} for row in rows]
+        return rows
 
 
 def pareto_front(costs: npt.ArrayLike, errors: npt.ArrayLike) -> Bool[np.ndarray, " points"]:

@@ -1,14 +1,13 @@
 """What simulates a batch: few compiled programs, for each takes long, and C MuJoCo beside them.
 
-What compiles is each scene with each integrator, cone, precision and library; time step, number of steps and solver tolerance
-are arguments.
+Time step, number of steps and solver tolerance are arguments, so that nothing is compiled for another one.
 """
 
 import contextlib
 import copy
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,7 @@ from jaxtyping import Array, Float
 
 import mjxgrad as mg
 from experiments.motion import advance
-from experiments.parallel import in_threads, num_cores
+from experiments.parallel import num_cores
 from experiments.work_precision.cases import CONES, Case
 from experiments.work_precision.outcome import MJX, C, Integrator, Knobs, Variant
 from experiments.work_precision.settings import Sizes
@@ -52,19 +51,12 @@ class Program:
     compile_seconds: float
 
     def timed(self, qvel: Float[np.ndarray, "batch nv"], knobs: Knobs) -> tuple[Any, float]:
-        """Simulate from these velocities, and tell the wall time.
-
-        Returns:
-            Final positions and velocities; with a derivative, outcomes and their slopes along the uncertain velocities.
-        """
+        """Give final positions and velocities, or outcomes and their slopes by the uncertain velocities; and the wall time."""
         begun = time.perf_counter()
         dtype = np.dtype(self.variant.precision)
-        model = softened(self.model, knobs.softening).tree_replace(
-            {
-                "opt.timestep": jnp.asarray(np.asarray(knobs.timestep, dtype)),
-                "opt.tolerance": jnp.asarray(np.asarray(knobs.tolerance, dtype)),
-            }
-        )
+        timestep, tolerance = (jnp.asarray(np.asarray(each, dtype)) for each in (knobs.timestep, knobs.tolerance))
+        model = softened(self.model, knobs.softening)
+        model = model.tree_replace({"opt.timestep": timestep, "opt.tolerance": tolerance})
         num_steps = np.int32(round(self.case.duration / knobs.timestep))
         found = jax.tree.map(np.asarray, self.call(model, np.asarray(qvel, dtype), num_steps))
         return found, time.perf_counter() - begun
@@ -113,12 +105,6 @@ def repeated(
     return result, tuple(taken)
 
 
-def compiled(case: Case, variants: Sequence[Variant], on_each: Callable[[], None]) -> dict[Variant, Program]:
-    """Compile the programs of a scene, several at a time; `on_each` is called as each is done, in their order."""
-    found = in_threads(functools.partial(_compiled, case), variants, lambda _: on_each())
-    return dict(zip(variants, found, strict=True))
-
-
 def softened(model: mjx.Model, factor: float) -> mjx.Model:
     """Multiply the time constants of all contacts, the damping ratio kept; stiffness falls with the factor's square."""
     if factor == 1.0:
@@ -159,7 +145,8 @@ def _unsaid() -> Iterator[None]:
         mujoco.set_mju_user_warning(None)
 
 
-def _compiled(case: Case, variant: Variant) -> Program:
+def compiled(case: Case, variant: Variant) -> Program:
+    """Trace and compile a scene's program."""
     begun, dtype = time.perf_counter(), np.dtype(variant.precision)
     with jax.enable_x64(variant.precision == "float64"):
         scene = mg.load_scene(_c_model(case, variant))

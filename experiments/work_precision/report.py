@@ -9,19 +9,7 @@ import numpy as np
 from experiments.parallel import num_compilers, num_cores
 from experiments.report import Table
 from experiments.words import joined, percent, quantity
-from experiments.work_precision.outcome import (
-    MG,
-    MJX,
-    NUM_ITERATIONS,
-    ONSET,
-    C,
-    Course,
-    Estimate,
-    GradientReference,
-    Outcome,
-    Point,
-    Reference,
-)  # fmt: skip
+from experiments.work_precision.outcome import MG, MJX, NUM_ITERATIONS, ONSET, C, Course, Estimate, Outcome, Point
 
 _One = TypeVar("_One", Point, Estimate)
 
@@ -114,26 +102,16 @@ def findings(outcome: Outcome) -> list[str]:
     own = {course.title: course.references[MG, course.cone] for course in outcome.courses}
     untold = {
         "Halving the step did not bring the reference nearer, so that the dotted line is all that is known": [
-            course.title for course in outcome.courses if not all(map(converges, course.references.values()))
+            course.title for course in outcome.courses if not all(one.converges for one in course.references.values())
         ],
         "MJX makes other contacts than C MuJoCo, so that each has its own reference": [
             title for title, one in own.items() if one.distance_to_c > max(1e-5, 3 * one.error)
         ],
         "The two ways to the reference gradient differ beyond chance, which makes its errors doubtful": [
-            course.title for course in outcome.courses if not agrees(course.gradient_reference)
+            course.title for course in outcome.courses if not course.gradient_reference.agrees
         ],
     }
     return sentences + [f"{what}: {'; '.join(titles)}." for what, titles in untold.items() if titles]
-
-
-def converges(one: Reference) -> bool:
-    """Whether halving the step still brought it nearer, or there is nothing left but rounding."""
-    return one.error < 0.75 * one.coarser_error or one.error < 1e-9
-
-
-def agrees(one: GradientReference) -> bool:
-    """Whether both ways agree within three standard errors; the difference's own bias, a per cent, granted."""
-    return one.difference < 3 * one.difference_error + 0.02
 
 
 def _onset_ratios(course: Course) -> list[float]:
@@ -177,24 +155,14 @@ def tables(outcome: Outcome) -> list[Table]:
     """Tabulate time for one state and for a batch, compilation, and what cone and contact model make of the motion."""
     rows = []
     for course in outcome.courses:
-        compiling = [
-            np.median(
-                [p.compile_seconds for p in course.points if (p.library, p.variant.integrator) == (name, "Euler")]
-            )
-            for name in (MG, MJX)
-        ]
+        euler = [one for one in course.points if one.variant.integrator == "Euler"]
+        compiling = [np.median([one.compile_seconds for one in euler if one.library == name]) for name in (MG, MJX)]
         others = [one for (engine, cone), one in course.references.items() if engine == MG and cone != course.cone]
         found = course.gradient_reference
-        rows.append(
-            [
-                course.title,
-                *(_alone_and_together(course, name) for name in (MG, MJX, C)),
-                *(f"{seconds:.1f}" for seconds in compiling),
-                _share(others[0].distance) if others else "–",
-                _share(course.references[MG, course.cone].distance_to_c),
-                "; ".join(map(_share, (found.standard_error, found.step_error, found.difference))),
-            ]
-        )
+        row = [course.title, *(_alone_and_together(course, name) for name in (MG, MJX, C))]
+        row += [f"{seconds:.1f}" for seconds in compiling]
+        row += [_share(others[0].distance) if others else "–", _share(course.references[MG, course.cone].distance_to_c)]
+        rows.append([*row, "; ".join(map(_share, (found.standard_error, found.step_error, found.difference)))])
     columns = (
         "scene", "mg.step: alone; in batch", "mjx.step: alone; in batch", "C MuJoCo: alone; in batch",
         "to compile mg.step, s", "mjx.step, s", "cone changes the motion by", "MJX from C MuJoCo",

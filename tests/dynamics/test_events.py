@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss.throw import cube_toss
+from experiments.cube_toss.measure import cube_toss
 from mjxgrad.dynamics import check_gradient, step
 
 # Impacts of everything that can begin, each on a body of its own and without gravity. All move at 1 m/s or 1 rad/s towards a stop

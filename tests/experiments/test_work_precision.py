@@ -18,8 +18,7 @@ from experiments.config import load_runs
 from experiments.failure import ConfigurationError
 from experiments.work_precision import figures, report
 from experiments.work_precision.cases import case
-from experiments.work_precision.gradient import Recorded, quasi_random, smoothed_gradient
-from experiments.work_precision.measure import Truth, differences, variants
+from experiments.work_precision.measure import Recorded, Truth, differences, quasi_random, smoothed_gradient, variants
 from experiments.work_precision.outcome import (
     MG,
     MJX,
