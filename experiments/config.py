@@ -92,8 +92,15 @@ def read_header(text: str) -> tuple[str, str]:
 
 
 def kinds() -> list[str]:
-    """List the kinds of experiment: the folders that hold settings."""
-    return sorted(path.parent.name for path in FOLDER.glob("*/settings.py"))
+    """List the kinds of experiment: the folders and the files that hold settings."""
+    files = (path.stem for path in FOLDER.glob("*.py") if "\nclass Settings(" in path.read_text(encoding="utf-8"))
+    return sorted([*files, *(path.parent.name for path in FOLDER.glob("*/settings.py"))])
+
+
+def part(kind: str, name: str) -> types.ModuleType:
+    """Import the settings, measure, report or figures of a kind: a module of its folder, or the one file that holds all."""
+    is_folder = (FOLDER / kind / "settings.py").is_file()
+    return importlib.import_module(f"experiments.{kind}.{name}" if is_folder else f"experiments.{kind}")
 
 
 def _choose_size(table: dict[str, Any]) -> None:
@@ -114,7 +121,7 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
     if kind not in kinds():
         named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
         return None, [f"experiment: {named}{suggest(str(kind), kinds())}"]
-    settings = importlib.import_module(f"experiments.{kind}.settings").Settings
+    settings = part(kind, "settings").Settings
     try:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []

@@ -1,6 +1,5 @@
 """From a configuration to a finished output folder."""
 
-import importlib
 import json
 import os
 import re
@@ -14,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments import environment
-from experiments.config import Run, load_runs
+from experiments.config import Run, load_runs, part
 from experiments.output import building, write_csv, write_text, write_toml, writing
 from experiments.report import Report, overview, page
 from experiments.workspace import CompileClock, Workspace
 
-# What a kind's report.py may say of its outcome, each by a function of that name.
+# What a kind may say of its outcome, each by a function of that name.
 _SAID = ("verdict", "findings", "tables", "summary", "warnings", "headline")
 
 
@@ -93,12 +92,10 @@ def _call(run: Run, workspace: Workspace) -> Report:
         # Late, once the precision is chosen: these import JAX and MuJoCo.
         from experiments.theme import save
 
-        measure, words, pictures = (
-            importlib.import_module(f"experiments.{run.settings.experiment}.{part}")
-            for part in ("measure", "report", "figures")
-        )
+        measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
         outcome = measure.measure(run.settings, workspace)
-        said = {part: getattr(words, part)(outcome) for part in _SAID if hasattr(words, part)}
+        # A kind of one file may have imported a module of such a name.
+        said = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
         video, caption = pictures.video(outcome, workspace) if hasattr(pictures, "video") else (None, "")
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
+import experiments
 import mjxgrad as mg
-from experiments import environment, video
+from experiments import config, environment, video
 from experiments.__main__ import main
 from experiments.bias_variance import measure
 from experiments.settings import VideoSettings
@@ -28,6 +29,46 @@ angles = [0.05, 0.12]
 stiffness = [1e1, 1e5]
 num_samples = 64
 reference_samples = 500
+"""
+
+
+# A whole kind; `warnings` is a module here, and no sentence of the report.
+ONE_FILE = """\
+import warnings
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from experiments.report import Table
+from experiments.settings import RunSettings
+
+
+class Settings(RunSettings):
+    number: float
+
+
+@dataclass
+class Outcome:
+    double: float
+
+    def rows(self):
+        return [{"double": self.double}]
+
+
+def measure(settings, workspace):
+    return Outcome(float(2 * jnp.asarray(settings.number)))
+
+
+def verdict(outcome):
+    return f"Twice the number is {outcome.double}."
+
+
+def tables(outcome):
+    return [Table(["double"], [[str(outcome.double)]], "All.")]
+
+
+def drawings(outcome):
+    return {}
 """
 
 
@@ -227,3 +268,15 @@ def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(
     text = (tmp_path / "ball_wall" / "report.html").read_text()
     assert "<b>No video.</b>" in text
     assert "libosmesa6" in text
+
+
+def test_a_kind_may_be_one_file_that_imports_jax(tmp_path, monkeypatch, capsys):
+    (tmp_path / "doubling.py").write_text(ONE_FILE)
+    (tmp_path / "trial.toml").write_text('# How much is twice it?\nexperiment = "doubling"\nnumber = 0.1\n')
+    monkeypatch.setattr(config, "FOLDER", tmp_path)
+    monkeypatch.setattr(experiments, "__path__", [*experiments.__path__, str(tmp_path)])
+    assert config.kinds() == ["doubling"]
+    assert run(tmp_path / "trial.toml", tmp_path / "runs") == 0
+    # In float32 it would be 0.20000000298: float64 was chosen in time.
+    assert capsys.readouterr().out.startswith("Twice the number is 0.2.\n")
+    assert (tmp_path / "runs" / "trial" / "metrics.csv").read_text().split() == ["double", "0.2"]
