@@ -21,32 +21,20 @@ FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Run:
-    """One run, ready to start.
+    """One run, ready to start."""
 
-    Attributes:
-        name: of the output folder; a combination of a sweep adds its own folder to it.
-        settings: validated, defaults filled in.
-        question: what the run answers, from the comment that opens the file.
-        expected: the answer its author expects, from the same comment; may be empty.
-        varied: the settings that set this run apart within its sweep, by dotted key.
-    """
-
-    name: str
-    settings: RunSettings
-    question: str
-    expected: str
-    varied: dict[str, Any]
+    name: str  # of the output folder; a combination of a sweep adds its own folder to it
+    settings: RunSettings  # validated, defaults filled in
+    question: str  # what the run answers, from the comment that opens the file
+    expected: str  # the answer its author expects, from the same comment; may be empty
+    varied: dict[str, Any]  # the settings that set this run apart within its sweep, by dotted key
 
 
 def load_runs(file: str, overrides: list[str]) -> list[Run]:
     """Read a configuration: one run, or one per combination of its `[sweep]` table, its last key changing fastest.
 
-    Args:
-        file: a path to a TOML file, or the name of one in `experiments/`.
-        overrides: `key=value` in TOML syntax, dotted keys included. A key that the file sweeps is no longer swept.
-
-    Raises:
-        ConfigurationError: naming every mistake in the file and the overrides.
+    Overrides are `key=value` in TOML syntax, dotted keys included; a key that the file sweeps is no longer swept. A
+    `ConfigurationError` names every mistake in both.
     """
     path = find_file(file)
     text = path.read_text(encoding="utf-8")

@@ -17,31 +17,18 @@ _ROUNDING_FACTOR = 100.0
 
 @dataclass(frozen=True)
 class Cost:
-    """One program of one variant, beside the same one of the scene with everything.
+    """One program of one variant, beside the same one of the scene with everything."""
 
-    Attributes:
-        seconds: of each run of the batch.
-        base_seconds: of the runs with everything, in the same turns.
-        compile_seconds: to trace and compile.
-        base_compile_seconds: likewise with everything.
-        flops: of the program by XLA's count, a loop's body once.
-        base_flops: likewise with everything.
-        is_same_program: whether the two are the same, letter for letter, before XLA compiles them.
-        difference: largest, of any number that the programs give.
-        rounding: largest that moving the start by a few roundings makes, with everything.
-        scale: largest number that the program gives.
-    """
-
-    seconds: Float[np.ndarray, " repeats"]
-    base_seconds: Float[np.ndarray, " repeats"]
-    compile_seconds: float
-    base_compile_seconds: float
-    flops: float
-    base_flops: float
-    is_same_program: bool
-    difference: float
-    rounding: float
-    scale: float
+    seconds: Float[np.ndarray, " repeats"]  # of each run of the batch
+    base_seconds: Float[np.ndarray, " repeats"]  # of the runs with everything, in the same turns
+    compile_seconds: float  # to trace and compile
+    base_compile_seconds: float  # likewise with everything
+    flops: float  # of the program by XLA's count, a loop's body once
+    base_flops: float  # likewise with everything
+    is_same_program: bool  # whether the two are the same, letter for letter, before XLA compiles them
+    difference: float  # largest, of any number that the programs give
+    rounding: float  # largest that moving the start by a few roundings makes, with everything
+    scale: float  # largest number that the program gives
 
     @property
     def ratio(self) -> tuple[float, float, float]:
@@ -66,17 +53,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class VariantOutcome(Variant):
-    """What a variant costs.
+    """What a variant costs."""
 
-    Attributes:
-        step: cost of the motion.
-        gradient: cost of its gradient; None if not measured.
-        checks: what the full model says of the motions from which it was told what is not reached, and of other motions of the
-            kind; empty where a group alone is left out.
-    """
-
-    step: Cost
-    gradient: Cost | None
+    step: Cost  # cost of the motion
+    gradient: Cost | None  # cost of its gradient; None if not measured
+    # What the full model says of the motions from which it was told what is not reached, and of other motions of the kind;
+    # empty where a group alone is left out.
     checks: Sequence[OmissionCheck]
 
     @property

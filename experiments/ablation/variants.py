@@ -20,17 +20,11 @@ PAIRS, LIMITS = "contacts not reached", "limits not reached"
 
 @dataclass(frozen=True)
 class Variant:
-    """A scene with something left out.
+    """A scene with something left out."""
 
-    Attributes:
-        name: of the group that is left out.
-        scene: without it.
-        what: what was left out, in a few words.
-    """
-
-    name: str
-    scene: mg.Scene
-    what: str
+    name: str  # of the group that is left out
+    scene: mg.Scene  # without it
+    what: str  # what was left out, in a few words
 
     @property
     def num_rows(self) -> int:

@@ -17,33 +17,21 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Run:
-    """All seeds of one method.
+    """All seeds of one method."""
 
-    Attributes:
-        method: its settings.
-        final_cost: without noise, after the last step; infinite for a run that was lost.
-        cost: without noise, by seed and evaluation, the last one after the last step.
-        rollouts: spent before each evaluation, of the seed that spent most.
-        seconds: likewise, of all seeds together, without compilation.
-        alpha: weight of the first-order part, by seed and step.
-        reasons: for each sentence, at which steps of which seeds it was why; empty for a method without a choice.
-        num_skipped: steps not taken, because the estimate was not finite, by seed.
-        finite_share: of all rollouts.
-        rollouts_per_step: most of all steps.
-        compile_seconds: spent on compilation.
-    """
-
-    method: MethodSettings
-    final_cost: Float[np.ndarray, " seeds"]
+    method: MethodSettings  # its settings
+    final_cost: Float[np.ndarray, " seeds"]  # without noise, after the last step; infinite for a run that was lost
+    # Without noise, by seed and evaluation, the last one after the last step.
     cost: Float[np.ndarray, "seeds evaluations"]
-    rollouts: Int[np.ndarray, " evaluations"]
-    seconds: Float[np.ndarray, " evaluations"]
-    alpha: Float[np.ndarray, "seeds steps"]
+    rollouts: Int[np.ndarray, " evaluations"]  # spent before each evaluation, of the seed that spent most
+    seconds: Float[np.ndarray, " evaluations"]  # likewise, of all seeds together, without compilation
+    alpha: Float[np.ndarray, "seeds steps"]  # weight of the first-order part, by seed and step
+    # For each sentence, at which steps of which seeds it was why; empty for a method without a choice.
     reasons: dict[str, Bool[np.ndarray, "seeds steps"]] = field(repr=False)
-    num_skipped: Int[np.ndarray, " seeds"]
-    finite_share: float
-    rollouts_per_step: int
-    compile_seconds: float
+    num_skipped: Int[np.ndarray, " seeds"]  # steps not taken, because the estimate was not finite, by seed
+    finite_share: float  # of all rollouts
+    rollouts_per_step: int  # most of all steps
+    compile_seconds: float  # spent on compilation
 
     @property
     def is_lost(self) -> Bool[np.ndarray, " seeds"]:
@@ -130,27 +118,17 @@ class Difference:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All methods on one task.
+    """All methods on one task."""
 
-    Attributes:
-        settings: of the experiment.
-        num_samples: rollouts per step.
-        num_steps: of each run.
-        dim: number of parameters.
-        start_cost: without noise, before the first step.
-        reference: published mean and standard deviation of the final cost, by what they belong to.
-        runs: in the order of the settings.
-        errors: of one estimate at the start, of the methods that estimate; None if it was not measured.
-    """
-
-    settings: Settings
-    num_samples: int
-    num_steps: int
-    dim: int
-    start_cost: float
+    settings: Settings  # of the experiment
+    num_samples: int  # rollouts per step
+    num_steps: int  # of each run
+    dim: int  # number of parameters
+    start_cost: float  # without noise, before the first step
+    # Published mean and standard deviation of the final cost, by what they belong to.
     reference: dict[str, tuple[float, float]]
-    runs: list[Run]
-    errors: Comparison | None
+    runs: list[Run]  # in the order of the settings
+    errors: Comparison | None  # of one estimate at the start, of the methods that estimate; None if it was not measured
 
     @cached_property
     def verdicts(self) -> list[Difference]:

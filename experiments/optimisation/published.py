@@ -19,38 +19,23 @@ class Published:
     """A task with its settings; those of the paper in `TASKS`, our own for a scene.
 
     The optimiser is plain gradient descent: params ← params − learning_rate · estimate.
-
-    Attributes:
-        name: of the task.
-        objective: the cost under noise on the actions.
-        params: where the optimisation starts.
-        num_samples: rollouts per estimate.
-        learning_rate: a number, or an optax schedule from the number of steps made.
-        num_steps: of the optimiser.
-        gamma: the bias that the α-order rule may accept.
-        bound: L, what the α-order rule takes as the largest norm of one sample's zeroth-order gradient.
-        reference: mean and standard deviation over seeds of the noise-free cost, at the "start" and at the end of
-            "first", "zeroth", "alpha" and "ddcg"; NaN is a deviation that is not known.
-        num_starts: over how many starts `final_cost` averages where they are random.
     """
 
-    name: str
-    objective: ActionNoise
-    params: Float[Array, " dim"]
-    num_samples: int
-    learning_rate: float | Schedule
-    num_steps: int
-    gamma: float
-    bound: float
+    name: str  # of the task
+    objective: ActionNoise  # the cost under noise on the actions
+    params: Float[Array, " dim"]  # where the optimisation starts
+    num_samples: int  # rollouts per estimate
+    learning_rate: float | Schedule  # a number, or an optax schedule from the number of steps made
+    num_steps: int  # of the optimiser
+    gamma: float  # the bias that the α-order rule may accept
+    bound: float  # L, what the α-order rule takes as the largest norm of one sample's zeroth-order gradient
+    # Mean and standard deviation over seeds of the noise-free cost, at the "start" and at the end of "first", "zeroth",
+    # "alpha" and "ddcg"; NaN is a deviation that is not known.
     reference: Mapping[str, tuple[float, float]]
-    num_starts: int = 1
+    num_starts: int = 1  # over how many starts `final_cost` averages where they are random
 
     def final_cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
-        """Give the cost without action noise: from the nominal start, or the mean over a fixed set of random ones.
-
-        Args:
-            params: the point.
-        """
+        """Give the cost without action noise: from the nominal start, or the mean over a fixed set of random ones."""
         free = self.objective.zero_noise()
         actions, start = self.objective.split(free)
         if start is None:
@@ -97,13 +82,8 @@ def push(stiffness: float = 10.0) -> Published:
     """A body pushes another to a place through a spring.
 
     The published soft and stiff tasks differ in more than the stiffness: at 1000 N/m and above the velocity factor is
-    0.99 and the horizon 200 steps, below 0.998 and 400. To sweep the stiffness alone change `stiffness` in the task.
-
-    Args:
-        stiffness: of the spring, in N/m; published for 10 and 1000.
-
-    Returns:
-        The task; it has reference results at the published stiffness values only.
+    0.99 and the horizon 200 steps, below 0.998 and 400. To sweep the stiffness (N/m) alone change `stiffness` in the task.
+    Reference results are those at the published 10 and 1000.
     """
     is_stiff = stiffness >= 1000
     return _controls(

@@ -11,27 +11,16 @@ from experiments.planning.settings import NAMES, Settings
 
 @dataclass(frozen=True)
 class Attempt:
-    """One way of planning.
+    """One way of planning."""
 
-    Attributes:
-        model: which linear models it used.
-        seed: of its random numbers.
-        seconds: wall time, compilation included where it was the first of its kind.
-        states: that the system goes through under the controls that it found.
-        controls: finger speeds.
-        course: numbers by name along its iterations or nodes.
-        nodes: the states of a tree, none for a trajectory.
-        parents: of these nodes.
-    """
-
-    model: str
-    seed: int
-    seconds: float
-    states: Float[np.ndarray, "states state"]
-    controls: Float[np.ndarray, "horizon 2"]
-    course: dict[str, Float[np.ndarray, " count"]]
-    nodes: Float[np.ndarray, "nodes state"] | None = None
-    parents: Int[np.ndarray, " nodes"] | None = None
+    model: str  # which linear models it used
+    seed: int  # of its random numbers
+    seconds: float  # wall time, compilation included where it was the first of its kind
+    states: Float[np.ndarray, "states state"]  # that the system goes through under the controls that it found
+    controls: Float[np.ndarray, "horizon 2"]  # finger speeds
+    course: dict[str, Float[np.ndarray, " count"]]  # numbers by name along its iterations or nodes
+    nodes: Float[np.ndarray, "nodes state"] | None = None  # the states of a tree, none for a trajectory
+    parents: Int[np.ndarray, " nodes"] | None = None  # of these nodes
 
     @property
     def label(self) -> str:
@@ -41,21 +30,14 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was found.
+    """All that was found."""
 
-    Attributes:
-        settings: of the run.
-        attempts: in the order of the settings, seeds last.
-        polished: the shortest way of the first kind after trajectory optimisation, if it was asked for and there is one.
-        shown: positions of the best plan at every time step, from a rollout of its own.
-        timestep: between these (s).
-    """
-
-    settings: Settings
-    attempts: list[Attempt]
+    settings: Settings  # of the run
+    attempts: list[Attempt]  # in the order of the settings, seeds last
+    # The shortest way of the first kind after trajectory optimisation, if it was asked for and there is one.
     polished: Attempt | None
-    shown: Float[np.ndarray, "steps 5"]
-    timestep: float
+    shown: Float[np.ndarray, "steps 5"]  # positions of the best plan at every time step, from a rollout of its own
+    timestep: float  # between these (s)
 
     @property
     def goal(self) -> Float[np.ndarray, " 3"]:

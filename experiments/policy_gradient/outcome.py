@@ -61,54 +61,31 @@ class Estimates(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What one gradient is worth at one point; all but α over the norm of the gradient.
+    """What one gradient is worth at one point; all but α over the norm of the gradient."""
 
-    Attributes:
-        bias: norm of that of the first order, noise taken off.
-        low: two standard errors below; they are of the square, and the square root of what is below zero is zero.
-        high: two standard errors above.
-        along: component of the first-order mean along the reference.
-        along_error: its standard error.
-        alpha: mean weight of the first order.
-        alpha_error: its standard error.
-        error_first: root-mean-square error of one estimate of first order.
-        error_unbiased: of one unbiased estimate.
-        error_mixed: of one α-order estimate.
-    """
-
-    bias: float
-    low: float
-    high: float
-    along: float
-    along_error: float
-    alpha: float
-    alpha_error: float
-    error_first: float
-    error_unbiased: float
-    error_mixed: float
+    bias: float  # norm of that of the first order, noise taken off
+    low: float  # two standard errors below; they are of the square, and the square root of what is below zero is zero
+    high: float  # two standard errors above
+    along: float  # component of the first-order mean along the reference
+    along_error: float  # its standard error
+    alpha: float  # mean weight of the first order
+    alpha_error: float  # its standard error
+    error_first: float  # root-mean-square error of one estimate of first order
+    error_unbiased: float  # of one unbiased estimate
+    error_mixed: float  # of one α-order estimate
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Both gradients at one point of one task.
+    """Both gradients at one point of one task."""
 
-    Attributes:
-        name: of the task.
-        title: of the task.
-        point: its label.
-        hits_and_misses: whether the noise covers a jump of the cost.
-        has_jump_of_force: whether contacts set in with a force that is not zero.
-        estimates: by gradient.
-        reference: unbiased estimates from rollouts of their own.
-    """
-
-    name: str
-    title: str
-    point: str
-    hits_and_misses: bool
-    has_jump_of_force: bool
-    estimates: Mapping[str, Estimates]
-    reference: Vectors
+    name: str  # of the task
+    title: str  # of the task
+    point: str  # its label
+    hits_and_misses: bool  # whether the noise covers a jump of the cost
+    has_jump_of_force: bool  # whether contacts set in with a force that is not zero
+    estimates: Mapping[str, Estimates]  # by gradient
+    reference: Vectors  # unbiased estimates from rollouts of their own
 
     @property
     def label(self) -> str:
@@ -157,25 +134,15 @@ def _root(square: float) -> float:
 
 @dataclass(frozen=True)
 class Course:
-    """Descents of one kind on a task, one per seed.
+    """Descents of one kind on a task, one per seed."""
 
-    Attributes:
-        name: of the task.
-        title: of the task.
-        estimator: of `ESTIMATORS`.
-        gradient: of `GRADIENTS`.
-        costs: mean costs under noise, before each step and at the end.
-        alphas: weights of the first order, likewise.
-        seconds: of all seeds, with compilation if there was any.
-    """
-
-    name: str
-    title: str
-    estimator: str
-    gradient: str
-    costs: Float[np.ndarray, "seeds steps"]
-    alphas: Float[np.ndarray, "seeds steps"]
-    seconds: float
+    name: str  # of the task
+    title: str  # of the task
+    estimator: str  # of `ESTIMATORS`
+    gradient: str  # of `GRADIENTS`
+    costs: Float[np.ndarray, "seeds steps"]  # mean costs under noise, before each step and at the end
+    alphas: Float[np.ndarray, "seeds steps"]  # weights of the first order, likewise
+    seconds: float  # of all seeds, with compilation if there was any
 
     @property
     def final(self) -> tuple[float, float | None]:

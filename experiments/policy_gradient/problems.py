@@ -41,23 +41,16 @@ class Point:
 
 @dataclass(frozen=True)
 class Problem:
-    """A task with its name in the settings and its title.
-
-    Attributes:
-        stddev: of the noise at the points where gradients are compared.
-        num_samples: rollouts of one estimate.
-        has_jump_of_force: whether its contacts set in with a force that is not zero.
-        descent: None if it is not optimised.
-    """
+    """A task with its name in the settings and its title."""
 
     name: str
     title: str
     task: Any
-    stddev: float
+    stddev: float  # of the noise at the points where gradients are compared
     points: Sequence[Point]
-    num_samples: int
-    has_jump_of_force: bool
-    descent: Descent | None = None
+    num_samples: int  # rollouts of one estimate
+    has_jump_of_force: bool  # whether its contacts set in with a force that is not zero
+    descent: Descent | None = None  # None if it is not optimised
 
     def objective(self, gradient: str, stddev: float) -> mg.Objective:
         """Give the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""

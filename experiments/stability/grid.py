@@ -49,17 +49,11 @@ _RANDOM = {
 
 @dataclass(frozen=True)
 class Points:
-    """Points of the grid of one scene.
+    """Points of the grid of one scene."""
 
-    Attributes:
-        values: of every parameter, by name.
-        family: index of the plane that each belongs to, −1 for random ones.
-        planes: names of the two parameters of each plane.
-    """
-
-    values: dict[str, Float[np.ndarray, " points"]]
-    family: np.ndarray
-    planes: tuple[tuple[str, str], ...]
+    values: dict[str, Float[np.ndarray, " points"]]  # of every parameter, by name
+    family: np.ndarray  # index of the plane that each belongs to, −1 for random ones
+    planes: tuple[tuple[str, str], ...]  # names of the two parameters of each plane
 
     def __len__(self) -> int:
         return len(self.family)

@@ -92,17 +92,11 @@ class _Case:
 
 @dataclass(frozen=True)
 class _Runs:
-    """What mjxgrad did on all points of a scene in one precision.
+    """What mjxgrad did on all points of a scene in one precision."""
 
-    Attributes:
-        discrete: motion and discrete gradient.
-        event: the same with the event gradient; None where it was not asked for.
-        differences: of the outcome (start and parameters, widths, points), in float64.
-    """
-
-    discrete: Run
-    event: Run | None
-    differences: np.ndarray | None
+    discrete: Run  # motion and discrete gradient
+    event: Run | None  # the same with the event gradient; None where it was not asked for
+    differences: np.ndarray | None  # of the outcome (start and parameters, widths, points), in float64
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:

@@ -19,42 +19,26 @@ from mjxgrad.dynamics import Gradient
 
 
 class Steps(eqx.Module):
-    """What the solves of a rollout were given and found.
+    """What the solves of a rollout were given and found."""
 
-    Attributes:
-        qpos: positions before each step.
-        qvel: velocities, likewise.
-        qacc: the acceleration found.
-        unbalanced: share of the forces that it leaves; 0 from the first bad step on.
-    """
-
-    qpos: Float[np.ndarray, "points steps nq"]
-    qvel: Float[np.ndarray, "points steps nv"]
-    qacc: Float[np.ndarray, "points steps nv"]
-    unbalanced: Float[np.ndarray, "points steps"]
+    qpos: Float[np.ndarray, "points steps nq"]  # positions before each step
+    qvel: Float[np.ndarray, "points steps nv"]  # velocities, likewise
+    qacc: Float[np.ndarray, "points steps nv"]  # the acceleration found
+    unbalanced: Float[np.ndarray, "points steps"]  # share of the forces that it leaves; 0 from the first bad step on
 
 
 @dataclass(frozen=True)
 class Run:
-    """What mjxgrad did on every point.
+    """What mjxgrad did on every point."""
 
-    Attributes:
-        course: the motion.
-        value: the outcome at the end.
-        gradient: of the outcome with respect to the model's fields, positions and velocities.
-        is_silent: whether a rollout returned a number that is not finite without a flag.
-        is_gradient_finite: whether all numbers of the gradient are.
-        is_unsolved: whether the rollout says that some step's forces are not in balance.
-        steps: state and solution at each step, for a closer look at those that seem wrong.
-    """
-
-    course: Course
-    value: Float[np.ndarray, " points"]
+    course: Course  # the motion
+    value: Float[np.ndarray, " points"]  # the outcome at the end
+    # Of the outcome with respect to the model's fields, positions and velocities.
     gradient: tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]
-    is_silent: np.ndarray
-    is_gradient_finite: np.ndarray
-    is_unsolved: np.ndarray
-    steps: Steps
+    is_silent: np.ndarray  # whether a rollout returned a number that is not finite without a flag
+    is_gradient_finite: np.ndarray  # whether all numbers of the gradient are
+    is_unsolved: np.ndarray  # whether the rollout says that some step's forces are not in balance
+    steps: Steps  # state and solution at each step, for a closer look at those that seem wrong
 
 
 def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Array]:

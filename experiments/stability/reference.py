@@ -23,42 +23,26 @@ _SHARES = 4
 
 @dataclass(frozen=True)
 class Course:
-    """What one simulator did on every point.
+    """What one simulator did on every point."""
 
-    Attributes:
-        qpos: positions after the last step, or the last good one.
-        qvel: velocities, likewise.
-        kinetic: energy of motion before each step and at the end, in J.
-        potential: energy of height, likewise.
-        residual: largest share of a step's velocity by which a solve is off, or that its forces leave unbalanced.
-        first_bad_step: −1 if there is none.
-    """
-
-    qpos: Float[np.ndarray, "points nq"]
-    qvel: Float[np.ndarray, "points nv"]
-    kinetic: Float[np.ndarray, "points states"]
-    potential: Float[np.ndarray, "points states"]
+    qpos: Float[np.ndarray, "points nq"]  # positions after the last step, or the last good one
+    qvel: Float[np.ndarray, "points nv"]  # velocities, likewise
+    kinetic: Float[np.ndarray, "points states"]  # energy of motion before each step and at the end, in J
+    potential: Float[np.ndarray, "points states"]  # energy of height, likewise
+    # Largest share of a step's velocity by which a solve is off, or that its forces leave unbalanced.
     residual: Float[np.ndarray, " points"]
-    first_bad_step: np.ndarray
+    first_bad_step: np.ndarray  # −1 if there is none
 
 
 @dataclass(frozen=True)
 class Reference:
-    """C MuJoCo on every point.
+    """C MuJoCo on every point."""
 
-    Attributes:
-        course: what it did.
-        fields: of the model, by name, for every point.
-        qpos: where each rollout starts.
-        qvel: likewise.
-        differences: central differences of the outcome along `direction`, by width.
-    """
-
-    course: Course
-    fields: dict[str, np.ndarray]
-    qpos: Float[np.ndarray, "points nq"]
-    qvel: Float[np.ndarray, "points nv"]
-    differences: Float[np.ndarray, "widths points"]
+    course: Course  # what it did
+    fields: dict[str, np.ndarray]  # of the model, by name, for every point
+    qpos: Float[np.ndarray, "points nq"]  # where each rollout starts
+    qvel: Float[np.ndarray, "points nv"]  # likewise
+    differences: Float[np.ndarray, "widths points"]  # central differences of the outcome along `direction`, by width
 
 
 def direction(scene: StabilityScene, num_steps: int, timestep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -48,35 +48,21 @@ _BALL = f'<geom name="{{0}}" size="{RADIUS}"/>'
 
 @dataclass(frozen=True)
 class StabilityScene:
-    """A scene with its own program; all that is not static is a point of the grid.
+    """A scene with its own program; all that is not static is a point of the grid."""
 
-    Attributes:
-        name: of the scene.
-        mjcf: of it.
-        family: what it shares with scenes that differ in cone or dimension.
-        start: from a point to positions and velocities.
-        masses: of all bodies but the world, from the mass ratio (kg).
-        outcome: weights of the positions in the number whose derivative is judged.
-        crossing: indices of two positions of which the first stays below the second unless the bodies tunnel.
-        spacing: of these two where their positions are equal (m).
-        depth_unit: what a depth of one is (m, or rad).
-        bounces: whether it is a single bounce, with a restitution in closed form.
-        has_refsafe: whether MuJoCo may replace time constants.
-        has_limits: whether the point's parameters are those of joint limits.
-    """
-
-    name: str
-    mjcf: str
-    family: str
-    start: Callable[[Point], State]
-    masses: Callable[[float], list[float]]
-    outcome: tuple[float, ...]
+    name: str  # of the scene
+    mjcf: str  # of it
+    family: str  # what it shares with scenes that differ in cone or dimension
+    start: Callable[[Point], State]  # from a point to positions and velocities
+    masses: Callable[[float], list[float]]  # of all bodies but the world, from the mass ratio (kg)
+    outcome: tuple[float, ...]  # weights of the positions in the number whose derivative is judged
+    # Indices of two positions of which the first stays below the second unless the bodies tunnel.
     crossing: tuple[tuple[int, int], ...] = ()
-    spacing: float = 0.0
-    depth_unit: float = RADIUS
-    bounces: bool = False
-    has_refsafe: bool = True
-    has_limits: bool = False
+    spacing: float = 0.0  # of these two where their positions are equal (m)
+    depth_unit: float = RADIUS  # what a depth of one is (m, or rad)
+    bounces: bool = False  # whether it is a single bounce, with a restitution in closed form
+    has_refsafe: bool = True  # whether MuJoCo may replace time constants
+    has_limits: bool = False  # whether the point's parameters are those of joint limits
 
     def model(self) -> mujoco.MjModel:
         """Compile it."""
