@@ -204,14 +204,15 @@ def _take_sweep(table: dict[str, Any]) -> tuple[dict[str, list[Any]], list[str]]
     sweep, problems = table.pop("sweep", {}), []
     if not isinstance(sweep, dict):
         return {}, [f"sweep: must be a table of arrays, got {sweep!r}"]
-    flat = _flatten(sweep)
+    flat = flatten(sweep)
     for key in [key for key, values in flat.items() if not isinstance(values, list) or not values]:
         problems.append(f"sweep.{key}: must be an array of at least one value, got {flat.pop(key)!r}")
     return flat, problems
 
 
-def _flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Give the values of nested tables by dotted key."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat

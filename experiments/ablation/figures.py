@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.lines import Line2D
 
-from experiments.ablation.outcome import Outcome, SceneOutcome, VariantOutcome
+from experiments.ablation.measure import Outcome, SceneOutcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
 from experiments.parallel import num_compilers
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.ablation.outcome import Cost, Outcome, VariantOutcome
+from experiments.ablation.measure import Cost, Outcome, VariantOutcome
 from experiments.ablation.variants import NEEDED, REACHED
 from experiments.report import Table
 from experiments.words import joined, percent

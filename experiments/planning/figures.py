@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 
-from experiments.planning.outcome import Attempt, Outcome
+from experiments.planning.measure import Attempt, Outcome
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
 from experiments.video import film, shown_speed
 from experiments.workspace import Workspace

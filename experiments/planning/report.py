@@ -1,6 +1,6 @@
 """What the plans say, in sentences and in a table."""
 
-from experiments.planning.outcome import Attempt, Outcome
+from experiments.planning.measure import Attempt, Outcome
 from experiments.planning.settings import NAMES
 from experiments.report import Table
 from experiments.words import capitalised, quantity

@@ -11,9 +11,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
-from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.grid import AXES, Points
-from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
+from experiments.stability.outcome import BOUNCE, C_MUJOCO, GAIN, Derivative, Motion, Outcome, SceneOutcome
 from experiments.stability.report import load
 from experiments.stability.scenes import RADIUS, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.report import Table
-from experiments.stability.classes import Derivative, Motion
 from experiments.stability.grid import Points
-from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Derivative, Motion, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import StabilityScene, effective
 from mjxgrad.contact.warnings import largest_stable_step, steepest
 

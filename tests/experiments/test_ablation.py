@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.ablation.measure import record, scene_path, segments
-from experiments.ablation.outcome import Cost
+from experiments.ablation.measure import Cost, record, scene_path, segments
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, RENDERING, variants
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import experiments
 import mjxgrad as mg
-from experiments import config, environment, video
+from experiments import config, runner, video
 from experiments.__main__ import main
 from experiments.bias_variance import measure
 from experiments.settings import VideoSettings
@@ -173,7 +173,7 @@ def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch)
     (copied / "runs" / "steep" / "report.html").rename(copied / "gone.html")
     assert run(copied / "steep.toml", copied / "runs") == 2
     (copied / "gone.html").rename(copied / "runs" / "steep" / "report.html")
-    monkeypatch.setattr(environment, "ROOT", copied)
+    monkeypatch.setattr(runner, "ROOT", copied)
     assert run(copied / "steep.toml", copied / "runs") == 2
     assert (copied / "runs" / "steep" / "metrics.csv").is_file()
     assert [path.name for path in (copied / "runs").iterdir()] == ["steep"]
@@ -262,7 +262,7 @@ def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(
     small = ["num_samples=8", "reference_samples=100", "stiffness=[1e2,1e4]", "angles=[0.65]"]
     command = [sys.executable, "-m", "experiments", "run", "ball_wall", *small, "--output", str(tmp_path)]
     result = subprocess.run(
-        command, env={**os.environ, "MUJOCO_GL": "disable"}, cwd=environment.ROOT, capture_output=True, text=True
+        command, env={**os.environ, "MUJOCO_GL": "disable"}, cwd=runner.ROOT, capture_output=True, text=True
     )
     assert result.returncode == 0, result.stderr
     text = (tmp_path / "ball_wall" / "report.html").read_text()
