@@ -86,9 +86,10 @@ def kinds() -> list[str]:
 
 
 def part(kind: str, name: str) -> types.ModuleType:
-    """Import the settings, measure, report or figures of a kind: a module of its folder, or the one file that holds all."""
-    is_folder = (FOLDER / kind / "settings.py").is_file()
-    return importlib.import_module(f"experiments.{kind}.{name}" if is_folder else f"experiments.{kind}")
+    """Import a kind's settings, measure, report or figures; a folder's figures may be in its report, and all in one file."""
+    places = (f"{kind}.{name}", f"{kind}.report", kind)
+    found = next(place for place in places if (FOLDER / f"{place.replace('.', '/')}.py").is_file())
+    return importlib.import_module(f"experiments.{found}")
 
 
 def _choose_size(table: dict[str, Any]) -> None:

@@ -12,10 +12,9 @@ from scipy import stats
 
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.optimisation.figures import drawings
 from experiments.optimisation.measure import problem
 from experiments.optimisation.outcome import Difference, Outcome, Run
-from experiments.optimisation.report import findings, headline, tables, verdict, warnings
+from experiments.optimisation.report import drawings, findings, headline, tables, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.report import overview
 from experiments.theme import save

@@ -9,7 +9,6 @@ import pytest
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.policy_gradient.figures import drawings
 from experiments.policy_gradient.measure import estimated
 from experiments.policy_gradient.outcome import (
     Cell,
@@ -21,7 +20,7 @@ from experiments.policy_gradient.outcome import (
     squared_distance,
     squared_norm,
 )
-from experiments.policy_gradient.report import tables, verdict
+from experiments.policy_gradient.report import drawings, tables, verdict
 from experiments.policy_gradient.settings import Settings
 from experiments.theme import save
 
