@@ -101,7 +101,7 @@ def _call(run: Run, workspace: Workspace) -> Report:
         measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
         outcome = measure.measure(run.settings, workspace)
         # A kind of one file may have imported a module of such a name.
-        said = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
+        said: dict[str, Any] = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
         video, caption = pictures.video(outcome, workspace) if hasattr(pictures, "video") else (None, "")
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
 from experiments.report import Table
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, percent, quantity
 from mjxgrad.estimators import Reason
 
@@ -185,7 +184,7 @@ def summarised(outcome: Outcome):
     axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
     axes[0, 1].set(title="Weight of the first order", xlabel="α")
     axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
-    _legend(figure, axes, 2)
+    legend_below(figure, axes[0, 0], 2)
     caption = (
         "Left, norm of the bias over the norm of the gradient, noise taken off, with two standard errors; where the interval "
         "reaches the edge no bias was found. Middle, mean weight of the first order. Right, root-mean-square error of one "
@@ -226,7 +225,7 @@ def throw(outcome: Outcome):
         right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
     for axis in axes[-1]:
         axis.set_xlabel("angle, rad")
-    _legend(figure, axes, 3)
+    legend_below(figure, axes[0, 0], 3)
     caption = (
         f"Left, gradient of the cost under noise of {outcome.settings.angle_stddev:g} rad; error bars are two standard errors. "
         "Right, weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the "
@@ -252,7 +251,7 @@ def push(outcome: Outcome):
         axis.set(title=cell.title, xlabel="step")
         axis.yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, 1/N")
-    _legend(figure, axes, 3)
+    legend_below(figure, axes[0, 0], 3)
     caption = (
         f"Components of the gradient by the force at each moment: {outcome.settings.num_references} unbiased estimates with a "
         "band of two standard errors, first-order means before it."
@@ -281,7 +280,7 @@ def hopper(outcome: Outcome):
         axis.grid(axis="x", visible=False)
     axes[0, 0].yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set_ylabel("gradient, m per unit of gain")
-    _legend(figure, axes, 3)
+    legend_below(figure, axes[0, 0], 3)
     caption = (
         "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
         "are two standard errors."
@@ -309,16 +308,12 @@ def descent(outcome: Outcome):
         below.set(ylim=(-0.05, 1.05), xlabel="step")
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("α")
-    _legend(figure, axes, 2)
+    legend_below(figure, axes[0, 0], 2)
     caption = (
         f"Adam from the same start, {outcome.settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of "
         "each step; below, weight of the first order."
     )
     return figure, "Descents", caption
-
-
-def _legend(figure: Picture, axes: np.ndarray, columns: int) -> None:
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
 def _by_motor(flat: np.ndarray) -> np.ndarray:

@@ -12,18 +12,9 @@ from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
+from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.grid import Points, points
-from experiments.stability.outcome import (
-    C_MUJOCO,
-    NOT_ASKED,
-    UNSOLVED,
-    Motion,
-    MotionRecord,
-    Outcome,
-    SceneOutcome,
-    classify_derivative,
-    classify_motion,
-)
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
@@ -254,16 +245,9 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
     record = _record(case, run.course)
     motion, bound = classify_motion(record), case.largest
     slopes = [along(run, case.push), along(run, case.changes) / case.flown]
+    bounds = {"largest": bound, "tolerance": _TOLERANCE[precision]}
     kinds = [
-        classify_derivative(
-            slope,
-            run.is_gradient_finite,
-            record.is_sound,
-            fine,
-            np.abs(fine - coarse),
-            largest=bound,
-            tolerance=_TOLERANCE[precision],
-        )
+        classify_derivative(slope, run.is_gradient_finite, record.is_sound, fine, np.abs(fine - coarse), **bounds)
         for slope, (coarse, fine) in zip(slopes, truth, strict=True)
     ]
     is_wild = ~run.is_gradient_finite | ~(np.abs(slopes) <= bound).all(axis=0)
@@ -289,12 +273,5 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
 def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
     """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
     truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
-    return classify_derivative(
-        run.gradient[1][:, 0],
-        run.is_gradient_finite,
-        record.is_sound,
-        truth,
-        0 * truth,
-        largest=bound,
-        tolerance=_EVENT_TOLERANCE,
-    )
+    slope, bounds = run.gradient[1][:, 0], {"largest": bound, "tolerance": _EVENT_TOLERANCE}
+    return classify_derivative(slope, run.is_gradient_finite, record.is_sound, truth, 0 * truth, **bounds)

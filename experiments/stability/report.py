@@ -14,18 +14,9 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
 from experiments.report import Table
+from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.grid import AXES, Points
-from experiments.stability.outcome import (
-    BOUNCE,
-    C_MUJOCO,
-    GAIN,
-    NOT_ASKED,
-    Derivative,
-    Motion,
-    Outcome,
-    SceneOutcome,
-    against_c,
-)
+from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import RADIUS, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
 from mjxgrad.contact.warnings import largest_stable_step, steepest
