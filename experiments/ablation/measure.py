@@ -181,14 +181,9 @@ def _scene(name: str, settings: Settings, workspace: Workspace) -> SceneOutcome:
     workspace.check(everything)
     recorded, others = (
         record(
-            everything,
-            num_rollouts=sizes.num_recorded,
-            duration=_DURATION,
-            least_steps=2 * sizes.horizon,
-            control_share=_CONTROL_SHARE,
-            seed=settings.seed + i,
+            everything, num_rollouts=sizes.num_recorded, duration=_DURATION, least_steps=2 * sizes.horizon, seed=seed
         )
-        for i in range(2)
+        for seed in (settings.seed, settings.seed + 1)
     )
     found = variants(path, recorded)
     starts = segments(recorded, batch=sizes.batch, horizon=sizes.horizon, seed=settings.seed)
@@ -221,12 +216,10 @@ def scene_path(name: str) -> Path:
     return own if own.exists() else _GYMNASIUM / f"{name}.xml"
 
 
-def record(
-    scene: mg.Scene, *, num_rollouts: int, duration: float, least_steps: int, control_share: float, seed: int
-) -> mg.Trajectory:
+def record(scene: mg.Scene, *, num_rollouts: int, duration: float, least_steps: int, seed: int) -> mg.Trajectory:
     """Roll out random controls, held for a few steps, from the reference pose with random velocities, by C MuJoCo.
 
-    Each takes its duration (s), or so many steps at least, and controls over a share of their range, about its middle. C MuJoCo
+    Each takes its duration (s), or so many steps at least, and controls over half of their range, about its middle. C MuJoCo
     needs no compilation.
     """
     model = scene.to_mujoco()
@@ -234,7 +227,7 @@ def record(
     horizon = max(round(duration / model.opt.timestep), least_steps)
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
-    middle, reach = (low + high) / 2, control_share * (high - low) / 2
+    middle, reach = (low + high) / 2, _CONTROL_SHARE * (high - low) / 2
     data, nq = mujoco.MjData(model), model.nq
     # Time, positions, velocities, and the state of actuators, if there is any.
     initial = np.zeros((num_rollouts, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))

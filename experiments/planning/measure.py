@@ -165,21 +165,15 @@ def _trajectory(task: PlanarPusher, settings: Settings, model: str):
     schedule = np.append(schedule, np.full(count // 6, last))
 
     def run(seed: int) -> Attempt:
-        begin = time.perf_counter()
-        controls = jnp.zeros((settings.horizon, 2))
-        plan = _optimised(task, settings, controls, _smoother(model, settings, settings.length), schedule, seed)
-        return _planned(plan, model, seed, time.perf_counter() - begin, settings.length)
+        return _attempt(task, settings, model, jnp.zeros((settings.horizon, 2)), settings.length, schedule, seed)
 
     return run
 
 
 def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
     """Optimise a way that was found."""
-    begin, length = time.perf_counter(), _POLISH_LENGTH
-    schedule = np.geomspace(1, min(1, settings.last_length / length), settings.tree.polish_iterations)
-    smoother = _smoother(way.model, settings, length)
-    plan = _optimised(task, settings, jnp.asarray(way.controls), smoother, schedule, way.seed)
-    return _planned(plan, way.model, way.seed, time.perf_counter() - begin, length)
+    schedule = np.geomspace(1, min(1, settings.last_length / _POLISH_LENGTH), settings.tree.polish_iterations)
+    return _attempt(task, settings, way.model, jnp.asarray(way.controls), _POLISH_LENGTH, schedule, way.seed)
 
 
 @eqx.filter_jit
@@ -200,8 +194,12 @@ def _optimised(
     )
 
 
-def _planned(plan: Plan, model: str, seed: int, seconds: float, length: float) -> Attempt:
-    rows = plan.iterations
+def _attempt(
+    task: PlanarPusher, settings: Settings, model: str, start: jax.Array, length: float, factors: np.ndarray, seed: int
+) -> Attempt:
+    begin = time.perf_counter()
+    plan = _optimised(task, settings, start, _smoother(model, settings, length), factors, seed)
+    seconds, rows = time.perf_counter() - begin, plan.iterations
     course = {
         "length": length * np.asarray(rows.factor),
         "smoothed_cost": np.asarray(rows.smoothed_cost),

@@ -87,31 +87,18 @@ def _throw(name: str, settings: Settings) -> Problem:
         )
         for angle in settings.angles
     ]
-    return Problem(
-        name=name,
-        title="Throw, default contact" if is_default else "Throw, gentle contact",
-        task=mg.tasks.ball_wall().with_softness(softness),
-        stddev=settings.angle_stddev,
-        points=points,
-        num_samples=50,
-        has_jump_of_force=is_default,
-        descent=Descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"]),
-    )
+    title = "Throw, default contact" if is_default else "Throw, gentle contact"
+    task = mg.tasks.ball_wall().with_softness(softness)
+    descent = Descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"])
+    return Problem(name, title, task, settings.angle_stddev, points, 50, has_jump_of_force=is_default, descent=descent)
 
 
 def _hopper(settings: Settings) -> Problem:
     task = mg.tasks.hopper()
     start = task.initial_params()
-    return Problem(
-        name="hopper",
-        title="Hopper",
-        task=task,
-        stddev=0.1,
-        points=[Point("start", start)],
-        num_samples=32,
-        has_jump_of_force=True,
-        descent=Descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"]),
-    )
+    descent = Descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"])
+    points = [Point("start", start)]
+    return Problem("hopper", "Hopper", task, 0.1, points, 32, has_jump_of_force=True, descent=descent)
 
 
 class Estimated(eqx.Module):

@@ -17,6 +17,7 @@ VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
 WIDTHS = (1e-4, 2e-5)
 """Of finite differences, in units of what a body flies in one step."""
+_Worker = tuple[StabilityScene, mujoco.MjModel, mujoco.MjData]
 _SHARES = 4
 """Pieces of work for each process: some points take longer than others."""
 
@@ -77,17 +78,11 @@ def _run_points(name: str, num_steps: int, cases: list[tuple[dict[str, float], n
     scene = next(scene for scene in catalogue() if scene.name == name)
     model = scene.model()
     worker = (scene, model, mujoco.MjData(model))
-    return [_run_point(worker, point, shift[: model.nq], shift[model.nq :], num_steps) for point, shift in cases]
+    return [_run_point(worker, point, change, num_steps) for point, change in cases]
 
 
-def _run_point(
-    worker: tuple[StabilityScene, mujoco.MjModel, mujoco.MjData],
-    point: dict[str, float],
-    shift: np.ndarray,
-    push: np.ndarray,
-    num_steps: int,
-) -> tuple:
-    scene, model, data = worker
+def _run_point(worker: _Worker, point: dict[str, float], change: np.ndarray, num_steps: int) -> tuple:
+    (scene, model, data), (shift, push) = worker, np.split(change, [worker[1].nq])
     configure(scene, model, data, point)
     fields = {name: np.array(getattr(model, name)) for name in FIELDS}
     fields["timestep"] = np.array(model.opt.timestep)

@@ -43,6 +43,8 @@ _HEAD = """
 """
 _TAIL = "\n</worldbody></mujoco>"
 _PLANE = '<geom name="floor" type="plane" size="1 1 .1" mass="0"/>'
+_CONES = ("pyramidal", "elliptic")
+_FREE_BODY = (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0)  # weights of its positions in the outcome
 _BALL = f'<geom name="{{0}}" size="{RADIUS}"/>'
 
 
@@ -113,6 +115,10 @@ def _mjcf(
     return _HEAD.format(name=name, gravity=-gravity, cone=cone, condim=condim, flags=flags) + body + _TAIL
 
 
+def _alone(_: float) -> list[float]:
+    return [MASS]
+
+
 def _graded(count: int) -> Callable[[float], list[float]]:
     """Masses of bodies in a row, each heavier than the one before by the same factor, the lightest of `MASS`."""
     places = np.arange(count) / (count - 1)
@@ -132,19 +138,11 @@ def _balls() -> list[StabilityScene]:
     def start(point: Point) -> State:
         return np.array([_above(point)]), np.array([-point["speed"]])
 
-    return [
-        StabilityScene(
-            name,
-            _mjcf("ball", body, flags=f'refsafe="{"enable" if has_refsafe else "disable"}"'),
-            "ball",
-            start,
-            lambda _: [MASS],
-            (1.0,),
-            bounces=True,
-            has_refsafe=has_refsafe,
-        )
-        for name, has_refsafe in (("ball", False), ("ball, refsafe", True))
-    ]
+    found = []
+    for name, refsafe in (("ball", "disable"), ("ball, refsafe", "enable")):
+        mjcf, has_refsafe = _mjcf("ball", body, flags=f'refsafe="{refsafe}"'), refsafe == "enable"
+        found.append(StabilityScene(name, mjcf, "ball", start, _alone, (1.0,), bounces=True, has_refsafe=has_refsafe))
+    return found
 
 
 def _spheres() -> list[StabilityScene]:
@@ -155,18 +153,13 @@ def _spheres() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, RADIUS + _above(point), 1.0, 0.0, 0.0, 0.0])
         return qpos, np.array([0.5 * speed, 0.2 * speed, -speed, 0.0, 0.3 * speed / RADIUS, 0.1 * speed / RADIUS])
 
-    variants = [(1, "pyramidal"), *((dim, cone) for cone in ("pyramidal", "elliptic") for dim in (3, 4, 6))]
-    return [
-        StabilityScene(
-            f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else ""),
-            _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim),
-            "sphere",
-            start,
-            lambda _: [MASS],
-            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
-        )
-        for dim, cone in variants
-    ]
+    variants = [(1, "pyramidal"), *((dim, cone) for cone in _CONES for dim in (3, 4, 6))]
+    found = []
+    for dim, cone in variants:
+        mjcf = _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim)
+        name = f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else "")
+        found.append(StabilityScene(name, mjcf, "sphere", start, _alone, _FREE_BODY))
+    return found
 
 
 def _pairs() -> list[StabilityScene]:
@@ -183,18 +176,17 @@ def _pairs() -> list[StabilityScene]:
         return np.array(first + second), np.array([point["speed"]] + 11 * [0.0])
 
     weights = (0.0, 0.3, 0.0) + 4 * (0.0,) + (1.0, 0.4, 0.1) + 4 * (0.0,)
-    return [
-        StabilityScene(
-            f"two balls, {cone}",
-            _mjcf("pair", body, cone=cone, condim=3),
-            "two balls",
-            start,
-            lambda ratio: [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)],
-            weights,
-            crossing=((0, 7),),
+
+    def masses(ratio: float) -> list[float]:
+        return [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)]
+
+    found = []
+    for cone in _CONES:
+        mjcf = _mjcf("pair", body, cone=cone, condim=3)
+        found.append(
+            StabilityScene(f"two balls, {cone}", mjcf, "two balls", start, masses, weights, crossing=((0, 7),))
         )
-        for cone in ("pyramidal", "elliptic")
-    ]
+    return found
 
 
 def _stack() -> StabilityScene:
@@ -210,16 +202,10 @@ def _stack() -> StabilityScene:
         heights = above * np.arange(1, count + 1) if above < 0 else np.full(count, above)
         return heights, np.full(count, -point["speed"])
 
-    return StabilityScene(
-        "stack",
-        _mjcf("stack", _PLANE + balls, gravity=GRAVITY),
-        "stack",
-        start,
-        _graded(count),
-        (0.2, 0.3, 0.5, 1.0),
-        crossing=tuple((i, i + 1) for i in range(count - 1)),
-        spacing=2 * RADIUS,
-    )
+    mjcf, weights = _mjcf("stack", _PLANE + balls, gravity=GRAVITY), (0.2, 0.3, 0.5, 1.0)
+    crossing = tuple((i, i + 1) for i in range(count - 1))
+    masses, spacing = _graded(count), 2 * RADIUS
+    return StabilityScene("stack", mjcf, "stack", start, masses, weights, crossing=crossing, spacing=spacing)
 
 
 def _boxes() -> list[StabilityScene]:
@@ -234,17 +220,11 @@ def _boxes() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, corner + _above(point), np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
         return qpos, np.array([0.3 * speed, 0.1 * speed, -speed, 0.0, 0.0, 0.0])
 
-    return [
-        StabilityScene(
-            f"box, {cone}",
-            _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3),
-            "box",
-            start,
-            lambda _: [MASS],
-            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
-        )
-        for cone in ("pyramidal", "elliptic")
-    ]
+    found = []
+    for cone in _CONES:
+        mjcf = _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3)
+        found.append(StabilityScene(f"box, {cone}", mjcf, "box", start, _alone, _FREE_BODY))
+    return found
 
 
 def _chain() -> StabilityScene:
