@@ -67,7 +67,7 @@ _SETTINGS: dict[str, dict[str, Any]] = {
 # the nominal start the spread of costs over starts drowns the gradient and the descent ends near 1800. Over 4 to 8 seeds
 # that baseline gives 1175 ± 2 (push, soft), 818 ± 2 (stiff), 7092 ± 20 (friction), 742 ± 75 (LQR); the mean of the other
 # samples gives 1144, 816, 7080 and 557.
-_KINDS = ("start", "first", "zeroth", "alpha", "ddcg")
+_KINDS: tuple[str, ...] = ("start", "first", "zeroth", "alpha", "ddcg")
 _RESULTS = {
     "push_soft": ((2375.0, UNKNOWN), (1128.0, 0.02), (1170.0, 2.0), (1128.0, UNKNOWN), (1134.0, 2.0)),
     "push_stiff": ((1821.0, UNKNOWN), (959.0, 130.0), (818.3, 0.8), (816.7, 0.6), (816.9, 0.6)),

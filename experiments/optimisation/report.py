@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.optimisation.outcome import Difference, Outcome, Run
+from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.words import quantity
@@ -255,7 +255,9 @@ def curves(outcome: Outcome):
     axes[-1, 1].set_xlabel(f"seconds for all {outcome.settings.seeds} runs, without compilation")
     # A run that climbs by decades, or one that is the lowest itself, would flatten all others.
     above = outcome.start_cost - lowest
-    axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * _smallest(outcome)), 1.5 * above)
+    medians = [float(np.nanmin(np.nanmedian(run.cost, axis=0))) for run in outcome.runs if run.kept.size]
+    smallest = min(medians, default=outcome.start_cost) - lowest
+    axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * smallest), 1.5 * above)
     for axis in axes.flat:
         axis.yaxis.set_major_formatter(lambda value, _: power(value))
         axis.yaxis.set_minor_formatter(NullFormatter())
@@ -276,7 +278,10 @@ def alpha(outcome: Outcome):
     left, right = axes[0]
     for run in runs:
         colour = _colours(outcome)[run.method.label]
-        middle = _smooth(np.nanmean(run.alpha, axis=0))
+        middle = np.nanmean(run.alpha, axis=0)
+        # Averaged over a fiftieth of the steps, so that the lines do not hide each other.
+        width = max(1, middle.size // 50)
+        middle = np.convolve(middle, np.ones(width) / width, mode="valid")
         left.plot(np.arange(middle.size), middle, color=colour, lw=1.8, label=run.method.label)
     left.set(title="Mean α over seeds", xlabel="step", ylim=(-0.04, 1.04), ylabel="α")
     left.margins(x=0)
@@ -351,12 +356,6 @@ def _floor(outcome: Outcome) -> float:
     return 1e-5 * (outcome.start_cost - _lowest(outcome)) or 1.0
 
 
-def _smallest(outcome: Outcome) -> float:
-    """Give how near to the lowest cost the median of the nearest method comes."""
-    medians = [float(np.nanmin(np.nanmedian(run.cost, axis=0))) for run in outcome.runs if run.kept.size]
-    return min(medians, default=outcome.start_cost) - _lowest(outcome)
-
-
 def _log_scale(axis: Axes) -> None:
     axis.set_xscale("log")
     low, high = axis.xaxis.get_view_interval()
@@ -364,12 +363,6 @@ def _log_scale(axis: Axes) -> None:
     axis.xaxis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.xaxis.set_major_formatter(lambda value, _: power(value))
     axis.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """Average over a fiftieth of the steps, so that the lines do not hide each other."""
-    width = max(1, values.size // 50)
-    return np.convolve(values, np.ones(width) / width, mode="valid") if values.size >= width else values
 
 
 def _colours(outcome: Outcome) -> dict[str, str]:

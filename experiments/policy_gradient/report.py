@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
+from experiments.policy_gradient.measure import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, percent, quantity

@@ -13,11 +13,10 @@ from jaxtyping import Float
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
 from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
-from experiments.stability.grid import Points, points
 from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
-from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
+from experiments.stability.scenes import GRAVITY, Points, StabilityScene, catalogue, effective, points
 from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import soundness

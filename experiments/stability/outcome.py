@@ -8,8 +8,7 @@ import numpy as np
 import xarray as xr
 
 from experiments.stability.classes import Derivative, Motion
-from experiments.stability.grid import Points
-from experiments.stability.scenes import StabilityScene
+from experiments.stability.scenes import Points, StabilityScene
 from experiments.stability.settings import Settings
 
 C_MUJOCO = "C MuJoCo"

@@ -79,9 +79,10 @@ class Program:
         value, trajectory, gradient = jax.tree.map(lambda *x: np.concatenate(x), *parts)
         kinetic, potential, residual, qacc = trajectory.observations
         # From the first bad step on the solver is asked what has no answer.
-        residual = _until(residual, trajectory.first_bad_step)
+        first_bad, step = trajectory.first_bad_step, np.arange(residual.shape[1])
+        residual = np.where((first_bad[:, None] >= 0) & (step >= first_bad[:, None]), 0.0, residual)
         is_silent = ~trajectory.diverged & ~_all_finite((trajectory, value))
-        ends, first_bad = (trajectory.qpos[:, -1], trajectory.qvel[:, -1]), trajectory.first_bad_step
+        ends = trajectory.qpos[:, -1], trajectory.qvel[:, -1]
         course = Course(*ends, kinetic, potential, residual.max(axis=1), first_bad)
         last = self._num_steps
         steps = Steps(trajectory.qpos[:, :last], trajectory.qvel[:, :last], qacc[:, :last], residual[:, :last])
@@ -149,8 +150,3 @@ def along(run: Run, changes: dict[str, np.ndarray]) -> Float[np.ndarray, " point
 def _all_finite(tree: Any) -> np.ndarray:
     leaves = [x for x in jax.tree.leaves(tree) if np.issubdtype(np.asarray(x).dtype, np.floating)]
     return np.all([np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in leaves], axis=0)
-
-
-def _until(values: Float[np.ndarray, "points states"], first_bad: np.ndarray) -> Float[np.ndarray, "points states"]:
-    step = np.arange(values.shape[1])
-    return np.where((first_bad[:, None] >= 0) & (step >= first_bad[:, None]), 0.0, values)

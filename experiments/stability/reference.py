@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.parallel import num_cores
-from experiments.stability.grid import Points
-from experiments.stability.scenes import FIELDS, StabilityScene, catalogue, configure
+from experiments.stability.scenes import FIELDS, Points, StabilityScene, catalogue, configure
 
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""

@@ -15,9 +15,8 @@ from matplotlib.patches import Patch
 
 from experiments.report import Table
 from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
-from experiments.stability.grid import AXES, Points
 from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
-from experiments.stability.scenes import RADIUS, StabilityScene, effective
+from experiments.stability.scenes import AXES, RADIUS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
 from mjxgrad.contact.warnings import largest_stable_step, steepest
 from mjxgrad.tasks.textbook import Bounce

@@ -9,12 +9,12 @@ import pytest
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.policy_gradient.measure import estimated
-from experiments.policy_gradient.outcome import (
+from experiments.policy_gradient.measure import (
     Cell,
     Course,
     Estimates,
     Outcome,
+    estimated,
     jackknife_error,
     share_along,
     squared_distance,
