@@ -1,10 +1,8 @@
 """From settings to numbers, and what follows from them."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -141,7 +139,7 @@ class Outcome:
     runs: list[Run]  # in the order of the settings
     errors: Comparison | None  # of one estimate at the start, of the methods that estimate; None if it was not measured
 
-    @cached_property
+    @functools.cached_property
     def verdicts(self) -> list[Difference]:
         """Compare α-order as it comes with the better of first and zeroth order; empty if one of them is missing."""
         ours = [run for run in self.runs if run.method.is_default_alpha]
@@ -224,7 +222,7 @@ def problem(settings: Settings) -> Published:
         # What is published of the equations does not hold for the scene.
         found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[settings.task])
     chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
-    return dataclasses.replace(found, **chosen, reference={}) if chosen else found
+    return replace(found, **chosen, reference={}) if chosen else found
 
 
 def scene(settings: Settings) -> mg.Scene | None:

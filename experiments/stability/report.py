@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from experiments.report import Table
 from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
-from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
+from experiments.stability.measure import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import AXES, RADIUS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
 from mjxgrad.contact.warnings import largest_stable_step, steepest
