@@ -21,32 +21,20 @@ FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Run:
-    """One run, ready to start.
+    """One run, ready to start."""
 
-    Attributes:
-        name: of the output folder; a combination of a sweep adds its own folder to it.
-        settings: validated, defaults filled in.
-        question: what the run answers, from the comment that opens the file.
-        expected: the answer its author expects, from the same comment; may be empty.
-        varied: the settings that set this run apart within its sweep, by dotted key.
-    """
-
-    name: str
-    settings: RunSettings
-    question: str
-    expected: str
-    varied: dict[str, Any]
+    name: str  # of the output folder; a combination of a sweep adds its own folder to it
+    settings: RunSettings  # validated, defaults filled in
+    question: str  # what the run answers, from the comment that opens the file
+    expected: str  # the answer its author expects, from the same comment; may be empty
+    varied: dict[str, Any]  # the settings that set this run apart within its sweep, by dotted key
 
 
 def load_runs(file: str, overrides: list[str]) -> list[Run]:
     """Read a configuration: one run, or one per combination of its `[sweep]` table, its last key changing fastest.
 
-    Args:
-        file: a path to a TOML file, or the name of one in `experiments/`.
-        overrides: `key=value` in TOML syntax, dotted keys included. A key that the file sweeps is no longer swept.
-
-    Raises:
-        ConfigurationError: naming every mistake in the file and the overrides.
+    Overrides are `key=value` in TOML syntax, dotted keys included; a key that the file sweeps is no longer swept. A
+    `ConfigurationError` names every mistake in both.
     """
     path = find_file(file)
     text = path.read_text(encoding="utf-8")
@@ -92,8 +80,16 @@ def read_header(text: str) -> tuple[str, str]:
 
 
 def kinds() -> list[str]:
-    """List the kinds of experiment: the folders that hold settings."""
-    return sorted(path.parent.name for path in FOLDER.glob("*/settings.py"))
+    """List the kinds of experiment: the folders and the files that hold settings."""
+    files = (path.stem for path in FOLDER.glob("*.py") if "\nclass Settings(" in path.read_text(encoding="utf-8"))
+    return sorted([*files, *(path.parent.name for path in FOLDER.glob("*/settings.py"))])
+
+
+def part(kind: str, name: str) -> types.ModuleType:
+    """Import a kind's settings, measure, report or figures; a folder's figures may be in its report, and all in one file."""
+    places = (f"{kind}.{name}", f"{kind}.report", kind)
+    found = next(place for place in places if (FOLDER / f"{place.replace('.', '/')}.py").is_file())
+    return importlib.import_module(f"experiments.{found}")
 
 
 def _choose_size(table: dict[str, Any]) -> None:
@@ -114,7 +110,7 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
     if kind not in kinds():
         named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
         return None, [f"experiment: {named}{suggest(str(kind), kinds())}"]
-    settings = importlib.import_module(f"experiments.{kind}.settings").Settings
+    settings = part(kind, "settings").Settings
     try:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
@@ -209,14 +205,15 @@ def _take_sweep(table: dict[str, Any]) -> tuple[dict[str, list[Any]], list[str]]
     sweep, problems = table.pop("sweep", {}), []
     if not isinstance(sweep, dict):
         return {}, [f"sweep: must be a table of arrays, got {sweep!r}"]
-    flat = _flatten(sweep)
+    flat = flatten(sweep)
     for key in [key for key, values in flat.items() if not isinstance(values, list) or not values]:
         problems.append(f"sweep.{key}: must be an array of at least one value, got {flat.pop(key)!r}")
     return flat, problems
 
 
-def _flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Give the values of nested tables by dotted key."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat

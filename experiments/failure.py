@@ -9,12 +9,7 @@ class ExperimentError(Exception):
 
 
 class ConfigurationError(ExperimentError):
-    """Mistakes in a configuration, all of them at once.
-
-    Args:
-        source: the file or command line that holds them.
-        mistakes: one sentence each, opened by the dotted path of its setting.
-    """
+    """Mistakes in a configuration, all of them at once: one sentence each, opened by the dotted path of its setting."""
 
     def __init__(self, source: str, mistakes: Iterable[str]):
         self.source = source

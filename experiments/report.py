@@ -26,47 +26,29 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers to read, already rounded to what their error bars allow.
+    """Numbers to read, already rounded to what their error bars allow."""
 
-    Attributes:
-        columns: headings.
-        rows: cells, as text; `quantity` writes a number with its error.
-        caption: what it shows.
-        emphasised: positions (row, column) of the cells that the verdict rests on.
-    """
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str
+    columns: Sequence[str]  # headings
+    rows: Sequence[Sequence[str]]  # cells, as text; `quantity` writes a number with its error
+    caption: str  # what it shows
+    # Positions (row, column) of the cells that the verdict rests on.
     emphasised: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a run.
+    """The outcome of a run."""
 
-    Attributes:
-        verdict: the answer in at most three sentences, computed from the data.
-        findings: further sentences, one each.
-        figures: in order of reading.
-        tables: after the figures.
-        metrics: rows for metrics.csv, in SI units.
-        video: relative to the output folder, or None.
-        video_caption: what it shows; without a video, why there is none.
-        warnings: what a reader must know before trusting the numbers.
-        summary: a table to stand before the figures, if there is one.
-        headline: heading -> cell, the run's columns in the page over a sweep.
-    """
-
-    verdict: str
-    figures: Sequence[Figure]
-    tables: Sequence[Table]
-    metrics: Sequence[dict[str, Any]]
-    findings: Sequence[str] = ()
-    video: str | None = None
-    video_caption: str = ""
-    warnings: Sequence[str] = field(default_factory=tuple)
-    summary: Table | None = None
+    verdict: str  # the answer in at most three sentences, computed from the data
+    figures: Sequence[Figure]  # in order of reading
+    tables: Sequence[Table]  # after the figures
+    metrics: Sequence[dict[str, Any]]  # rows for metrics.csv, in SI units
+    findings: Sequence[str] = ()  # further sentences, one each
+    video: str | None = None  # relative to the output folder, or None
+    video_caption: str = ""  # what it shows; without a video, why there is none
+    warnings: Sequence[str] = field(default_factory=tuple)  # what a reader must know before trusting the numbers
+    summary: Table | None = None  # a table to stand before the figures, if there is one
+    # Heading -> cell, the run's columns in the page over a sweep.
     headline: dict[str, str] = field(default_factory=dict)
 
 

@@ -1,10 +1,13 @@
 """From a configuration to a finished output folder."""
 
-import importlib
+import hashlib
+import importlib.metadata
 import json
 import os
+import platform
 import re
 import shlex
+import subprocess
 import sys
 import time
 import warnings
@@ -13,13 +16,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments import environment
-from experiments.config import Run, load_runs
+from experiments.config import Run, flatten, load_runs, part
 from experiments.output import building, write_csv, write_text, write_toml, writing
+from experiments.parallel import num_cores
 from experiments.report import Report, overview, page
 from experiments.workspace import CompileClock, Workspace
 
-# What a kind's report.py may say of its outcome, each by a function of that name.
+ROOT = Path(__file__).parent.parent
+_PACKAGES = ("mjxgrad", "jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "numpy", "scipy", "matplotlib", "mediapy")
+# What a kind may say of its outcome, each by a function of that name.
 _SAID = ("verdict", "findings", "tables", "summary", "warnings", "headline")
 
 
@@ -47,7 +52,7 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 
 def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     settings = run.settings.model_dump(mode="json")
-    fingerprint = environment.fingerprint([settings, run.question, run.expected])
+    fingerprint = _fingerprint([settings, run.question, run.expected])
     previous = _previous(folder)
     # A report that lacks its video is made again once there is an OpenGL to draw it with.
     is_unchanged = previous.get("fingerprint") == fingerprint
@@ -59,14 +64,14 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
         print(f"{folder}: {run.question}", file=sys.stderr)
         workspace, started, compiling = Workspace(partial), time.perf_counter(), CompileClock()
         report = _call(run, workspace)
-        head, is_dirty = environment.commit()
+        head, is_dirty = _commit()
         facts = {
             "command": command,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "commit": head,
             "dirty": is_dirty,
-            "versions": environment.versions(),
-            "device": environment.device(),
+            "versions": _versions(),
+            "device": _device(),
             "lacks_video": report.video is None and bool(report.video_caption),
             "seconds": {
                 **workspace.seconds,
@@ -93,12 +98,10 @@ def _call(run: Run, workspace: Workspace) -> Report:
         # Late, once the precision is chosen: these import JAX and MuJoCo.
         from experiments.theme import save
 
-        measure, words, pictures = (
-            importlib.import_module(f"experiments.{run.settings.experiment}.{part}")
-            for part in ("measure", "report", "figures")
-        )
+        measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
         outcome = measure.measure(run.settings, workspace)
-        said = {part: getattr(words, part)(outcome) for part in _SAID if hasattr(words, part)}
+        # A kind of one file may have imported a module of such a name.
+        said: dict[str, Any] = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
         video, caption = pictures.video(outcome, workspace) if hasattr(pictures, "video") else (None, "")
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
@@ -124,7 +127,7 @@ def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
     commit = (facts["commit"] or "no repository")[:12] + (" with uncommitted changes" if facts["dirty"] else "")
     device = facts["device"]
     return {
-        "Settings": _flat(run.settings.model_dump(mode="json")),
+        "Settings": {key: _listed(value) for key, value in flatten(run.settings.model_dump(mode="json")).items()},
         "Time": {name: f"{seconds:.1f} s" for name, seconds in facts["seconds"].items()},
         "Made with": {
             "command": facts["command"],
@@ -136,14 +139,8 @@ def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = ", ".join(map(_short, value)) if isinstance(value, list) else _short(value)
-    return flat
+def _listed(value: Any) -> str:
+    return ", ".join(map(_short, value)) if isinstance(value, list) else _short(value)
 
 
 def _short(value: Any) -> str:
@@ -166,7 +163,7 @@ def _set_up_jax(precision: str) -> None:
 
     jax.config.update("jax_enable_x64", precision == "float64")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(environment.ROOT / ".cache" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
@@ -175,3 +172,54 @@ def _folder_name(varied: dict[str, Any]) -> str:
     text = ",".join(f"{key}={value}" for key, value in varied.items())
     safe = re.sub(r"[^\w.,=+-]", "_", text)[:100]
     return safe if safe == text else f"{safe}-{zlib.crc32(text.encode()):08x}"
+
+
+def _versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on; "source tree" if not installed."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "source tree"
+    return found
+
+
+def _commit() -> tuple[str | None, bool | None]:
+    """The commit of the source, and whether files differ from it; None outside a git repository."""
+    try:
+        head = _git("rev-parse", "HEAD")
+        return head, bool(_git("status", "--porcelain"))
+    except (OSError, subprocess.CalledProcessError):
+        return None, None
+
+
+def _device() -> dict[str, Any]:
+    """What JAX computes on; JAX has been set up by then."""
+    import jax
+
+    first = jax.devices()[0]
+    return {
+        "platform": first.platform,
+        "kind": first.device_kind,
+        "count": jax.device_count(),
+        "processors": num_cores(),
+    }
+
+
+def _fingerprint(settings: Any) -> str:
+    """A hash of all that decides a result: settings, source and versions.
+
+    The source is hashed rather than its commit asked for, so that an uncommitted change counts too.
+    """
+    digest = hashlib.sha256(json.dumps([settings, _versions()], sort_keys=True).encode())
+    for folder, pattern in (("mjxgrad", "*.py"), ("experiments", "*.py"), ("mjcf", "*")):
+        for path in sorted((ROOT / folder).rglob(pattern)):
+            if path.is_file():
+                digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _git(*arguments: str) -> str:
+    result = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    return result.stdout.strip()

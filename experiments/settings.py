@@ -18,7 +18,7 @@ class RunSettings(SettingsTable):
     """What every kind of experiment has."""
 
     experiment: str
-    """The kind of experiment, a folder of `experiments`."""
+    """The kind of experiment, a folder or a file of `experiments`."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Of every random number in the run."""
     precision: Literal["float32", "float64"] = "float64"

@@ -27,10 +27,8 @@ def film(
 ) -> tuple[str | None, str]:
     """Draw motions side by side, each a model and its positions over time.
 
-    Several have titles and stand in columns. The time between positions (s) is the model's own if it is not given.
-
-    Returns:
-        The file in the output folder and its caption; without OpenGL None and the reason.
+    Several have titles and stand in columns. The time between positions (s) is the model's own if it is not given. Gives the
+    file in the output folder and its caption; without OpenGL None and the reason.
     """
     clips = []
     try:
@@ -72,11 +70,7 @@ def with_coarse_shadows(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def tile(videos: Sequence[np.ndarray], captions: Sequence[str], *, columns: int) -> np.ndarray:
-    """Put videos of one size side by side, each under its caption; one that ends early keeps its last frame.
-
-    Raises:
-        ValueError: if there are no videos, if the captions are not as many, or if the sizes differ.
-    """
+    """Put videos of one size side by side, each under its caption; one that ends early keeps its last frame."""
     if not videos or len(videos) != len(captions):
         raise ValueError(f"captions must be as many as videos, and at least 1, got {len(captions)} for {len(videos)}")
     sizes = {video.shape[1:] for video in videos}

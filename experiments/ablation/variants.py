@@ -1,7 +1,7 @@
 """A scene with everything, without one group, and without all that it does not need."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,17 +20,11 @@ PAIRS, LIMITS = "contacts not reached", "limits not reached"
 
 @dataclass(frozen=True)
 class Variant:
-    """A scene with something left out.
+    """A scene with something left out."""
 
-    Attributes:
-        name: of the group that is left out.
-        scene: without it.
-        what: what was left out, in a few words.
-    """
-
-    name: str
-    scene: mg.Scene
-    what: str
+    name: str  # of the group that is left out
+    scene: mg.Scene  # without it
+    what: str  # what was left out, in a few words
 
     @property
     def num_rows(self) -> int:
@@ -50,7 +44,8 @@ def variants(path: Path, recorded: mg.Trajectory) -> list[Variant]:
         everything = mg.load_scene(path, keep_everything=True)
         unused = mg.diagnostics.unused(everything, recorded)
         found = [Variant(EVERYTHING, everything, "")]
-        for name, edit in _EDITS.items():
+        edits = (_without_rendering, _without_sensors, _without_tendons, _fused, _without_damping)
+        for name, edit in zip((RENDERING, SENSORS, TENDONS, FUSED, DAMPING), edits, strict=True):
             edited = edit(path)
             if edited is not None:
                 found.append(Variant(name, mg.load_scene(edited[0], keep_everything=True), edited[1]))
@@ -134,12 +129,3 @@ def _without_damping(path: Path) -> tuple[mujoco.MjModel, str] | None:
     before = model.opt.disableflags
     switch_off(model)
     return (model, "a second factorisation") if model.opt.disableflags != before else None
-
-
-_EDITS: dict[str, Callable[[Path], tuple[mujoco.MjModel, str] | None]] = {
-    RENDERING: _without_rendering,
-    SENSORS: _without_sensors,
-    TENDONS: _without_tendons,
-    FUSED: _fused,
-    DAMPING: _without_damping,
-}

@@ -66,11 +66,7 @@ class Ramp(eqx.Module):
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Estimate at every stiffness and angle, with a progress bar.
-
-    Raises:
-        ExperimentError: if at some stiffness and angle there is no estimate, for hardly any rollout was finite.
-    """
+    """Estimate at every stiffness and angle; an `ExperimentError` if somewhere hardly any rollout was finite."""
     task = ball_wall() if settings.task == "ball_wall" else None
     stiffness, knob, objective = _ramp(settings) if task is None else _wall(task, settings)
     if task is not None:

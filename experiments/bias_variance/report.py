@@ -1,13 +1,21 @@
-"""The answer of a bias and variance experiment in words, computed from its numbers."""
+"""The answer of a bias and variance experiment, computed from its numbers, and its pictures."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.ticker import NullLocator, SymmetricalLogLocator
 from numpy.typing import ArrayLike
 
-from experiments.bias_variance.measure import Outcome
+from experiments import theme
+from experiments.bias_variance.measure import Outcome, wall_contact
 from experiments.report import Table
-from experiments.theme import power
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
+from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
+from experiments.workspace import Workspace
 
 
 def verdict(outcome: Outcome) -> str:
@@ -111,3 +119,190 @@ def _default(outcome: Outcome) -> list[str]:
         return [f"Under MuJoCo's default contact no bias is seen at any of the {count} angles."]
     sign = f", and has the wrong sign at {wrong}" if wrong else ""
     return [f"Under MuJoCo's default contact it is biased at {biased} of {count} angles{sign}."]
+
+
+UNIT = "1/s²"
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"landscape": landscape, "gradient": gradient, "bias_variance": bias_variance, "choice": choice}
+
+
+def landscape(outcome: Outcome):
+    """Cost against angle for each stiffness, without noise and under it."""
+    figure, axes = subplots(1, 2, height=4.0, sharey=True)
+    found, table = outcome.landscape, outcome.table
+    colours = iter(theme.shades(int((~table.is_default).sum())))
+    looks = [
+        {"color": theme.DEFAULT, "ls": (0, (4, 1.5)), "label": "default"}
+        if is_default
+        else {"color": next(colours), "label": power(stiffness)}
+        for stiffness, is_default in zip(table.stiffness.values, table.is_default.values, strict=True)
+    ]
+    titles = ("Without noise", f"Mean under noise of {outcome.settings.stddev:g} rad")
+    for axis, costs, title in zip(axes[0], (found.cost, found.smoothed), titles, strict=True):
+        for cost, look in zip(costs, looks, strict=True):
+            axis.plot(costs[costs.dims[1]], cost, lw=1.3, **look)
+        for angle in table.angle.values:
+            axis.axvline(angle, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
+        axis.set(title=title, xlabel="angle of the throw, rad", xlim=found.smooth_grid.values[[0, -1]])
+    # The landscape goes on to both sides, where costs that nobody sees would set the scale.
+    seen = found.cost.sel(grid=slice(*found.smooth_grid.values[[0, -1]]))
+    low, high = float(seen.min()), float(seen.max())
+    axes[0, 0].set_ylim(low - 0.04 * (high - low), high + 0.06 * (high - low))
+    axes[0, 0].set_ylabel("cost, m²")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", title=f"stiffness, {UNIT}")
+    caption = (
+        "Left, one rollout per angle: where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer "
+        "the wall the sharper. Right, what noise makes of it, and what both estimates are to differentiate. Dotted lines mark "
+        "the angles examined below."
+    )
+    return figure, "The cost against the angle of the throw", caption
+
+
+def gradient(outcome: Outcome):
+    """Means of both estimates and the reference against stiffness, one panel per angle."""
+    figure, axes = _panels(outcome, rows=1, height=3.6)
+    for j, axis in enumerate(axes[0]):
+        axis.axhline(0, color=MUTED, lw=0.8)
+        swept, one = outcome.swept.isel(angle=j), outcome.table.isel(angle=j)
+        axis.fill_between(swept.stiffness, swept.reference_low, swept.reference_high, color=REFERENCE, alpha=0.15, lw=0)
+        _bars(axis, one, "reference", REFERENCE, "_", "reference")
+        _bars(axis, one, "zeroth_order", ZEROTH, "s", "zeroth order", shift=1.06)
+        _bars(axis, one, "first_order", FIRST, "o", "first order", shift=1 / 1.06)
+        # One wild interval of a stiff contact is not to flatten all others.
+        seen = ("reference_low", "reference_high", "zeroth_order_low", "zeroth_order_high", "first_order")
+        ends = np.append(one[list(seen)].to_array(), 0.0)
+        margin = 0.15 * (np.nanmax(ends) - np.nanmin(ends) or 1.0)
+        axis.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
+        axis.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useMathText=True)
+    axes[0, 0].set_ylabel("gradient, m²/rad")
+    theme.legend_below(figure, axes[0, 0], 3)
+    caption = (
+        f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each angle. "
+        "The reference comes from rollouts of its own; the grey band is its interval. Intervals that leave a panel are "
+        f"cut.{_diamond(outcome)}"
+    )
+    return figure, "Both estimates against the truth", caption
+
+
+def bias_variance(outcome: Outcome):
+    """Bias of the first-order estimate above, variance of both below, one column per angle."""
+    figure, axes = _panels(outcome, rows=2, height=5.7)
+    table = outcome.table
+    threshold = max(float((table.bias_high - table.bias_low).median()) / 2, 1e-12)
+    extreme = float(abs(table[["bias_low", "bias_high"]].to_array()).max())
+    for j, (above, below) in enumerate(axes.T):
+        one = table.isel(angle=j)
+        above.axhline(0, color=MUTED, lw=0.8)
+        _bars(above, one, "bias", FIRST, "o", "bias of first order")
+        chance = one.isel(stiffness=~one.is_biased.values)
+        above.plot(chance.stiffness, chance.bias, "o", ms=5, mfc="white", mec=FIRST, zorder=3)
+        above.set_yscale("symlog", linthresh=threshold)
+        above.set_ylim(-2 * extreme, 2 * extreme)
+        # Labels nearer to zero would cover its own.
+        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
+        _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
+        _bars(below, one, "first_order_variance", FIRST, "o", "first order")
+        below.set_yscale("log")
+    axes[0, 0].set_ylabel("bias of first order, m²/rad")
+    axes[1, 0].set_ylabel("variance of one sample, (m²/rad)²")
+    theme.legend_below(figure, axes[1, 0], 2)
+    percent = f"{outcome.settings.confidence:.0%}"
+    caption = (
+        f"Above, the mean of the first-order estimate less the reference, with the {percent} interval of the difference; "
+        "filled where it differs from zero beyond chance over all cases, hollow where it does not. Below, the variance of a "
+        f"single sample, with {percent} bootstrap intervals.{_diamond(outcome)}"
+    )
+    return figure, "Bias and variance", caption
+
+
+def choice(outcome: Outcome):
+    """Ratio of expected errors within the budget, for each stiffness and angle."""
+    table, budget = outcome.table, outcome.settings.rollouts_per_gradient
+    figure, axes = subplots(1, 1, height=0.55 * table.angle.size + 1.6)
+    axis = axes[0, 0]
+    ratio = np.log10(table.first_order_error / table.zeroth_order_error).values.T
+    bound = max(0.3, np.nanmax(np.abs(ratio)))
+    colours = LinearSegmentedColormap.from_list("choice", [FIRST, "#f7f7f5", ZEROTH])
+    # One tone per winner: where first order wins its own colour shows.
+    axis.imshow(ratio, cmap=colours, vmin=-bound, vmax=bound, aspect="auto")
+    for j, i in np.ndindex(ratio.shape):
+        one = table.isel(stiffness=i, angle=j)
+        text = f"{10 ** ratio[j, i]:.2g}" + ("*" if one.is_biased else "") + ("†" if one.has_wrong_sign else "")
+        colour = "white" if abs(ratio[j, i]) > 0.6 * bound else REFERENCE
+        axis.text(i, j, text, ha="center", va="center", fontsize=9, color=colour)
+    count = outcome.swept.stiffness.size
+    names = [power(stiffness) for stiffness in outcome.swept.stiffness.values]
+    if count < table.stiffness.size:
+        names.append("default")
+        axis.axvline(count - 0.5, color="white", lw=6)
+    axis.set_xticks(range(len(names)), names)
+    axis.set_yticks(range(table.angle.size), [f"{angle:g}" for angle in table.angle.values])
+    axis.set(xlabel=f"contact stiffness, {UNIT}", ylabel="angle, rad")
+    axis.set_title(f"Expected error with {budget} rollouts: first order over zeroth order")
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+    axis.tick_params(length=0)
+    caption = (
+        f"Root of squared bias plus variance over {budget}, of first order divided by that of zeroth order: orange, and below "
+        "1, where first order is closer to the truth, blue where zeroth order is. A bias counts where it is beyond chance (*); "
+        "† marks the wrong sign."
+    )
+    return figure, "Which estimate is closer", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw the throws that the settings ask for, and give the file and its caption; nothing if there are none."""
+    wanted, task = outcome.settings.video, outcome.task
+    if wanted is None or task is None:
+        return None, ""
+    knob = wall_contact(task, np.asarray(wanted.stiffness), outcome.settings.damping_ratio, with_default=False)
+    mj_model = with_coarse_shadows(task.scene.mj_model)
+
+    @jax.jit
+    def throw(softness, angles):
+        thrown = task.with_softness(softness)
+        return jax.vmap(lambda angle: thrown.trajectory(angle[None]).qpos)(angles)
+
+    motions = [
+        (mj_model, qpos)
+        for i in range(len(wanted.stiffness))
+        for qpos in throw(jax.tree.map(lambda leaf, i=i: leaf[i], knob), jnp.asarray(wanted.angles))
+    ]
+    titles = [f"{angle:g} rad, stiffness {power(k)} {UNIT}" for k in wanted.stiffness for angle in wanted.angles]
+    caption = f"Throws without noise, by angle (columns) and stiffness of the wall (rows), {shown_speed(wanted.speed)}."
+    return film(workspace, motions, wanted, camera="side", caption=caption, titles=titles, columns=len(wanted.angles))
+
+
+def _diamond(outcome: Outcome) -> str:
+    has_default = outcome.table.is_default.any()
+    return " The diamond on the dashed line is MuJoCo's default contact." if has_default else ""
+
+
+def _panels(outcome: Outcome, *, rows: int, height: float):
+    table = outcome.table
+    figure, axes = subplots(rows, table.angle.size, height=height, sharex=True, sharey="row" if rows > 1 else False)
+    first, last = np.log10(outcome.swept.stiffness.values[[0, -1]])
+    ticks = 10.0 ** np.arange(np.ceil(first - 1e-9), last + 1e-9, 1 if last - first <= 3 else 2)
+    for axis in axes.flat:
+        axis.set_xscale("log")
+        axis.set_xticks(ticks, [power(tick) for tick in ticks])
+        axis.xaxis.set_minor_locator(NullLocator())
+        for stiffness in table.stiffness.values[table.is_default.values]:
+            axis.axvline(stiffness, color=MUTED, lw=1.0, ls=(0, (4, 3)), zorder=0)
+    for top, bottom, angle in zip(axes[0], axes[-1], table.angle.values, strict=True):
+        top.set_title(f"{angle:g} rad")
+        bottom.set_xlabel(f"stiffness, {UNIT}")
+    return figure, axes
+
+
+def _bars(axis: Axes, one: xr.Dataset, name: str, colour: str, marker: str, label: str, shift: float = 1.0) -> None:
+    """Draw an interval against stiffness: the sweep as a line, the default as a point beside it."""
+    swept = ~one.is_default.values
+    for rows, look in ((swept, {"marker": marker, "lw": 1.2, "label": label}), (~swept, {"marker": "D", "ls": ""})):
+        picked = one.isel(stiffness=rows)
+        ends = picked[[f"{name}_low", f"{name}_high"]].to_array().values
+        theme.errorbar(axis, shift * picked.stiffness.values, picked[name].values, ends, color=colour, ms=5, **look)

@@ -1,17 +1,282 @@
-"""From settings to the numbers."""
+"""From settings to numbers, and what follows from them."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+from scipy import stats
 
 import mjxgrad as mg
-from experiments.optimisation.methods import estimator, problem, runner, scene
-from experiments.optimisation.outcome import Outcome, Run
-from experiments.optimisation.published import Published
+from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics import Comparison, Rollouts, compare
-from mjxgrad.estimators import Reason
+from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
+from mjxgrad.diagnostics.comparison import affordable
+from mjxgrad.estimators import GradientEstimate, Reason, rules
+
+# Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class Run:
+    """All seeds of one method."""
+
+    method: MethodSettings  # its settings
+    final_cost: Float[np.ndarray, " seeds"]  # without noise, after the last step; infinite for a run that was lost
+    # Without noise, by seed and evaluation, the last one after the last step.
+    cost: Float[np.ndarray, "seeds evaluations"]
+    rollouts: Int[np.ndarray, " evaluations"]  # spent before each evaluation, of the seed that spent most
+    seconds: Float[np.ndarray, " evaluations"]  # likewise, of all seeds together, without compilation
+    alpha: Float[np.ndarray, "seeds steps"]  # weight of the first-order part, by seed and step
+    # For each sentence, at which steps of which seeds it was why; empty for a method without a choice.
+    reasons: dict[str, Bool[np.ndarray, "seeds steps"]] = field(repr=False)
+    num_skipped: Int[np.ndarray, " seeds"]  # steps not taken, because the estimate was not finite, by seed
+    finite_share: float  # of all rollouts
+    rollouts_per_step: int  # most of all steps
+    compile_seconds: float  # spent on compilation
+
+    @property
+    def is_lost(self) -> Bool[np.ndarray, " seeds"]:
+        """Say which runs ended without a finite cost."""
+        return ~np.isfinite(self.final_cost)
+
+    @property
+    def kept(self) -> Float[np.ndarray, " kept"]:
+        """Give the final costs of the others."""
+        return self.final_cost[~self.is_lost]
+
+    @property
+    def mean(self) -> float:
+        """Give their mean, NaN if all runs were lost."""
+        return float(self.kept.mean()) if self.kept.size else np.nan
+
+    @property
+    def spread(self) -> float:
+        """Give their standard deviation, NaN for fewer than two."""
+        return float(self.kept.std(ddof=1)) if self.kept.size > 1 else np.nan
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Give the time of one step of one seed."""
+        return float(self.seconds[-1]) / self.alpha.size
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Give what runs are ordered by: fewer lost ones first, then a lower mean."""
+        return int(self.is_lost.sum()), self.mean if self.kept.size else np.inf
+
+    def interval(self, confidence: float) -> Float[np.ndarray, " 2"]:
+        """Give the interval of the mean over seeds."""
+        count = self.kept.size
+        return mean_interval(self.mean, self.spread / np.sqrt(max(count, 1)), count, confidence)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One method less another, in final cost: the difference of the means with Welch's interval.
+
+    Beside it stands the p-value of Mann and Whitney's two-sided rank test, a lost run ranking last; it counts below what is left
+    of the confidence.
+    """
+
+    ours: Run
+    other: Run
+    value: float
+    low: float
+    high: float
+    p_value: float
+    confidence: float
+
+    @classmethod
+    def of(cls, ours: Run, other: Run, confidence: float) -> "Difference":
+        """Compare two methods."""
+        errors = [run.spread / np.sqrt(max(run.kept.size, 1)) for run in (ours, other)]
+        low, high = bias_interval(
+            ours.mean, errors[0], ours.kept.size, other.mean, errors[1], other.kept.size, confidence
+        )
+        # Rounded, so that runs that are the same but for rounding tie.
+        size = max(ROUNDING * abs(other.mean), 1e-300) if other.kept.size else 1.0
+        first, second = (np.where(run.is_lost, np.inf, np.round(run.final_cost / size)) for run in (ours, other))
+        p_value = float(stats.mannwhitneyu(first, second).pvalue)
+        return cls(ours, other, ours.mean - other.mean, float(low), float(high), p_value, confidence)
+
+    @property
+    def is_above(self) -> bool:
+        """Say whether the one ends higher beyond seed noise, by the means, by the ranks, or by lost runs."""
+        return int(self.ours.is_lost.sum()) > int(self.other.is_lost.sum()) or self._is_beyond(1)
+
+    @property
+    def is_below(self) -> bool:
+        """Say whether it ends lower beyond seed noise."""
+        return not self.is_above and self._is_beyond(-1)
+
+    def _is_beyond(self, sign: int) -> bool:
+        noise = ROUNDING * abs(self.other.mean)
+        # To say which way the ranks point.
+        shift = float(np.median(self.ours.final_cost) - np.median(self.other.final_cost))
+        is_ranked = self.p_value < 1 - self.confidence
+        return (self.low if sign > 0 else -self.high) > noise or (is_ranked and sign * shift > noise)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All methods on one task."""
+
+    settings: Settings  # of the experiment
+    num_samples: int  # rollouts per step
+    num_steps: int  # of each run
+    dim: int  # number of parameters
+    start_cost: float  # without noise, before the first step
+    # Published mean and standard deviation of the final cost, by what they belong to.
+    reference: dict[str, tuple[float, float]]
+    runs: list[Run]  # in the order of the settings
+    errors: Comparison | None  # of one estimate at the start, of the methods that estimate; None if it was not measured
+
+    @functools.cached_property
+    def verdicts(self) -> list[Difference]:
+        """Compare α-order as it comes with the better of first and zeroth order; empty if one of them is missing."""
+        ours = [run for run in self.runs if run.method.is_default_alpha]
+        pure = [run for run in self.runs if run.method.name in ("first_order", "zeroth_order")]
+        if not ours or not pure:
+            return []
+        return [Difference.of(ours[0], min(pure, key=lambda run: run.rank), self.settings.confidence)]
+
+    @property
+    def best(self) -> Run:
+        """Give the method that ends lowest."""
+        return min(self.runs, key=lambda run: run.rank)
+
+    def published(self, run: Run) -> tuple[float, float] | None:
+        """Give the published result of a method."""
+        method = run.method
+        if method.name == "first_order":
+            return self.reference.get("first")
+        if method.name == "zeroth_order" and method.baseline == "zero_noise" and not method.antithetic:
+            return self.reference.get("zeroth")
+        if method.name != "alpha_order" or method.control_variate is not False:
+            return None
+        return self.reference.get({"bias_constrained": "alpha", "concavity": "ddcg"}.get(method.rule or "", ""))
+
+    def relative_error(self, run: Run) -> Float[np.ndarray, " 3"] | None:
+        """Give the error of one estimate at the start over the gradient's norm, with its interval."""
+        if self.errors is None or run.method.label not in self.errors.names:
+            return None
+        row = self.errors.names.index(run.method.label)
+        ends = self.errors.rmse_interval[:, row]
+        return np.array([self.errors.rmse[row], *ends]) / np.linalg.norm(self.errors.reference)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per method, seed and evaluation, for metrics.csv."""
+        return [
+            {
+                "task": self.settings.task,
+                "dynamics": self.settings.dynamics,
+                "method": run.method.label,
+                "seed": seed,
+                "rollouts": int(run.rollouts[i]),
+                "seconds": float(run.seconds[i]),
+                "cost": float(run.cost[seed, i]),
+                "is_final": i == run.cost.shape[1] - 1,
+                "steps_skipped": int(run.num_skipped[seed]),
+                "mean_alpha": float(run.alpha[seed].mean()),
+            }
+            for run in self.runs
+            for seed, i in np.ndindex(run.cost.shape)
+        ]
+
+
+_SCENES = {
+    "push_soft": lambda: mg.tasks.push(10.0),
+    "push_stiff": lambda: mg.tasks.push(1000.0),
+    "friction": mg.tasks.friction,
+    "motion_planning": mg.tasks.motion_planning,
+    "tennis": mg.tasks.tennis,
+}
+_ELITE = 0.2  # share of the candidates that cross-entropy fits to
+# How to optimise the scenes; found by trying, so that few steps show what each is about.
+_PUSH = {"num_samples": 10, "learning_rate": 1e-3, "num_steps": 200, "gamma": 1e8, "bound": 100.0}
+_SCENE_SETTINGS = {
+    "push_soft": _PUSH,
+    "push_stiff": _PUSH,
+    "friction": {"num_samples": 10, "learning_rate": 1e-4, "num_steps": 100, "gamma": 2e4, "bound": 100.0},
+    "motion_planning": {"num_samples": 50, "learning_rate": 0.03, "num_steps": 100, "gamma": 150.0, "bound": 10.0},
+    "tennis": {
+        "num_samples": 100, "learning_rate": 1e-6, "num_steps": 60, "gamma": 1000.0, "bound": 1000.0, "num_starts": 500
+    },
+}  # fmt: skip
+
+
+def problem(settings: Settings) -> Published:
+    """Set up the task, with the run's own settings in place of the published ones, which alone have reference results."""
+    if settings.dynamics == "published":
+        found = TASKS[settings.task]()
+    else:
+        task = _SCENES[settings.task]()
+        # What is published of the equations does not hold for the scene.
+        found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[settings.task])
+    chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
+    return replace(found, **chosen, reference={}) if chosen else found
+
+
+def scene(settings: Settings) -> mg.Scene | None:
+    """Give the scene of the task; None under the published equations, which have none."""
+    return None if settings.dynamics == "published" else _SCENES[settings.task]().scene
+
+
+def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
+    """Give a function of `mjxgrad.estimators`, its options bound; its rule may take the published constants of the task."""
+    options = method.options
+    if method.rule is not None:
+        options["rule"] = {
+            "consistent": rules.Consistent,
+            "inverse_variance": rules.InverseVariance,
+            "concavity": rules.Concavity,
+            "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
+        }[method.rule]()
+    return functools.partial(getattr(mg.estimators, method.name), **options)
+
+
+def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Callable[..., mg.Optimisation]:
+    """Give the function that runs a method, of keys, one per seed, and of the options of `mg.optimise`.
+
+    A baseline without noise is a rollout, too: an estimator gets as many samples as the rollouts of a step allow.
+    """
+    if method.is_search:
+        return _search(method, task)
+    function = estimator(method, task)
+    afforded = affordable(function, task.objective, task.params, key, Rollouts(task.num_samples)).num_samples
+
+    def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
+        return mg.optimise(
+            task.objective,
+            task.params,
+            keys,
+            estimator=functools.partial(function, num_samples=afforded),
+            # The schedules of tasks are optax's, but for the arrays that optax allows and they do not need.
+            optimiser=optax.sgd(task.learning_rate),  # pyright: ignore[reportArgumentType]
+            num_steps=task.num_steps,
+            **options,
+        )
+
+    return run
+
+
+def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimisation]:
+    objective, width = task.objective, method.stddev
+    if width is None and isinstance(objective, mg.objective.OpenLoop):
+        # The controls are the parameters, so noise on the ones is noise on the others.
+        width = jax.numpy.broadcast_to(objective.stddev, objective.noise_shape).ravel()
+    own = {"num_elite": max(2, round(_ELITE * task.num_samples))} if method.name == "cross_entropy" else {}
+    search = getattr(mg.baselines, method.name)
+    sizes = {"num_samples": task.num_samples, "num_steps": task.num_steps}
+    return functools.partial(search, objective, task.params, stddev=width, **sizes, **own)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -72,18 +337,8 @@ def _before(totals: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     # Steps that a run did not do have no α.
     was_done = ~np.isnan(history.alpha)
-    found = {
-        name: np.asarray(history.reason == getattr(Reason, name)) & was_done
-        for name in (
-            "fixed",
-            "inverse_variance",
-            "bias_limit",
-            "uncertain",
-            "inconsistent",
-            "not_finite",
-            "nothing_felt",
-        )
-    }
+    names = ["fixed", "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite", "nothing_felt"]
+    found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in names}
     return {name: where for name, where in found.items() if where.any()}
 
 

@@ -1,9 +1,14 @@
-"""The answer of an optimisation experiment in words, computed from its numbers."""
+"""The answer of an optimisation experiment, computed from its numbers, and its pictures."""
+
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.optimisation.outcome import Difference, Outcome
+from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.words import quantity
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
@@ -120,3 +125,247 @@ def _signed(difference: Difference) -> str:
     ends = f"{quantity(difference.low)} to {quantity(difference.high)}"
     sign = "+" if difference.value > 0 else ""
     return f"{sign}{quantity(difference.value)}, {difference.confidence:.0%} interval {ends}"
+
+
+# One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
+_COLOURS = {
+    "first order": FIRST,
+    "zeroth order": ZEROTH,
+    "zeroth order (zero noise)": "#56b4e9",
+    "control variate": "#cc79a7",
+    "α-order": "#00795a",
+    "α-order (bias constrained)": "#b58900",
+    "α-order (concavity)": "#6b6ecf",
+    "α-order (inverse variance)": "#843c39",
+    "REINFORCE": "#7f3c8d",
+    "cross-entropy": "#3b4452",
+    "MPPI": "#8c6d31",
+    "predictive sampling": "#8b94a1",
+}
+_OTHERS = ("#17becf", "#bcbd22", "#e377c2", "#393b79", "#637939", "#ad494a")
+
+# From the best to the worst cost, as a factor; beyond, differences near the best are seen on a logarithmic axis only.
+_WIDE = 3.0
+
+# Beyond the quartiles of the final costs by so many times their distance a method is far off.
+_REACH = 6.0
+
+_SENTENCES = {
+    "inverse_variance": ("least variance", "#7fb8a6"),
+    "bias_limit": ("bias limits it", "#e69f00"),
+    "uncertain": ("too uncertain for first order", "#9db4d0"),
+    "inconsistent": ("derivatives contradict costs", "#0b5c8f"),
+    "not_finite": ("derivatives not finite", "#22262e"),
+    "nothing_felt": ("nothing reaches the cost", "#6b2737"),
+    "fixed": ("given", "#c9ced6"),
+}
+_DARK = ("inconsistent", "not_finite", "nothing_felt")
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    has_alpha = any(run.reasons for run in outcome.runs)
+    return {"final": final, "curves": curves} | ({"alpha": alpha} if has_alpha else {})
+
+
+def final(outcome: Outcome):
+    """Final cost of every seed, and the relative error of one estimate, a row for each method."""
+    has_errors = outcome.errors is not None
+    widths = {"width_ratios": [1.5, 1]} if has_errors else None
+    height = 1.1 + 0.31 * len(outcome.runs)
+    figure, axes = subplots(1, 1 + has_errors, height=height, sharey=True, gridspec_kw=widths)
+    left = axes[0, 0]
+    rows = np.arange(len(outcome.runs))[::-1]
+    limit = _limit(outcome)
+    for y, run in zip(rows, outcome.runs, strict=True):
+        colour = _colours(outcome)[run.method.label]
+        kept = run.kept
+        # Spread out by number, not by chance: the same picture from the same numbers.
+        left.plot(kept, y + np.linspace(-0.22, 0.22, kept.size), "o", ms=3.2, color=colour, alpha=0.45, mew=0)
+        if kept.size > 1 and run.mean <= limit:
+            low, high = run.interval(outcome.settings.confidence)
+            left.plot([low, high], [y, y], color=colour, lw=2.4, solid_capstyle="butt")
+        left.plot(run.mean, y, "|", color=colour, ms=13, mew=2.2)
+        if (published := outcome.published(run)) is not None:
+            spread = np.nan_to_num(published[1], posinf=0.0)
+            left.errorbar(
+                published[0], y - 0.33, xerr=spread, fmt="D", ms=4.5, mfc="white", mec=REFERENCE, ecolor=REFERENCE,
+                elinewidth=1.0, capsize=2, zorder=5,
+            )  # fmt: skip
+        notes = [f"{run.is_lost.sum()} of {len(run.is_lost)} not finite"] if run.is_lost.any() else []
+        notes += [f"{quantity(run.mean, run.spread)} →"] if run.mean > limit else []
+        if notes:
+            text = ", ".join(notes)
+            left.text(0.99, y, text, transform=left.get_yaxis_transform(), ha="right", va="center", fontsize=8.5)
+        error = outcome.relative_error(run)
+        if has_errors and error is not None:
+            spread = np.maximum([[error[0] - error[1]], [error[2] - error[0]]], 0)
+            axes[0, 1].errorbar(error[0], y, xerr=spread, fmt="o", ms=5, color=colour, capsize=2.5, elinewidth=1.3)
+    left.set_yticks(rows, [run.method.label for run in outcome.runs])
+    left.set_ylim(-0.6, len(rows) - 0.4)
+    low = min([*(float(cost) for run in outcome.runs for cost in run.kept), limit])
+    if limit > _WIDE * low > 0:
+        _log_scale(left)
+        left.set_xlim(low / 1.08, limit * 1.08)
+    else:
+        margin = 0.04 * (limit - low or 1.0)
+        left.set_xlim(low - margin, limit + margin)
+    left.set(title="Cost without noise after the last step", xlabel="cost")
+    if has_errors:
+        _log_scale(axes[0, 1])
+        axes[0, 1].set(title="Relative error of one estimate at the start", xlabel="error / norm of the gradient")
+    _mark_ours(left, outcome.runs)
+    settings = outcome.settings
+    percent = f"{settings.confidence:.0%}"
+    diamonds = "; diamonds are published means ± standard deviations" if outcome.reference else ""
+    errors = (
+        " Right, distance of one estimate at the start to the gradient, over its norm: root mean square of "
+        f"{settings.error_repeats} estimates of {outcome.num_samples} rollouts, with its {percent} interval; the gradient is "
+        f"an unbiased estimate from {settings.reference_samples} rollouts."
+        if outcome.errors is not None
+        else ""
+    )
+    caption = (
+        f"Left, dots are seeds, bars the means with their {percent} intervals{diamonds}. An arrow stands for a mean ± "
+        f"standard deviation beyond the panel.{errors}"
+    )
+    return figure, "Where each method ends, and how far off one estimate is", caption
+
+
+def curves(outcome: Outcome):
+    """Cost without noise against what was spent, the median and the range over seeds."""
+    descents, baselines = _descents(outcome), [run for run in outcome.runs if _is_baseline(run)]
+    # What one would otherwise use has α-order as it comes beside it.
+    searches = [run for run in outcome.runs if run.method.is_default_alpha] + baselines if baselines else []
+    groups = [group for group in (descents, searches) if group]
+    figure, axes = subplots(len(groups), 2, height=3.7 * len(groups), sharey=True)
+    lowest = _lowest(outcome)
+    for row, group in zip(axes, groups, strict=True):
+        for axis, spent in zip(row, ("rollouts", "seconds"), strict=True):
+            for run in group:
+                _curve(axis, outcome, run, getattr(run, spent))
+            axis.set_yscale("log")
+            axis.margins(x=0)
+        row[0].set_ylabel(f"cost − {lowest:.4g}")
+        row[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5)
+        row[0].xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}".replace(",", "\u2009"))
+    axes[0, 0].set_title("Against rollouts")
+    axes[0, 1].set_title("Against time")
+    axes[-1, 0].set_xlabel("rollouts of one run")
+    axes[-1, 1].set_xlabel(f"seconds for all {outcome.settings.seeds} runs, without compilation")
+    # A run that climbs by decades, or one that is the lowest itself, would flatten all others.
+    above = outcome.start_cost - lowest
+    medians = [float(np.nanmin(np.nanmedian(run.cost, axis=0))) for run in outcome.runs if run.kept.size]
+    smallest = min(medians, default=outcome.start_cost) - lowest
+    axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * smallest), 1.5 * above)
+    for axis in axes.flat:
+        axis.yaxis.set_major_formatter(lambda value, _: power(value))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    settings = outcome.settings
+    caption = (
+        f"Lines are medians over {settings.seeds} seeds, bands reach from the lowest to the highest. The axis is the cost "
+        "above the lowest that any run has met, so a line that ends low on the logarithmic scale is as good as the best; "
+        "below, what one would otherwise use, with α-order for comparison. Both columns are of the same runs; the seconds "
+        "include the measurement of the noise-free cost, which is no rollout of the method."
+    )
+    return figure, "Cost against rollouts and against time", caption
+
+
+def alpha(outcome: Outcome):
+    """α over steps, and the share of steps for each reason."""
+    runs = [run for run in outcome.runs if run.reasons]
+    figure, axes = subplots(1, 2, height=2.2 + 0.42 * len(runs), gridspec_kw={"width_ratios": [1.25, 1]})
+    left, right = axes[0]
+    for run in runs:
+        colour = _colours(outcome)[run.method.label]
+        middle = np.nanmean(run.alpha, axis=0)
+        # Averaged over a fiftieth of the steps, so that the lines do not hide each other.
+        width = max(1, middle.size // 50)
+        middle = np.convolve(middle, np.ones(width) / width, mode="valid")
+        left.plot(np.arange(middle.size), middle, color=colour, lw=1.8, label=run.method.label)
+    left.set(title="Mean α over seeds", xlabel="step", ylim=(-0.04, 1.04), ylabel="α")
+    left.margins(x=0)
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=8.5)
+    rows = np.arange(len(runs))[::-1]
+    starts = np.zeros(len(runs))
+    totals = np.array([max((~np.isnan(run.alpha)).sum(), 1) for run in runs])
+    for name, (text, colour) in _SENTENCES.items():
+        shares = np.array([run.reasons[name].sum() if name in run.reasons else 0 for run in runs]) / totals
+        if shares.any():
+            right.barh(rows, shares, left=starts, color=colour, height=0.6, label=text)
+            ink = "white" if name in _DARK else REFERENCE
+            for y, start, share in zip(rows, starts, shares, strict=True):
+                if share >= 0.08:
+                    right.text(start + share / 2, y, f"{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
+        starts += shares
+    right.set_yticks(rows, [run.method.label for run in runs])
+    _mark_ours(right, runs)
+    right.set(title="Share of steps by the reason for α", xlim=(0, 1))
+    right.xaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
+    right.grid(visible=False, axis="y")
+    right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
+    caption = (
+        "Left, the weight of the first-order part, the mean over seeds and over a fiftieth of the steps; where there are "
+        "several blocks, over these, too. Right, how often each reason settled it."
+    )
+    return figure, "The weight of the first-order part", caption
+
+
+def _descents(outcome: Outcome) -> list[Run]:
+    return [run for run in outcome.runs if not _is_baseline(run)]
+
+
+def _is_baseline(run: Run) -> bool:
+    return run.method.is_search or run.method.name == "reinforce"
+
+
+def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
+    colour = _colours(outcome)[run.method.label]
+    cost = np.maximum(np.where(np.isfinite(run.cost), run.cost, np.nan) - _lowest(outcome), _floor(outcome))
+    seen = np.isfinite(cost).any(axis=0)
+    x, cost = x[seen], cost[:, seen]
+    axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.13, lw=0)
+    # Ours is a broad line beneath the others, so that those it agrees with are seen on it.
+    width, order = (3.4, 2.5) if run.method.is_default_alpha else (1.4, 3.0)
+    axis.plot(x, np.nanmedian(cost, axis=0), color=colour, lw=width, label=run.method.label, zorder=order)
+
+
+def _mark_ours(axis: Axes, runs: Sequence[Run]) -> None:
+    for label, run in zip(axis.get_yticklabels(), runs, strict=True):
+        if run.method.is_default_alpha:
+            label.set_fontweight("bold")
+
+
+def _limit(outcome: Outcome) -> float:
+    """Give the highest final cost to show: methods that fail would set the scale, and hide how the others differ."""
+    shown = [float(cost) for run in _descents(outcome) for cost in run.kept]
+    shown += [found[0] for run in outcome.runs if (found := outcome.published(run)) is not None]
+    if not shown:
+        return outcome.start_cost
+    low, high = np.quantile(shown, [0.25, 0.75])
+    return float(min(max(shown), high + _REACH * (high - low)))
+
+
+def _lowest(outcome: Outcome) -> float:
+    """Give the lowest cost that any run has seen."""
+    return min([outcome.start_cost, *(float(np.min(run.cost)) for run in outcome.runs)])
+
+
+def _floor(outcome: Outcome) -> float:
+    """Give what stands for zero on a logarithmic axis."""
+    return 1e-5 * (outcome.start_cost - _lowest(outcome)) or 1.0
+
+
+def _log_scale(axis: Axes) -> None:
+    axis.set_xscale("log")
+    low, high = axis.xaxis.get_view_interval()
+    subs = (1.0,) if high > 30 * low else (1.0, 2.0, 5.0)
+    axis.xaxis.set_major_locator(LogLocator(subs=subs, numticks=12))
+    axis.xaxis.set_major_formatter(lambda value, _: power(value))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _colours(outcome: Outcome) -> dict[str, str]:
+    labels = [run.method.label for run in outcome.runs]
+    others = iter(_OTHERS)
+    return {label: _COLOURS.get(label) or next(others, MUTED) for label in labels}

@@ -1,30 +1,113 @@
-"""From settings to plans."""
+"""From settings to plans, and what follows from them."""
 
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 import mjxgrad as mg
-from experiments.planning.outcome import Attempt, Outcome
-from experiments.planning.settings import Settings
+from experiments.planning.settings import NAMES, Settings
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
-from mjxgrad.planning import (
-    Analytic,
-    Exact,
-    GoalCost,
-    Plan,
-    Sampled,
-    Sampling,
-    Smoother,
-    optimise_trajectory,
-    path,
-    search,
-)
+from mjxgrad.planning import GoalCost, Plan, Sampling, Smoother, optimise_trajectory, path, search
 from mjxgrad.tasks.planar_pusher import PlanarPusher, beside_rod, planar_pusher
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way of planning."""
+
+    model: str  # which linear models it used
+    seed: int  # of its random numbers
+    seconds: float  # wall time, compilation included where it was the first of its kind
+    states: Float[np.ndarray, "states state"]  # that the system goes through under the controls that it found
+    controls: Float[np.ndarray, "horizon 2"]  # finger speeds
+    course: dict[str, Float[np.ndarray, " count"]]  # numbers by name along its iterations or nodes
+    nodes: Float[np.ndarray, "nodes state"] | None = None  # the states of a tree, none for a trajectory
+    parents: Int[np.ndarray, " nodes"] | None = None  # of these nodes
+
+    @property
+    def label(self) -> str:
+        """Give a name for legends."""
+        return NAMES[self.model]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was found."""
+
+    settings: Settings  # of the run
+    attempts: list[Attempt]  # in the order of the settings, seeds last
+    # The shortest way of the first kind after trajectory optimisation, if it was asked for and there is one.
+    polished: Attempt | None
+    shown: Float[np.ndarray, "steps 5"]  # positions of the best plan at every time step, from a rollout of its own
+    timestep: float  # between these (s)
+
+    @property
+    def goal(self) -> Float[np.ndarray, " 3"]:
+        """Where the rod is to be."""
+        return np.asarray(self.settings.goal)
+
+    def distance(self, attempt: Attempt) -> float:
+        """Give the distance of the rod from its goal in the end (m)."""
+        return float(np.hypot(*(attempt.states[-1, 2:4] - self.goal[:2])))
+
+    def angle(self, attempt: Attempt) -> float:
+        """Give the angle between the rod and its goal in the end (rad)."""
+        return float(abs(attempt.states[-1, 4] - self.goal[2]))
+
+    def _off(self, state: np.ndarray) -> float:
+        """Give how far the coordinate of the rod that is farthest off is from the goal, in tolerances."""
+        tree = self.settings.tree
+        units = np.array([tree.position_tolerance, tree.position_tolerance, tree.angle_tolerance])
+        return float(np.max(np.abs(state[2:5] - self.goal) / units))
+
+    def is_solved(self, attempt: Attempt) -> bool:
+        """Say whether the rod is at its goal, as near as the settings ask for."""
+        return self._off(attempt.states[-1]) <= 1
+
+    def moved(self, attempt: Attempt) -> float:
+        """Give which share of the way to the goal was made good, in units of the tolerances."""
+        return 1 - self._off(attempt.states[-1]) / self._off(attempt.states[0])
+
+    def of(self, model: str) -> list[Attempt]:
+        """Give all attempts with one kind of linear model."""
+        return [attempt for attempt in self.attempts if attempt.model == model]
+
+    @property
+    def best(self) -> Attempt:
+        """Give what figures and video show: the polished way, else the shortest solved one of the first kind."""
+        return self.polished or self.shortest(self.settings.models[0])
+
+    def shortest(self, model: str) -> Attempt:
+        """Give the solved attempt of fewest steps, or the one that came nearest."""
+        attempts = self.of(model)
+        solved = [attempt for attempt in attempts if self.is_solved(attempt)]
+        return min(solved, key=lambda one: len(one.controls)) if solved else max(attempts, key=self.moved)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give one row per attempt for the table of metrics."""
+        named = [("", attempt) for attempt in self.attempts] + ([(" polished", self.polished)] if self.polished else [])
+        return [
+            {
+                "model": attempt.model + suffix,
+                "seed": attempt.seed,
+                "is_solved": self.is_solved(attempt),
+                "distance_m": self.distance(attempt),
+                "angle_rad": self.angle(attempt),
+                "num_steps": len(attempt.controls),
+                "num_nodes": 0 if attempt.nodes is None else len(attempt.nodes),
+                "final_cost": float(attempt.course["cost"].min()) if "cost" in attempt.course else float("nan"),
+                "seconds": attempt.seconds,
+            }
+            for suffix, attempt in named
+        ]
+
 
 # Weights of the rod's x, y and turn; a turn of 0.17 rad counts as much as 0.03 m.
 _ROD = (0.0, 0.0, 1.0, 1.0, 0.03, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -66,12 +149,12 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 def _smoother(model: str, settings: Settings, length: float) -> Smoother:
     """Give the linear models; sampled ones have noise of the same length on positions, less on velocities."""
     if model == "none":
-        return Exact()
+        return mg.planning.Exact()
     if model == "analytic":
-        return Analytic(Smoothing(length))
+        return mg.planning.Analytic(Smoothing(length))
     rod_turn = length / 0.1  # as far at the rod's end
     state = jnp.array([length] * 4 + [rod_turn] + [0.1 * length] * 5)
-    return Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
+    return mg.planning.Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
 
 
 def _trajectory(task: PlanarPusher, settings: Settings, model: str):
@@ -82,21 +165,15 @@ def _trajectory(task: PlanarPusher, settings: Settings, model: str):
     schedule = np.append(schedule, np.full(count // 6, last))
 
     def run(seed: int) -> Attempt:
-        begin = time.perf_counter()
-        controls = jnp.zeros((settings.horizon, 2))
-        plan = _optimised(task, settings, controls, _smoother(model, settings, settings.length), schedule, seed)
-        return _planned(plan, model, seed, time.perf_counter() - begin, settings.length)
+        return _attempt(task, settings, model, jnp.zeros((settings.horizon, 2)), settings.length, schedule, seed)
 
     return run
 
 
 def _polish(task: PlanarPusher, settings: Settings, way: Attempt) -> Attempt:
     """Optimise a way that was found."""
-    begin, length = time.perf_counter(), _POLISH_LENGTH
-    schedule = np.geomspace(1, min(1, settings.last_length / length), settings.tree.polish_iterations)
-    smoother = _smoother(way.model, settings, length)
-    plan = _optimised(task, settings, jnp.asarray(way.controls), smoother, schedule, way.seed)
-    return _planned(plan, way.model, way.seed, time.perf_counter() - begin, length)
+    schedule = np.geomspace(1, min(1, settings.last_length / _POLISH_LENGTH), settings.tree.polish_iterations)
+    return _attempt(task, settings, way.model, jnp.asarray(way.controls), _POLISH_LENGTH, schedule, way.seed)
 
 
 @eqx.filter_jit
@@ -117,8 +194,12 @@ def _optimised(
     )
 
 
-def _planned(plan: Plan, model: str, seed: int, seconds: float, length: float) -> Attempt:
-    rows = plan.iterations
+def _attempt(
+    task: PlanarPusher, settings: Settings, model: str, start: jax.Array, length: float, factors: np.ndarray, seed: int
+) -> Attempt:
+    begin = time.perf_counter()
+    plan = _optimised(task, settings, start, _smoother(model, settings, length), factors, seed)
+    seconds, rows = time.perf_counter() - begin, plan.iterations
     course = {
         "length": length * np.asarray(rows.factor),
         "smoothed_cost": np.asarray(rows.smoothed_cost),

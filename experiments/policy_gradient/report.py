@@ -1,11 +1,13 @@
-"""The answer of the experiment on policy gradients in words, computed from its numbers."""
+"""The answer of the experiment on policy gradients, computed from its numbers, and its pictures."""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.policy_gradient.outcome import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome
+from experiments.policy_gradient.measure import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
 from experiments.report import Table
+from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, percent, quantity
 from mjxgrad.estimators import Reason
 
@@ -135,3 +137,185 @@ def _reasons(cell: Cell, gradient: str) -> str:
 
 def _span(values: Sequence[float], write: Callable[[float], str] = percent) -> str:
     return " to ".join(dict.fromkeys(map(write, (min(values), max(values)))))
+
+
+_COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
+_MARKERS = {DISCRETE: "o", ONSET: "s"}
+_SMALLEST = 1e-3
+_OBSERVED = ("thigh", "leg", "foot", "thigh's speed", "leg's speed", "foot's speed", "offset")
+_MOTORS = ("thigh", "leg", "foot")
+_THROWS, _PUSHES = ("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff")
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    by_problem = {"throw": (throw, _THROWS), "hopper": (hopper, ("hopper",)), "push": (push, _PUSHES)}
+    found = {name: drawing for name, (drawing, problems) in by_problem.items() if outcome.of(*problems)}
+    return {"summary": summarised, **found} | ({"descent": descent} if outcome.courses else {})
+
+
+def summarised(outcome: Outcome):
+    """Three panels with one row per point: bias of the first order, α, error of one α-order estimate."""
+    cells = outcome.cells
+    figure, axes = subplots(1, 3, height=1.4 + 0.27 * len(cells), sharey=True)
+    rows = np.arange(len(cells))
+    for gradient, shift in ((DISCRETE, -0.14), (ONSET, 0.14)):
+        look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ls": "", "ms": 5}
+        judged = [cell.judged[gradient] for cell in cells]
+        bias, low, high = np.maximum(np.array([one[:3] for one in judged]).T, _SMALLEST)
+        spread = np.abs(np.stack([bias - low, high - bias]))
+        axes[0, 0].errorbar(bias, rows + shift, xerr=spread, label=f"{gradient} gradient", elinewidth=1, **look)
+        alpha, alpha_error = np.array([(one.alpha, one.alpha_error) for one in judged]).T
+        axes[0, 1].errorbar(alpha, rows + shift, xerr=2 * alpha_error, elinewidth=1, **look)
+        axes[0, 2].plot([one.error_mixed for one in judged], rows + shift, **look)
+    for axis in axes[0]:
+        for row in rows[[cell.hits_and_misses for cell in cells]]:
+            axis.axhspan(row - 0.5, row + 0.5, color=MUTED, alpha=0.18, lw=0)
+        axis.grid(axis="y", visible=False)
+    for axis in axes[0, ::2]:
+        axis.set_xscale("log")
+        axis.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g}%")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+    axes[0, 0].set_xlim(left=_SMALLEST)
+    axes[0, 1].set_xlim(-0.04, 1.04)
+    axes[0, 0].set_yticks(rows, [cell.label for cell in cells])
+    axes[0, 0].set_ylim(len(cells) - 0.5, -0.5)
+    axes[0, 2].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes[0, 0].set(title="Bias of the first order", xlabel="share of the gradient")
+    axes[0, 1].set(title="Weight of the first order", xlabel="α")
+    axes[0, 2].set(title="Error of one α-order estimate", xlabel="share of the gradient")
+    legend_below(figure, axes[0, 0], 2)
+    caption = (
+        "Left, norm of the bias over the norm of the gradient, noise taken off, with two standard errors; where the interval "
+        "reaches the edge no bias was found. Middle, mean weight of the first order. Right, root-mean-square error of one "
+        "estimate, over the norm of the gradient: the smaller, the fewer rollouts are needed. Shaded: the noise covers a jump "
+        "of the cost."
+    )
+    return figure, "Bias, trust and error", caption
+
+
+def throw(outcome: Outcome):
+    """A row per contact: gradients against the angle, and α."""
+    cells = outcome.of(*_THROWS)
+    names = list(dict.fromkeys(cell.name for cell in cells))
+    figure, axes = subplots(len(names), 2, height=0.6 + 2.7 * len(names), sharex=True, width_ratios=[1.6, 1])
+    for (left, right), name in zip(axes, names, strict=True):
+        shown = [cell for cell in cells if cell.name == name]
+        angle = np.array([float(cell.point.split()[0]) for cell in shown])
+        reference = np.array([mean_and_error(cell.reference) for cell in shown])[:, :, 0]
+        left.errorbar(
+            angle, reference[:, 0], 2 * reference[:, 1], color=REFERENCE, lw=2.2, capsize=3, label="unbiased reference"
+        )
+        for gradient, shift in ((DISCRETE, -0.006), (ONSET, 0.006)):
+            look = {"color": _COLOURS[gradient], "marker": _MARKERS[gradient], "ms": 5, "lw": 1, "ls": (0, (4, 2))}
+            first = np.array([mean_and_error(cell.estimates[gradient].first) for cell in shown])[:, :, 0]
+            left.errorbar(
+                angle + shift, first[:, 0], 2 * first[:, 1], label=f"first order, {gradient} gradient", **look
+            )
+            judged = [cell.judged[gradient] for cell in shown]
+            spread = [2 * one.alpha_error for one in judged]
+            right.errorbar(angle + shift, [one.alpha for one in judged], spread, **look)
+        for axis in (left, right):
+            for cell, place in zip(shown, angle, strict=True):
+                if cell.hits_and_misses:
+                    axis.axvspan(place - 0.05, place + 0.05, color=MUTED, alpha=0.18, lw=0)
+        left.set_yscale("symlog", linthresh=0.01)
+        left.yaxis.set_major_formatter("{x:g}")
+        left.set(title=shown[0].title, ylabel="gradient, m²/rad")
+        right.set(title="Weight of the first order", ylabel="α", ylim=(-0.05, 1.05))
+    for axis in axes[-1]:
+        axis.set_xlabel("angle, rad")
+    legend_below(figure, axes[0, 0], 3)
+    caption = (
+        f"Left, gradient of the cost under noise of {outcome.settings.angle_stddev:g} rad; error bars are two standard errors. "
+        "Right, weight of the first order in the α-order estimate. Shaded: between the first throws that clear the wall and the "
+        "last that do not; there neither derivative sees the jump."
+    )
+    return figure, "Throws over the wall", caption
+
+
+def push(outcome: Outcome):
+    """A panel per stiffness: components of the gradient over the steps."""
+    cells = outcome.of(*_PUSHES)
+    figure, axes = subplots(1, len(cells), height=3.4)
+    for axis, cell in zip(axes[0], cells, strict=True):
+        mean, error = mean_and_error(cell.reference)
+        step = np.arange(len(mean))
+        axis.fill_between(
+            step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
+        )
+        for gradient in GRADIENTS:
+            style = {"ls": (0, (4, 2))} if gradient == ONSET else {"lw": 2.4}
+            first = cell.estimates[gradient].first.mean(axis=0)
+            axis.plot(step, first, color=_COLOURS[gradient], label=f"{gradient} gradient", **style)
+        axis.set(title=cell.title, xlabel="step")
+        axis.yaxis.set_major_formatter("{x:g}")
+    axes[0, 0].set_ylabel("gradient, 1/N")
+    legend_below(figure, axes[0, 0], 3)
+    caption = (
+        f"Components of the gradient by the force at each moment: {outcome.settings.num_references} unbiased estimates with a "
+        "band of two standard errors, first-order means before it."
+    )
+    return figure, "Control gradient of the push", caption
+
+
+def hopper(outcome: Outcome):
+    """A panel per motor: components of the policy gradient by what is observed."""
+    (cell,) = outcome.of("hopper")
+    figure, axes = subplots(1, 3, height=3.8, sharey=True)
+    looks = [(REFERENCE, "D", "unbiased reference", cell.reference, 0.0)]
+    for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True):
+        label, first = f"first order, {gradient} gradient", cell.estimates[gradient].first
+        looks.append((_COLOURS[gradient], _MARKERS[gradient], label, first, shift))
+    places = np.arange(len(_OBSERVED))
+    for motor, axis in enumerate(axes[0]):
+        axis.axhline(0, color=MUTED, lw=0.8)
+        for colour, marker, label, vectors, shift in looks:
+            values, errors = (_by_motor(flat)[motor] for flat in mean_and_error(vectors))
+            axis.errorbar(
+                places + shift, values, 2 * errors, color=colour, marker=marker, ms=5, ls="", elinewidth=1, label=label
+            )
+        axis.set(title=f"Motor of the {_MOTORS[motor]}")
+        axis.set_xticks(places, _OBSERVED, rotation=35, ha="right")
+        axis.grid(axis="x", visible=False)
+    axes[0, 0].yaxis.set_major_formatter("{x:g}")
+    axes[0, 0].set_ylabel("gradient, m per unit of gain")
+    legend_below(figure, axes[0, 0], 3)
+    caption = (
+        "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
+        "are two standard errors."
+    )
+    return figure, "Policy gradient of the hopper", caption
+
+
+def descent(outcome: Outcome):
+    """A column per task and estimator: cost above, α below."""
+    courses = outcome.courses
+    kinds = list(dict.fromkeys((course.name, course.estimator) for course in courses))
+    figure, axes = subplots(2, len(kinds), height=4.6, sharex="col", height_ratios=[2, 1])
+    for (above, below), kind in zip(axes.T, kinds, strict=True):
+        for course in courses:
+            if (course.name, course.estimator) != kind:
+                continue
+            style = {"ls": (0, (4, 2))} if course.gradient == ONSET else {}
+            colour, steps = _COLOURS[course.gradient], np.arange(course.costs.shape[1])
+            for axis, values in ((above, course.costs), (below, course.alphas)):
+                axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)
+                axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
+            title = course.title.replace("Throw, ", "Throw,\n")
+            above.set_title(f"{title}, {ESTIMATORS[kind[1]]}")
+        above.yaxis.set_major_formatter("{x:g}")
+        below.set(ylim=(-0.05, 1.05), xlabel="step")
+    axes[0, 0].set_ylabel("cost")
+    axes[1, 0].set_ylabel("α")
+    legend_below(figure, axes[0, 0], 2)
+    caption = (
+        f"Adam from the same start, {outcome.settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of "
+        "each step; below, weight of the first order."
+    )
+    return figure, "Descents", caption
+
+
+def _by_motor(flat: np.ndarray) -> np.ndarray:
+    """Give (motor, observed) from the flattened gain and offset."""
+    return np.concatenate([flat[:18].reshape(3, 6), flat[18:, None]], axis=1)

@@ -58,27 +58,20 @@ class Derivative(enum.IntEnum):
 
 
 class MotionRecord(eqx.Module):
-    """What `classify_motion` looks at, one entry per rollout.
+    """What `classify_motion` looks at, one entry per rollout."""
 
-    Attributes:
-        is_sound: whether all states were finite and below the velocity limit.
-        residual: largest share of a step's velocity by which a solve is off, or a bound on it: the share of the forces that it
-            leaves unbalanced.
-        gain: largest kinetic energy over what there was to draw on: that of the start, of gravity and of springs
-            compressed at the start.
-        rest: final kinetic energy over the same.
-        has_crossed: whether bodies ended on the wrong side of each other.
-        restitution: speed after a single bounce over that before; NaN without one, or while it lasts.
-        expected: the restitution of the motion itself; NaN where it is not known.
-    """
-
-    is_sound: Bool[np.ndarray, " points"]
+    is_sound: Bool[np.ndarray, " points"]  # whether all states were finite and below the velocity limit
+    # Largest share of a step's velocity by which a solve is off, or a bound on it: the share of the forces that it leaves
+    # unbalanced.
     residual: Float[np.ndarray, " points"]
+    # Largest kinetic energy over what there was to draw on: that of the start, of gravity and of springs compressed at the
+    # start.
     gain: Float[np.ndarray, " points"]
-    rest: Float[np.ndarray, " points"]
-    has_crossed: Bool[np.ndarray, " points"]
+    rest: Float[np.ndarray, " points"]  # final kinetic energy over the same
+    has_crossed: Bool[np.ndarray, " points"]  # whether bodies ended on the wrong side of each other
+    # Speed after a single bounce over that before; NaN without one, or while it lasts.
     restitution: Float[np.ndarray, " points"]
-    expected: Float[np.ndarray, " points"]
+    expected: Float[np.ndarray, " points"]  # the restitution of the motion itself; NaN where it is not known
 
 
 def classify_motion(record: MotionRecord) -> Int[np.ndarray, " points"]:

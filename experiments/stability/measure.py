@@ -1,9 +1,10 @@
-"""From settings to numbers."""
+"""From settings to numbers: mjxgrad beside C MuJoCo on every point."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,16 +13,94 @@ from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
-from experiments.stability.classes import UNSOLVED, Motion, MotionRecord, classify_derivative, classify_motion
-from experiments.stability.grid import Points, points
-from experiments.stability.outcome import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome
+from experiments.stability.classes import (
+    UNSOLVED,
+    Derivative,
+    Motion,
+    MotionRecord,
+    classify_derivative,
+    classify_motion,
+)
 from experiments.stability.program import Program, Run, along, errors_of_solves
 from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
-from experiments.stability.scenes import GRAVITY, StabilityScene, catalogue, effective
+from experiments.stability.scenes import GRAVITY, Points, StabilityScene, catalogue, effective, points
 from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import soundness
 from mjxgrad.tasks.textbook import Bounce, integrated_restitution
+
+C_MUJOCO = "C MuJoCo"
+NOT_ASKED = -1
+"""In the place of a value of `Derivative` that was not asked for."""
+_JUDGED = ("derivative", "derivative_by_parameters", "event_derivative")
+
+
+@dataclass(frozen=True)
+class SceneOutcome:
+    """One scene."""
+
+    scene: StabilityScene  # of the catalogue
+    points: Points  # of its grid
+    # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that of the
+    # discrete gradient along a change of the start (`derivative`) and of the model's parameters
+    # (`derivative_by_parameters`), and that of the event gradient (`event_derivative`); whether numbers that are not finite
+    # left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
+    # (`untold`), whether the gradient is not finite or explodes where `Trajectory.diverged` is false
+    # (`gradient_unflagged_by_rollout`), and `soundness` finds nothing wrong either (`missed`); difference of the final
+    # positions from those of C MuJoCo over what a body flies (`apart_from_c`), and largest kinetic energy over what there
+    # was to draw on (`energy`).
+    found: xr.Dataset
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured, the scenes in the order of the catalogue."""
+
+    settings: Settings
+    scenes: list[SceneOutcome]
+
+    @cached_property
+    def found(self) -> xr.Dataset:
+        """The points of all scenes, one after another."""
+        return xr.concat([one.found for one in self.scenes], "point")
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per point, for metrics.csv."""
+        return [row for one in self.scenes for row in _rows(one)]
+
+
+def against_c(found: xr.Dataset, precision: str) -> np.ndarray:
+    """Compare mjxgrad's motion with that of C MuJoCo: above 0 where it is of a worse kind, below where of a better one."""
+    # All that are fine have one rank.
+    ranks = np.maximum(found.motion, Motion.BOUNCES_RIGHT)
+    return (ranks.sel(simulator=precision) - ranks.sel(simulator=C_MUJOCO)).values
+
+
+def _rows(one: SceneOutcome) -> list[dict[str, Any]]:
+    columns: dict[str, Any] = {}
+    for name in one.found.simulator.values:
+        of_one = one.found.sel(simulator=name)
+        keys = [key for key in of_one.data_vars if key != "missed"] if name != C_MUJOCO else ["motion", "derivative"]
+        prefix = "c" if name == C_MUJOCO else name
+        columns |= {f"{prefix}_{key}": _readable(str(key), of_one[key].values) for key in keys}
+    planes = ["random" if i < 0 else " × ".join(one.points.planes[i]) for i in one.points.family]
+    return [
+        {
+            "scene": one.scene.name,
+            "plane": plane,
+            **one.points[i],
+            **{key: values[i] for key, values in columns.items()},
+        }
+        for i, plane in enumerate(planes)
+    ]
+
+
+def _readable(key: str, values: np.ndarray) -> list[Any]:
+    if key != "motion" and key not in _JUDGED:
+        return values.tolist()
+    kind = Derivative if key in _JUDGED else Motion
+    return ["" if value == NOT_ASKED else kind(value).label for value in values]
+
 
 _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
 """Fields of the model that are changed in proportion, to judge the derivative by them."""
@@ -92,17 +171,11 @@ class _Case:
 
 @dataclass(frozen=True)
 class _Runs:
-    """What mjxgrad did on all points of a scene in one precision.
+    """What mjxgrad did on all points of a scene in one precision."""
 
-    Attributes:
-        discrete: motion and discrete gradient.
-        event: the same with the event gradient; None where it was not asked for.
-        differences: of the outcome (start and parameters, widths, points), in float64.
-    """
-
-    discrete: Run
-    event: Run | None
-    differences: np.ndarray | None
+    discrete: Run  # motion and discrete gradient
+    event: Run | None  # the same with the event gradient; None where it was not asked for
+    differences: np.ndarray | None  # of the outcome (start and parameters, widths, points), in float64
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -251,16 +324,9 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
     record = _record(case, run.course)
     motion, bound = classify_motion(record), case.largest
     slopes = [along(run, case.push), along(run, case.changes) / case.flown]
+    bounds = {"largest": bound, "tolerance": _TOLERANCE[precision]}
     kinds = [
-        classify_derivative(
-            slope,
-            run.is_gradient_finite,
-            record.is_sound,
-            fine,
-            np.abs(fine - coarse),
-            largest=bound,
-            tolerance=_TOLERANCE[precision],
-        )
+        classify_derivative(slope, run.is_gradient_finite, record.is_sound, fine, np.abs(fine - coarse), **bounds)
         for slope, (coarse, fine) in zip(slopes, truth, strict=True)
     ]
     is_wild = ~run.is_gradient_finite | ~(np.abs(slopes) <= bound).all(axis=0)
@@ -286,12 +352,5 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
 def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
     """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
     truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
-    return classify_derivative(
-        run.gradient[1][:, 0],
-        run.is_gradient_finite,
-        record.is_sound,
-        truth,
-        0 * truth,
-        largest=bound,
-        tolerance=_EVENT_TOLERANCE,
-    )
+    slope, bounds = run.gradient[1][:, 0], {"largest": bound, "tolerance": _EVENT_TOLERANCE}
+    return classify_derivative(slope, run.is_gradient_finite, record.is_sound, truth, 0 * truth, **bounds)

@@ -19,42 +19,26 @@ from mjxgrad.dynamics import Gradient
 
 
 class Steps(eqx.Module):
-    """What the solves of a rollout were given and found.
+    """What the solves of a rollout were given and found."""
 
-    Attributes:
-        qpos: positions before each step.
-        qvel: velocities, likewise.
-        qacc: the acceleration found.
-        unbalanced: share of the forces that it leaves; 0 from the first bad step on.
-    """
-
-    qpos: Float[np.ndarray, "points steps nq"]
-    qvel: Float[np.ndarray, "points steps nv"]
-    qacc: Float[np.ndarray, "points steps nv"]
-    unbalanced: Float[np.ndarray, "points steps"]
+    qpos: Float[np.ndarray, "points steps nq"]  # positions before each step
+    qvel: Float[np.ndarray, "points steps nv"]  # velocities, likewise
+    qacc: Float[np.ndarray, "points steps nv"]  # the acceleration found
+    unbalanced: Float[np.ndarray, "points steps"]  # share of the forces that it leaves; 0 from the first bad step on
 
 
 @dataclass(frozen=True)
 class Run:
-    """What mjxgrad did on every point.
+    """What mjxgrad did on every point."""
 
-    Attributes:
-        course: the motion.
-        value: the outcome at the end.
-        gradient: of the outcome with respect to the model's fields, positions and velocities.
-        is_silent: whether a rollout returned a number that is not finite without a flag.
-        is_gradient_finite: whether all numbers of the gradient are.
-        is_unsolved: whether the rollout says that some step's forces are not in balance.
-        steps: state and solution at each step, for a closer look at those that seem wrong.
-    """
-
-    course: Course
-    value: Float[np.ndarray, " points"]
+    course: Course  # the motion
+    value: Float[np.ndarray, " points"]  # the outcome at the end
+    # Of the outcome with respect to the model's fields, positions and velocities.
     gradient: tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]
-    is_silent: np.ndarray
-    is_gradient_finite: np.ndarray
-    is_unsolved: np.ndarray
-    steps: Steps
+    is_silent: np.ndarray  # whether a rollout returned a number that is not finite without a flag
+    is_gradient_finite: np.ndarray  # whether all numbers of the gradient are
+    is_unsolved: np.ndarray  # whether the rollout says that some step's forces are not in balance
+    steps: Steps  # state and solution at each step, for a closer look at those that seem wrong
 
 
 def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Array]:
@@ -95,9 +79,10 @@ class Program:
         value, trajectory, gradient = jax.tree.map(lambda *x: np.concatenate(x), *parts)
         kinetic, potential, residual, qacc = trajectory.observations
         # From the first bad step on the solver is asked what has no answer.
-        residual = _until(residual, trajectory.first_bad_step)
+        first_bad, step = trajectory.first_bad_step, np.arange(residual.shape[1])
+        residual = np.where((first_bad[:, None] >= 0) & (step >= first_bad[:, None]), 0.0, residual)
         is_silent = ~trajectory.diverged & ~_all_finite((trajectory, value))
-        ends, first_bad = (trajectory.qpos[:, -1], trajectory.qvel[:, -1]), trajectory.first_bad_step
+        ends = trajectory.qpos[:, -1], trajectory.qvel[:, -1]
         course = Course(*ends, kinetic, potential, residual.max(axis=1), first_bad)
         last = self._num_steps
         steps = Steps(trajectory.qpos[:, :last], trajectory.qvel[:, :last], qacc[:, :last], residual[:, :last])
@@ -165,8 +150,3 @@ def along(run: Run, changes: dict[str, np.ndarray]) -> Float[np.ndarray, " point
 def _all_finite(tree: Any) -> np.ndarray:
     leaves = [x for x in jax.tree.leaves(tree) if np.issubdtype(np.asarray(x).dtype, np.floating)]
     return np.all([np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in leaves], axis=0)
-
-
-def _until(values: Float[np.ndarray, "points states"], first_bad: np.ndarray) -> Float[np.ndarray, "points states"]:
-    step = np.arange(values.shape[1])
-    return np.where((first_bad[:, None] >= 0) & (step >= first_bad[:, None]), 0.0, values)

@@ -10,55 +10,39 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.parallel import num_cores
-from experiments.stability.grid import Points
-from experiments.stability.scenes import FIELDS, StabilityScene, catalogue, configure
+from experiments.stability.scenes import FIELDS, Points, StabilityScene, catalogue, configure
 
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
 WIDTHS = (1e-4, 2e-5)
 """Of finite differences, in units of what a body flies in one step."""
+_Worker = tuple[StabilityScene, mujoco.MjModel, mujoco.MjData]
 _SHARES = 4
 """Pieces of work for each process: some points take longer than others."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """What one simulator did on every point.
+    """What one simulator did on every point."""
 
-    Attributes:
-        qpos: positions after the last step, or the last good one.
-        qvel: velocities, likewise.
-        kinetic: energy of motion before each step and at the end, in J.
-        potential: energy of height, likewise.
-        residual: largest share of a step's velocity by which a solve is off, or that its forces leave unbalanced.
-        first_bad_step: −1 if there is none.
-    """
-
-    qpos: Float[np.ndarray, "points nq"]
-    qvel: Float[np.ndarray, "points nv"]
-    kinetic: Float[np.ndarray, "points states"]
-    potential: Float[np.ndarray, "points states"]
+    qpos: Float[np.ndarray, "points nq"]  # positions after the last step, or the last good one
+    qvel: Float[np.ndarray, "points nv"]  # velocities, likewise
+    kinetic: Float[np.ndarray, "points states"]  # energy of motion before each step and at the end, in J
+    potential: Float[np.ndarray, "points states"]  # energy of height, likewise
+    # Largest share of a step's velocity by which a solve is off, or that its forces leave unbalanced.
     residual: Float[np.ndarray, " points"]
-    first_bad_step: np.ndarray
+    first_bad_step: np.ndarray  # −1 if there is none
 
 
 @dataclass(frozen=True)
 class Reference:
-    """C MuJoCo on every point.
+    """C MuJoCo on every point."""
 
-    Attributes:
-        course: what it did.
-        fields: of the model, by name, for every point.
-        qpos: where each rollout starts.
-        qvel: likewise.
-        differences: central differences of the outcome along `direction`, by width.
-    """
-
-    course: Course
-    fields: dict[str, np.ndarray]
-    qpos: Float[np.ndarray, "points nq"]
-    qvel: Float[np.ndarray, "points nv"]
-    differences: Float[np.ndarray, "widths points"]
+    course: Course  # what it did
+    fields: dict[str, np.ndarray]  # of the model, by name, for every point
+    qpos: Float[np.ndarray, "points nq"]  # where each rollout starts
+    qvel: Float[np.ndarray, "points nv"]  # likewise
+    differences: Float[np.ndarray, "widths points"]  # central differences of the outcome along `direction`, by width
 
 
 def direction(scene: StabilityScene, num_steps: int, timestep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,17 +77,11 @@ def _run_points(name: str, num_steps: int, cases: list[tuple[dict[str, float], n
     scene = next(scene for scene in catalogue() if scene.name == name)
     model = scene.model()
     worker = (scene, model, mujoco.MjData(model))
-    return [_run_point(worker, point, shift[: model.nq], shift[model.nq :], num_steps) for point, shift in cases]
+    return [_run_point(worker, point, change, num_steps) for point, change in cases]
 
 
-def _run_point(
-    worker: tuple[StabilityScene, mujoco.MjModel, mujoco.MjData],
-    point: dict[str, float],
-    shift: np.ndarray,
-    push: np.ndarray,
-    num_steps: int,
-) -> tuple:
-    scene, model, data = worker
+def _run_point(worker: _Worker, point: dict[str, float], change: np.ndarray, num_steps: int) -> tuple:
+    (scene, model, data), (shift, push) = worker, np.split(change, [worker[1].nq])
     configure(scene, model, data, point)
     fields = {name: np.array(getattr(model, name)) for name in FIELDS}
     fields["timestep"] = np.array(model.opt.timestep)

@@ -1,4 +1,4 @@
-"""The scenes of an experiment on stability, and how a point of its grid becomes a model and a state."""
+"""The scenes of an experiment on stability, the points of its grid, and how a point becomes a model and a state."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,40 +43,28 @@ _HEAD = """
 """
 _TAIL = "\n</worldbody></mujoco>"
 _PLANE = '<geom name="floor" type="plane" size="1 1 .1" mass="0"/>'
+_CONES = ("pyramidal", "elliptic")
+_FREE_BODY = (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0)  # weights of its positions in the outcome
 _BALL = f'<geom name="{{0}}" size="{RADIUS}"/>'
 
 
 @dataclass(frozen=True)
 class StabilityScene:
-    """A scene with its own program; all that is not static is a point of the grid.
+    """A scene with its own program; all that is not static is a point of the grid."""
 
-    Attributes:
-        name: of the scene.
-        mjcf: of it.
-        family: what it shares with scenes that differ in cone or dimension.
-        start: from a point to positions and velocities.
-        masses: of all bodies but the world, from the mass ratio (kg).
-        outcome: weights of the positions in the number whose derivative is judged.
-        crossing: indices of two positions of which the first stays below the second unless the bodies tunnel.
-        spacing: of these two where their positions are equal (m).
-        depth_unit: what a depth of one is (m, or rad).
-        bounces: whether it is a single bounce, with a restitution in closed form.
-        has_refsafe: whether MuJoCo may replace time constants.
-        has_limits: whether the point's parameters are those of joint limits.
-    """
-
-    name: str
-    mjcf: str
-    family: str
-    start: Callable[[Point], State]
-    masses: Callable[[float], list[float]]
-    outcome: tuple[float, ...]
+    name: str  # of the scene
+    mjcf: str  # of it
+    family: str  # what it shares with scenes that differ in cone or dimension
+    start: Callable[[Point], State]  # from a point to positions and velocities
+    masses: Callable[[float], list[float]]  # of all bodies but the world, from the mass ratio (kg)
+    outcome: tuple[float, ...]  # weights of the positions in the number whose derivative is judged
+    # Indices of two positions of which the first stays below the second unless the bodies tunnel.
     crossing: tuple[tuple[int, int], ...] = ()
-    spacing: float = 0.0
-    depth_unit: float = RADIUS
-    bounces: bool = False
-    has_refsafe: bool = True
-    has_limits: bool = False
+    spacing: float = 0.0  # of these two where their positions are equal (m)
+    depth_unit: float = RADIUS  # what a depth of one is (m, or rad)
+    bounces: bool = False  # whether it is a single bounce, with a restitution in closed form
+    has_refsafe: bool = True  # whether MuJoCo may replace time constants
+    has_limits: bool = False  # whether the point's parameters are those of joint limits
 
     def model(self) -> mujoco.MjModel:
         """Compile it."""
@@ -127,6 +115,10 @@ def _mjcf(
     return _HEAD.format(name=name, gravity=-gravity, cone=cone, condim=condim, flags=flags) + body + _TAIL
 
 
+def _alone(_: float) -> list[float]:
+    return [MASS]
+
+
 def _graded(count: int) -> Callable[[float], list[float]]:
     """Masses of bodies in a row, each heavier than the one before by the same factor, the lightest of `MASS`."""
     places = np.arange(count) / (count - 1)
@@ -146,19 +138,11 @@ def _balls() -> list[StabilityScene]:
     def start(point: Point) -> State:
         return np.array([_above(point)]), np.array([-point["speed"]])
 
-    return [
-        StabilityScene(
-            name,
-            _mjcf("ball", body, flags=f'refsafe="{"enable" if has_refsafe else "disable"}"'),
-            "ball",
-            start,
-            lambda _: [MASS],
-            (1.0,),
-            bounces=True,
-            has_refsafe=has_refsafe,
-        )
-        for name, has_refsafe in (("ball", False), ("ball, refsafe", True))
-    ]
+    found = []
+    for name, refsafe in (("ball", "disable"), ("ball, refsafe", "enable")):
+        mjcf, has_refsafe = _mjcf("ball", body, flags=f'refsafe="{refsafe}"'), refsafe == "enable"
+        found.append(StabilityScene(name, mjcf, "ball", start, _alone, (1.0,), bounces=True, has_refsafe=has_refsafe))
+    return found
 
 
 def _spheres() -> list[StabilityScene]:
@@ -169,18 +153,13 @@ def _spheres() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, RADIUS + _above(point), 1.0, 0.0, 0.0, 0.0])
         return qpos, np.array([0.5 * speed, 0.2 * speed, -speed, 0.0, 0.3 * speed / RADIUS, 0.1 * speed / RADIUS])
 
-    variants = [(1, "pyramidal"), *((dim, cone) for cone in ("pyramidal", "elliptic") for dim in (3, 4, 6))]
-    return [
-        StabilityScene(
-            f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else ""),
-            _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim),
-            "sphere",
-            start,
-            lambda _: [MASS],
-            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
-        )
-        for dim, cone in variants
-    ]
+    variants = [(1, "pyramidal"), *((dim, cone) for cone in _CONES for dim in (3, 4, 6))]
+    found = []
+    for dim, cone in variants:
+        mjcf = _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim)
+        name = f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else "")
+        found.append(StabilityScene(name, mjcf, "sphere", start, _alone, _FREE_BODY))
+    return found
 
 
 def _pairs() -> list[StabilityScene]:
@@ -197,18 +176,17 @@ def _pairs() -> list[StabilityScene]:
         return np.array(first + second), np.array([point["speed"]] + 11 * [0.0])
 
     weights = (0.0, 0.3, 0.0) + 4 * (0.0,) + (1.0, 0.4, 0.1) + 4 * (0.0,)
-    return [
-        StabilityScene(
-            f"two balls, {cone}",
-            _mjcf("pair", body, cone=cone, condim=3),
-            "two balls",
-            start,
-            lambda ratio: [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)],
-            weights,
-            crossing=((0, 7),),
+
+    def masses(ratio: float) -> list[float]:
+        return [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)]
+
+    found = []
+    for cone in _CONES:
+        mjcf = _mjcf("pair", body, cone=cone, condim=3)
+        found.append(
+            StabilityScene(f"two balls, {cone}", mjcf, "two balls", start, masses, weights, crossing=((0, 7),))
         )
-        for cone in ("pyramidal", "elliptic")
-    ]
+    return found
 
 
 def _stack() -> StabilityScene:
@@ -224,16 +202,10 @@ def _stack() -> StabilityScene:
         heights = above * np.arange(1, count + 1) if above < 0 else np.full(count, above)
         return heights, np.full(count, -point["speed"])
 
-    return StabilityScene(
-        "stack",
-        _mjcf("stack", _PLANE + balls, gravity=GRAVITY),
-        "stack",
-        start,
-        _graded(count),
-        (0.2, 0.3, 0.5, 1.0),
-        crossing=tuple((i, i + 1) for i in range(count - 1)),
-        spacing=2 * RADIUS,
-    )
+    mjcf, weights = _mjcf("stack", _PLANE + balls, gravity=GRAVITY), (0.2, 0.3, 0.5, 1.0)
+    crossing = tuple((i, i + 1) for i in range(count - 1))
+    masses, spacing = _graded(count), 2 * RADIUS
+    return StabilityScene("stack", mjcf, "stack", start, masses, weights, crossing=crossing, spacing=spacing)
 
 
 def _boxes() -> list[StabilityScene]:
@@ -248,17 +220,11 @@ def _boxes() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, corner + _above(point), np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
         return qpos, np.array([0.3 * speed, 0.1 * speed, -speed, 0.0, 0.0, 0.0])
 
-    return [
-        StabilityScene(
-            f"box, {cone}",
-            _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3),
-            "box",
-            start,
-            lambda _: [MASS],
-            (0.7, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0),
-        )
-        for cone in ("pyramidal", "elliptic")
-    ]
+    found = []
+    for cone in _CONES:
+        mjcf = _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3)
+        found.append(StabilityScene(f"box, {cone}", mjcf, "box", start, _alone, _FREE_BODY))
+    return found
 
 
 def _chain() -> StabilityScene:
@@ -277,3 +243,131 @@ def _chain() -> StabilityScene:
     mjcf = _mjcf("chain", inner, gravity=GRAVITY)
     weights = (0.3, 0.5, 1.0)
     return StabilityScene("chain", mjcf, "chain", start, _graded(count), weights, depth_unit=0.1, has_limits=True)
+
+
+Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
+"""From places in [0, 1] to values."""
+
+# In the planes of a single bounce the impedance is constant, for a restitution in closed form.
+CONSTANT = {"impedance_first": 0.9, "impedance_last": 0.9}
+PLANES: dict[str, tuple[tuple[str, str, dict[str, float]], ...]] = {
+    "ball": (
+        ("timestep", "time_constant", CONSTANT),
+        ("time_constant", "damping_ratio", CONSTANT),
+        ("timestep", "stiffness", CONSTANT),
+        ("width", "impedance_first", {}),
+        ("timestep", "speed", CONSTANT),
+    ),
+    "ball, refsafe": (("timestep", "time_constant", CONSTANT),),
+    "sphere": (("speed", "friction", {}), ("time_constant", "depth", {})),
+    "two balls": (
+        ("speed", "mass_ratio", {}),
+        ("timestep", "speed", {}),
+        ("time_constant", "depth", {}),
+        ("width", "margin", {}),
+    ),
+    "stack": (("time_constant", "mass_ratio", {}), ("timestep", "depth", {})),
+    "box": (("time_constant", "depth", {}), ("speed", "friction", {})),
+    "chain": (("time_constant", "mass_ratio", {}), ("timestep", "stiffness", {})),
+}
+"""By scene, or by its family: the parameter across, the one up, and what else differs from the default."""
+_CONTACT = (
+    "timestep", "time_constant", "damping_ratio", "stiffness", "impedance_first", "impedance_last", "width", "speed"
+)  # fmt: skip
+_RANDOM = {
+    "ball": (*_CONTACT, "margin"),
+    "sphere": (*_CONTACT, "margin", "friction", "depth"),
+    "two balls": (*_CONTACT, "margin", "friction", "depth", "mass_ratio"),
+    "stack": (*_CONTACT, "margin", "depth", "mass_ratio"),
+    "box": (*_CONTACT, "margin", "friction", "depth"),
+    "chain": (*_CONTACT, "depth", "mass_ratio"),
+}
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the grid of one scene."""
+
+    values: dict[str, Float[np.ndarray, " points"]]  # of every parameter, by name
+    family: np.ndarray  # index of the plane that each belongs to, −1 for random ones
+    planes: tuple[tuple[str, str], ...]  # names of the two parameters of each plane
+
+    def __len__(self) -> int:
+        return len(self.family)
+
+    def __getitem__(self, index: int) -> dict[str, float]:
+        return {name: float(value[index]) for name, value in self.values.items()}
+
+    @property
+    def flown(self) -> Float[np.ndarray, " points"]:
+        """What a body flies in one step (m)."""
+        return self.values["speed"] * self.values["timestep"]
+
+    def plane(self, index: int, values: np.ndarray) -> np.ndarray:
+        """Arrange what belongs to one plane, of one value per point, as an image, the parameter across along columns."""
+        chosen = values[self.family == index]
+        return chosen.reshape(round(np.sqrt(len(chosen))), -1)
+
+
+def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -> Points:
+    """List the points of a scene: plane by plane, the parameter across changing fastest, then the random ones."""
+    planes = PLANES.get(scene.name, PLANES[scene.family])
+    places = np.linspace(0, 1, resolution)
+    blocks = []
+    for across, up, others in planes:
+        x, y = np.meshgrid(AXES[across](places), AXES[up](places))
+        blocks.append(_block(x.size, others | {across: x.ravel(), up: y.ravel()}))
+    names = _RANDOM[scene.family]
+    # A plane alone decides whether the format is direct; here every other point is.
+    rng = np.random.default_rng(seed)
+    strata = rng.permuted(np.tile(np.arange(num_random), (len(names), 1)), axis=1).T
+    sample = (strata + rng.random(strata.shape)) / num_random
+    drawn = {name: AXES[name](sample[:, i]) for i, name in enumerate(names)}
+    drawn["stiffness"] = np.where(np.arange(num_random) % 2, drawn["stiffness"], 0.0)
+    if "depth" in drawn:
+        drawn["depth"] = np.where(np.arange(num_random) % 4 < 3, 0.0, drawn["depth"])
+    blocks.append(_block(num_random, drawn))
+    family = np.repeat([*range(len(planes)), -1], [len(block["timestep"]) for block in blocks])
+    values = {name: np.concatenate([block[name] for block in blocks]) for name in DEFAULTS}
+    return Points(values, family, tuple((across, up) for across, up, _ in planes))
+
+
+def _block(count: int, given: Mapping[str, np.ndarray | float]) -> dict[str, Float[np.ndarray, " n"]]:
+    return {name: np.broadcast_to(given.get(name, value), count).astype(float) for name, value in DEFAULTS.items()}
+
+
+def _powers(low: float, high: float) -> Axis:
+    return lambda place: low * (high / low) ** place
+
+
+def _zero_and_powers(low: float, high: float) -> Axis:
+    """The lowest twelfth is zero."""
+    share = 1 / 12
+    return lambda place: np.where(place <= share, 0.0, low * (high / low) ** ((place - share) / (1 - share)))
+
+
+def _impedance(place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    knots = (0.0, 0.3, 0.6, 0.9, 0.99, 0.999, 0.9999)
+    return np.interp(place, np.linspace(0, 1, len(knots)), knots)
+
+
+def _depth(place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Up to four radii; around two, where two balls have one centre, exactly that."""
+    depth = np.maximum(4 * place, 0.1)
+    return np.where(np.abs(depth - 2) < 0.3, 2.0, depth)
+
+
+AXES: dict[str, Axis] = {
+    "timestep": _powers(1e-4, 5e-2),
+    "time_constant": _powers(1e-5, 1.0),
+    "damping_ratio": _powers(1e-2, 10.0),
+    "stiffness": _powers(1.0, 1e8),
+    "impedance_first": _impedance,
+    "impedance_last": _impedance,
+    "width": _zero_and_powers(1e-6, 0.1),
+    "mass_ratio": _powers(1e-6, 1e6),
+    "speed": _powers(1e-2, 100.0),
+    "friction": _zero_and_powers(1e-3, 10.0),
+    "margin": _zero_and_powers(1e-6, 0.02),
+    "depth": _depth,
+}

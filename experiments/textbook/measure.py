@@ -59,11 +59,7 @@ class Outcome:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Repeat every estimator at every number of rollouts and every stiffness.
-
-    Raises:
-        ExperimentError: if there is no estimator of some name.
-    """
+    """Repeat every estimator at every number of rollouts and every stiffness."""
     named = {one.label: _estimator(one) for one in settings.estimators}
     shown = settings.shown_stiffness
     problem = _problem(settings, shown)

@@ -1,12 +1,20 @@
-"""The answer of an experiment on a textbook problem in words, computed from its numbers."""
+"""The answer on a textbook problem, computed from its numbers, and its pictures."""
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullLocator
 
+from experiments import theme
 from experiments.report import Table
-from experiments.textbook.figures import stiffness_name
 from experiments.textbook.measure import Outcome
-from experiments.theme import power
+from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import joined, quantity
 
 
@@ -123,3 +131,139 @@ def _unseen(outcome: Outcome) -> str:
                 f"{quantity(found.implied_variance_bound)}, and the truth is {quantity((2 * x) ** 2 * p * (1 - p))}."
             )
     return sentence
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    found: dict[str, Any] = {"problem": problem, "samples": samples}
+    found |= {} if outcome.by_stiffness is None else {"stiffness": stiffness}
+    return found | ({"missing": missing} if outcome.hits else {})
+
+
+def stiffness_name(outcome: Outcome) -> str:
+    """Name the axis of stiffness."""
+    return "frequency ω" if outcome.settings.problem == "quadratic_sine" else "stiffness 1/ν"
+
+
+def problem(outcome: Outcome):
+    """The cost with and without noise, and both gradients that estimates can converge to."""
+    figure, axes = subplots(1, 2, height=3.3)
+    settings, one = outcome.settings, outcome.problem
+    left, right = axes[0]
+    point, stddev = settings.point, settings.stddev
+    grid = jnp.linspace(-1, 1, 801) * max(4 * stddev, 1.5 * abs(point))
+
+    def draw(axis: Axes, function: Callable[[Array], Array], **look: Any) -> None:
+        axis.plot(grid, jax.jit(jax.vmap(function))(grid), **look)
+
+    draw(left, lambda x: one(x[None]), color=MUTED, lw=1.2, label="without noise")
+    draw(left, lambda x: one.smoothed(x, stddev), color=REFERENCE, label=f"mean under noise of {stddev:g}")
+    draw(right, lambda x: one.gradient(x, stddev), color=REFERENCE, label="gradient of the mean")
+    look = {"color": FIRST, "ls": (0, (4, 2)), "zorder": 3}
+    draw(right, lambda x: one.first_order_mean(x, stddev), label="mean of first order", **look)
+    for axis, title in ((left, "Cost"), (right, "Gradient")):
+        axis.axvline(point, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
+        low, high = axis.get_ylim()
+        axis.set(title=title, xlabel="parameter", xlim=(grid[0], grid[-1]), ylim=(low, high + 0.22 * (high - low)))
+        axis.legend(loc="upper left", ncols=2)
+    shown = "" if settings.shown_stiffness is None else f" at stiffness {settings.shown_stiffness:g}"
+    caption = (
+        f"Left, the cost{shown}; right, the gradient that is to be estimated, and what first order converges to. Where the "
+        "two part, first order is biased. The dotted line marks the point of the estimates below."
+    )
+    return figure, "The cost and its gradient", caption
+
+
+def samples(outcome: Outcome):
+    """Root-mean-square error and bias against rollouts."""
+    figure, axes = subplots(1, 2, height=4.2)
+    x, size, table = np.asarray(outcome.settings.num_samples, float), abs(outcome.gradient), outcome.by_samples
+    left, right = axes[0]
+    _errors(left, x, table)
+    left.set_xlabel("rollouts per estimate")
+    right.axhline(0, color=MUTED, lw=0.8)
+    right.axhline(-1, color=MUTED, lw=0.8, ls=(0, (2, 3)))
+    _marks(right, x, table, "bias", 1 / size)
+    # One wild interval of few samples is not to flatten all others.
+    reach = max(0.15, 1.6 * float(abs(table.bias[1:]).max()) / size)
+    right.set(title="Bias, as a share of the gradient", xlabel="rollouts per estimate", ylim=(-reach, reach))
+    theme.legend_below(figure, left, 4)
+    caption = (
+        f"{_repeats(outcome)}. Left, distance to the true gradient; thin lines are closed forms, dotted ones join marks that "
+        "have none. Right, mean less truth; at −1 (dotted) an estimate is zero throughout. A budget counts every rollout, that "
+        "without noise included. Intervals that leave the panel are cut."
+    )
+    return figure, "Error against rollouts", caption
+
+
+def stiffness(outcome: Outcome):
+    """Root-mean-square error against stiffness."""
+    assert outcome.by_stiffness is not None
+    figure, axes = subplots(1, 1, height=4.2)
+    axis, settings = axes[0, 0], outcome.settings
+    _errors(axis, np.asarray(settings.stiffness), outcome.by_stiffness)
+    axis.set_xlabel(stiffness_name(outcome))
+    theme.legend_below(figure, axis, 4)
+    caption = (
+        f"{_repeats(outcome)}, {settings.samples_at_stiffness} rollouts each: distance to the true gradient. Thin lines are "
+        "closed forms, dotted ones join marks that have none."
+    )
+    return figure, "Error against stiffness", caption
+
+
+def missing(outcome: Outcome):
+    """Chance that N samples all miss the slope."""
+    figure, axes = subplots(1, 1, height=4.0)
+    axis, settings, grid = axes[0, 0], outcome.settings, np.geomspace(2, 1000, 200)
+    for x, (p, found), colour in zip(settings.stiffness, outcome.hits, theme.shades(len(outcome.hits)), strict=True):
+        axis.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(x))
+        if p > 0.5:
+            continue  # most samples are on the slope, so that the event is to be on it
+        # Where half of the sets miss, and so the interval is widest; bands of all stiffnesses would hide each other.
+        at = np.clip(np.log(0.5) / np.log1p(-p), 2, 1000)
+        middle, ends = found.miss_probability(at), found.miss_probability_interval(at)
+        theme.errorbar(axis, at, middle, ends, color=colour, marker="D", ms=5, capsize=3, mec="white")
+    axis.set(xlabel="samples N", ylabel="chance that all miss", xscale="log", ylim=(-0.03, 1.03))
+    _ticks(axis, np.array([2.0, 10.0, 100.0, 1000.0]))
+    axis.legend(title=stiffness_name(outcome), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    caption = (
+        f"For each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what {settings.missed_samples} first-order samples tell, "
+        f"with its {settings.confidence:.0%} interval."
+    )
+    return figure, "How often samples miss the slope", caption
+
+
+def _repeats(outcome: Outcome) -> str:
+    settings = outcome.settings
+    return f"Each mark is from {settings.num_repeats} estimates, with its {settings.confidence:.0%} interval"
+
+
+def _errors(axis: Axes, x: np.ndarray, table: xr.Dataset) -> None:
+    """Draw measured errors with intervals and, thin, the closed forms."""
+    _marks(axis, x, table, "rmse", ls=(0, (1, 2)))
+    axis.set(title="Root-mean-square error", ylabel="error of the gradient", yscale="log")
+    # Errors often span a single decade, where powers of ten alone would leave one label.
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_minor_locator(NullLocator())
+    theme.plain(axis.yaxis)
+
+
+def _marks(axis: Axes, x: np.ndarray, table: xr.Dataset, name: str, scale: float = 1.0, ls: Any = "") -> None:
+    """Draw a number of each estimator with its interval; closed forms of the error are lines in place of dotted ones."""
+    for row, look in enumerate(theme.looks(table.estimator.values)):
+        one = table.isel(estimator=row)
+        at = x * 1.035 ** (row - (table.estimator.size - 1) / 2)
+        has_exact = name == "rmse" and bool(one.exact_rmse.notnull().all())
+        ends = scale * one[[f"{name}_low", f"{name}_high"]].to_array().values
+        look |= {"ls": "" if has_exact else ls, "ms": 4.5, "label": str(one.estimator.values)}
+        theme.errorbar(axis, at, scale * one[name].values, ends, **look)
+        if has_exact:
+            axis.plot(at, one.exact_rmse, color=look["color"], lw=1.0)
+    axis.set_xscale("log")
+    _ticks(axis, x)
+
+
+def _ticks(axis: Axes, values: np.ndarray, most: int = 8) -> None:
+    shown = values[:: -(-len(values) // most)]
+    axis.set_xticks(shown, [power(value) for value in shown])
+    axis.minorticks_off()

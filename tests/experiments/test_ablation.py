@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.ablation.measure import record, scene_path, segments
-from experiments.ablation.outcome import Cost
+from experiments.ablation.measure import Cost, record, scene_path, segments
 from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, RENDERING, variants
 
 
 @pytest.fixture(scope="module")
 def recorded():
     scene = mg.load_scene(scene_path("reacher"), keep_everything=True)
-    return record(scene, num_rollouts=2, duration=0.4, least_steps=1, control_share=0.5, seed=0)
+    return record(scene, num_rollouts=2, duration=0.4, least_steps=1, seed=0)
 
 
 def test_a_group_deletes_what_it_says_and_no_inertia(recorded):
@@ -45,7 +44,7 @@ def test_starts_are_recorded_states_with_the_controls_that_followed(recorded):
 
 def test_a_long_time_step_leaves_steps_enough_to_start_from():
     scene = mg.load_scene(scene_path("reacher"), keep_everything=True)
-    found = record(scene, num_rollouts=1, duration=0.02, least_steps=14, control_share=0.5, seed=0)
+    found = record(scene, num_rollouts=1, duration=0.02, least_steps=14, seed=0)
     qpos, _, _ = segments(found, batch=3, horizon=7, seed=0)
     assert found.ctrl.shape[1] == 14
     assert len(qpos) == 3

@@ -12,10 +12,8 @@ from scipy import stats
 
 from experiments.__main__ import main
 from experiments.config import load_runs
-from experiments.optimisation.figures import drawings
-from experiments.optimisation.methods import problem
-from experiments.optimisation.outcome import Difference, Outcome, Run
-from experiments.optimisation.report import findings, headline, tables, verdict, warnings
+from experiments.optimisation.measure import Difference, Outcome, Run, problem
+from experiments.optimisation.report import drawings, findings, headline, tables, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.report import overview
 from experiments.theme import save

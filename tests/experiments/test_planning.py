@@ -9,9 +9,8 @@ import pytest
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.planning.figures import drawings
-from experiments.planning.outcome import Attempt, Outcome
-from experiments.planning.report import findings, tables, verdict
+from experiments.planning.measure import Attempt, Outcome
+from experiments.planning.report import drawings, findings, tables, verdict
 from experiments.planning.settings import Settings
 from experiments.theme import save
 

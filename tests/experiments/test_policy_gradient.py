@@ -9,19 +9,18 @@ import pytest
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.policy_gradient.figures import drawings
-from experiments.policy_gradient.measure import estimated
-from experiments.policy_gradient.outcome import (
+from experiments.policy_gradient.measure import (
     Cell,
     Course,
     Estimates,
     Outcome,
+    estimated,
     jackknife_error,
     share_along,
     squared_distance,
     squared_norm,
 )
-from experiments.policy_gradient.report import tables, verdict
+from experiments.policy_gradient.report import drawings, tables, verdict
 from experiments.policy_gradient.settings import Settings
 from experiments.theme import save
 

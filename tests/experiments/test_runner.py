@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
+import experiments
 import mjxgrad as mg
-from experiments import environment, video
+from experiments import config, runner, video
 from experiments.__main__ import main
 from experiments.bias_variance import measure
 from experiments.settings import VideoSettings
@@ -28,6 +29,46 @@ angles = [0.05, 0.12]
 stiffness = [1e1, 1e5]
 num_samples = 64
 reference_samples = 500
+"""
+
+
+# A whole kind; `warnings` is a module here, and no sentence of the report.
+ONE_FILE = """\
+import warnings
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from experiments.report import Table
+from experiments.settings import RunSettings
+
+
+class Settings(RunSettings):
+    number: float
+
+
+@dataclass
+class Outcome:
+    double: float
+
+    def rows(self):
+        return [{"double": self.double}]
+
+
+def measure(settings, workspace):
+    return Outcome(float(2 * jnp.asarray(settings.number)))
+
+
+def verdict(outcome):
+    return f"Twice the number is {outcome.double}."
+
+
+def tables(outcome):
+    return [Table(["double"], [[str(outcome.double)]], "All.")]
+
+
+def drawings(outcome):
+    return {}
 """
 
 
@@ -132,7 +173,7 @@ def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch)
     (copied / "runs" / "steep" / "report.html").rename(copied / "gone.html")
     assert run(copied / "steep.toml", copied / "runs") == 2
     (copied / "gone.html").rename(copied / "runs" / "steep" / "report.html")
-    monkeypatch.setattr(environment, "ROOT", copied)
+    monkeypatch.setattr(runner, "ROOT", copied)
     assert run(copied / "steep.toml", copied / "runs") == 2
     assert (copied / "runs" / "steep" / "metrics.csv").is_file()
     assert [path.name for path in (copied / "runs").iterdir()] == ["steep"]
@@ -221,9 +262,21 @@ def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(
     small = ["num_samples=8", "reference_samples=100", "stiffness=[1e2,1e4]", "angles=[0.65]"]
     command = [sys.executable, "-m", "experiments", "run", "ball_wall", *small, "--output", str(tmp_path)]
     result = subprocess.run(
-        command, env={**os.environ, "MUJOCO_GL": "disable"}, cwd=environment.ROOT, capture_output=True, text=True
+        command, env={**os.environ, "MUJOCO_GL": "disable"}, cwd=runner.ROOT, capture_output=True, text=True
     )
     assert result.returncode == 0, result.stderr
     text = (tmp_path / "ball_wall" / "report.html").read_text()
     assert "<b>No video.</b>" in text
     assert "libosmesa6" in text
+
+
+def test_a_kind_may_be_one_file_that_imports_jax(tmp_path, monkeypatch, capsys):
+    (tmp_path / "doubling.py").write_text(ONE_FILE)
+    (tmp_path / "trial.toml").write_text('# How much is twice it?\nexperiment = "doubling"\nnumber = 0.1\n')
+    monkeypatch.setattr(config, "FOLDER", tmp_path)
+    monkeypatch.setattr(experiments, "__path__", [*experiments.__path__, str(tmp_path)])
+    assert config.kinds() == ["doubling"]
+    assert run(tmp_path / "trial.toml", tmp_path / "runs") == 0
+    # In float32 it would be 0.20000000298: float64 was chosen in time.
+    assert capsys.readouterr().out.startswith("Twice the number is 0.2.\n")
+    assert (tmp_path / "runs" / "trial" / "metrics.csv").read_text().split() == ["double", "0.2"]

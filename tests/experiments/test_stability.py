@@ -9,12 +9,11 @@ import xarray as xr
 
 from experiments.config import load_runs
 from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
-from experiments.stability.grid import PLANES, Points, points
-from experiments.stability.outcome import C_MUJOCO, Outcome, SceneOutcome
+from experiments.stability.measure import C_MUJOCO, Outcome, SceneOutcome
 from experiments.stability.program import Steps, errors_of_solves
 from experiments.stability.reference import simulate, unbalanced
 from experiments.stability.report import UNEXPLAINED, findings, load, reasons
-from experiments.stability.scenes import DEFAULTS, FIELDS, catalogue, configure
+from experiments.stability.scenes import DEFAULTS, FIELDS, PLANES, Points, catalogue, configure, points
 
 SCENES = {scene.name: scene for scene in catalogue()}
 

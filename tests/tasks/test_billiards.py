@@ -5,10 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.billiards import hard
-from experiments.billiards.measure import Outcome, Run
-from experiments.billiards.report import verdict
-from experiments.billiards.settings import MethodSettings, Settings
+from experiments.billiards import MethodSettings, Outcome, Run, Settings, hard_cost, hard_optimum, verdict
 from mjxgrad.tasks.billiards import billiards
 
 
@@ -24,7 +21,7 @@ def differentiated(task):
 
 def best_forces(num_pieces):
     """The best force is linear in time up to the collision; here its mean over each piece."""
-    _, end, speed = hard.optimum()
+    _, end, speed = hard_optimum()
     gap = np.sqrt(2) - 0.4
     edges = np.minimum(np.arange(num_pieces + 1) / num_pieces, end)
     first, slope = 6 * gap / end**2 - 2 * speed / end, 6 * speed / end**2 - 12 * gap / end**3
@@ -33,19 +30,19 @@ def best_forces(num_pieces):
 
 
 def test_the_optimum_for_hard_balls_is_the_published_one():
-    assert hard.optimum()[0] == pytest.approx(1.396542, abs=1e-6)
+    assert hard_optimum()[0] == pytest.approx(1.396542, abs=1e-6)
 
 
 def test_the_best_force_played_on_hard_balls_costs_the_optimum():
     # In pieces of 1 ms the force is right but for the piece in which the balls meet: 1e-3 of the time.
-    assert hard.cost(best_forces(1000)) == pytest.approx(hard.optimum()[0], abs=2e-3)
+    assert hard_cost(best_forces(1000)) == pytest.approx(hard_optimum()[0], abs=2e-3)
 
 
 def test_the_simulated_stroke_costs_what_hard_balls_say(task, differentiated):
     for forces in (best_forces(10), np.tile([3.2, 2.9], (10, 1))):
         simulated, _ = differentiated(jnp.asarray(forces.ravel()))
         # The contact takes 11 ms of a second and begins 27 mm early.
-        assert float(simulated) == pytest.approx(hard.cost(forces), abs=0.03)
+        assert float(simulated) == pytest.approx(hard_cost(forces), abs=0.03)
 
 
 def test_as_long_as_the_balls_do_not_touch_the_derivative_is_that_of_the_effort(task, differentiated):

@@ -186,10 +186,9 @@ def test_a_random_start_has_the_published_spread():
     np.testing.assert_allclose(draw.mean(axis=0)[1], 2.0, atol=4 * 0.2 / 4000**0.5)
 
 
-def test_the_stiff_push_differs_in_more_than_stiffness_and_has_no_reference_elsewhere():
+def test_the_stiff_push_differs_in_more_than_stiffness():
     assert setting("push_stiff").objective.task.horizon == 200
     assert setting("push_soft").objective.task.horizon == 400
-    assert settings.push(50.0).reference == {}
 
 
 def test_rates_decrease_where_the_paper_says():

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.rolling_pin.measure import Descent, Outcome
-from experiments.rolling_pin.report import tables, verdict
-from experiments.rolling_pin.settings import Settings
+from experiments.rolling_pin import Descent, Outcome, Settings, tables, verdict
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.tasks.rolling_pin import DENT, DEPTH, rolling_pin
 

@@ -1,1 +1,0 @@
-"""What leaving out costs and gains, group by group."""

@@ -1,1 +1,0 @@
-"""Bias and variance of first- and zeroth-order gradients against contact stiffness."""

@@ -1,0 +1,327 @@
+"""Optimal control of a stroke from balls that do not touch, by several methods."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from numpy.polynomial import Polynomial
+from pydantic import Field, model_validator
+from scipy.optimize import minimize
+
+import mjxgrad as mg
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
+from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
+from experiments.video import film
+from experiments.words import capitalised, joined
+from experiments.workspace import Workspace
+from mjxgrad.dynamics import Smoothing
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks import scene_path
+from mjxgrad.tasks.billiards import Billiards, billiards
+
+
+class MethodSettings(SettingsTable):
+    """One way to descend, from one start."""
+
+    label: str
+    """In legends and tables."""
+    estimator: Literal["first_order", "zeroth_order", "alpha_order"] = "first_order"
+    """Of `mjxgrad.estimators`."""
+    gradient: Literal["discrete", "event"] = "discrete"
+    """Derivative of the steps."""
+    start: Positive = 1.3
+    """Constant force of the start, in N along each axis; below 1.43 the balls do not touch."""
+    stddev: Positive = 1e-6
+    """Of the noise on each piece of the force at the start, in N; the default is none to speak of."""
+    num_samples: Annotated[int, Field(ge=2)] = 2
+    """Rollouts per step."""
+    margin: Positive | None = None
+    """By what the contact begins earlier at the start, in m."""
+    length: Positive | None = None
+    """Of the noise on the distance that the solver averages over at the start, in m."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "MethodSettings":
+        if self.margin is not None and self.length is not None:
+            raise ValueError("margin and length must not be set both")
+        return self
+
+
+class Settings(RunSettings):
+    """Cost against steps of several descents on the same stroke."""
+
+    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
+    """In the order of the legend."""
+    num_steps: Annotated[int, Field(ge=10)] = 80
+    """Of each descent."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Settings":
+        labels = [method.label for method in self.methods]
+        if len(set(labels)) < len(labels):
+            raise ValueError("labels of methods must differ")
+        return self
+
+
+# The same stroke with hard balls: closed forms that share no code with the simulation. A driven ball from rest, accelerated by u,
+# has to cover the vector d in the time s and arrive at velocity v. The least ∫|u|² for that is 12|d|²/s³ − 12 d·v/s² + 4|v|²/s
+# (a force linear in time). Then both balls, of equal mass, exchange what is along the line of centres: the collision is elastic.
+DRIVEN, KNOCKED = np.array([-2.0, -2.0]), np.array([-1.0, -1.0])
+CONTACT = 0.4  # m, between the centres
+EFFORT = 0.1
+
+
+@functools.cache
+def hard_optimum() -> tuple[float, float, float]:
+    """Find the best stroke: its cost (m²), the time of the collision (s) and the speed at it (m/s)."""
+    gap = np.linalg.norm(KNOCKED - DRIVEN) - CONTACT
+    miss = np.linalg.norm(KNOCKED)
+
+    def cost(x):
+        time, speed = x
+        effort = 12 * gap**2 / time**3 - 12 * gap * speed / time**2 + 4 * speed**2 / time
+        return (miss - (1 - time) * speed) ** 2 + EFFORT * effort
+
+    best = minimize(cost, [0.7, 2.5], method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14})
+    return float(best.fun), float(best.x[0]), float(best.x[1])
+
+
+def hard_cost(forces: np.ndarray) -> float:
+    """Play forces (pieces, 2), in N and constant over pieces of the second, on hard balls; gives the cost (m²)."""
+    forces = np.asarray(forces, float)
+    piece = 1 / len(forces)
+    position, velocity = DRIVEN.copy(), np.zeros(2)
+    end = KNOCKED
+    for i, force in enumerate(forces):
+        way = [Polynomial(along) for along in zip(position - KNOCKED, velocity, force / 2, strict=True)]
+        roots = (way[0] ** 2 + way[1] ** 2 - CONTACT**2).roots()
+        times = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real >= 0) & (roots.real < piece)]
+        if times.size:
+            time = times.min()
+            normal = -np.array([along(time) for along in way]) / CONTACT
+            end = KNOCKED + (1 - i * piece - time) * ((velocity + time * force) @ normal) * normal
+            break
+        position, velocity = position + piece * velocity + piece**2 / 2 * force, velocity + piece * force
+    return float(end @ end + EFFORT * piece * np.sum(forces**2))
+
+
+IDLE = 2.0  # m², the cost of standing still
+_LEARNING_RATE = 0.1  # of Adam, in N; it falls along a cosine to a twentieth
+_FINAL_SCALE = 0.02  # left at the last step of noise, margin or length; margin and length are then taken away
+_EVALUATIONS = 20  # how often along a descent the true cost is measured
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One descent; its costs are in m², without noise and with the contact as it is."""
+
+    method: MethodSettings
+    steps: np.ndarray  # at which the cost was measured
+    cost: np.ndarray
+    final_cost: float  # of the best forces that were measured
+    hard_cost: float  # of the same forces with balls that collide in no time, by another program
+    qpos: np.ndarray  # (states, 4) of the stroke with these forces
+    touches_at_start: bool
+    num_rollouts: int
+    seconds: float
+    compile_seconds: float
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether hard balls, too, are within one per cent of the best."""
+        return max(self.final_cost, self.hard_cost) < 1.01 * hard_optimum()[0]
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it ends within one per cent of standing still, or above."""
+        return self.final_cost > 0.99 * IDLE
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """All numbers."""
+
+    settings: Settings
+    runs: tuple[Run, ...]  # one per method
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give the cost along each descent, for metrics.csv."""
+        columns = ("final_cost", "hard_cost", "touches_at_start", "num_rollouts", "seconds", "compile_seconds")
+        return [
+            {"method": run.method.label, "step": int(step), "cost": float(cost)}
+            | {name: getattr(run, name) for name in columns}
+            for run in self.runs
+            for step, cost in zip(run.steps, run.cost, strict=True)
+        ]
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Descend by every method."""
+    task = billiards()
+    workspace.check(task.scene)
+    play = jax.jit(lambda params: task.trajectory(params).qpos)
+    runs = []
+    with workspace.stage("descents", "methods", len(settings.methods)) as advance_to:
+        for i, method in enumerate(settings.methods):
+            key = jax.random.fold_in(jax.random.key(settings.seed), i)
+            runs.append(_run(method, task, settings, key, play))
+            advance_to(len(runs))
+    return Outcome(settings, tuple(runs))
+
+
+def _run(
+    method: MethodSettings, task: Billiards, settings: Settings, key: Array, play: Callable[[Array], Array]
+) -> Run:
+    every = -(-settings.num_steps // _EVALUATIONS)
+    start = task.start(method.start)
+    rate = optax.cosine_decay_schedule(_LEARNING_RATE, settings.num_steps, 0.05)
+    decay = optax.exponential_decay(1.0, settings.num_steps, _FINAL_SCALE)
+    result = mg.optimise(
+        _objective(method, task.with_gradient(method.gradient), settings),
+        start,
+        key,
+        estimator=functools.partial(getattr(mg.estimators, method.estimator), num_samples=method.num_samples),
+        optimiser=optax.adam(rate),
+        num_steps=settings.num_steps,
+        annealing=decay,
+        evaluate=task.cost,
+        evaluate_every=every,
+    )
+    # Where nothing is felt the descent stops early.
+    done = int(result.num_steps)
+    steps = np.arange(0, done, every)
+    return Run(
+        method=method,
+        steps=np.append(steps, done),
+        cost=np.append(np.asarray(result.history.noise_free_cost)[steps], result.final_cost),
+        final_cost=float(result.best_cost),
+        hard_cost=hard_cost(np.asarray(result.best_params).reshape(-1, 2)),
+        qpos=np.asarray(play(result.best_params)),
+        touches_at_start=bool(np.any(np.asarray(play(start))[-1, 2:] != 0)),
+        num_rollouts=int(result.num_rollouts),
+        seconds=result.seconds,
+        compile_seconds=result.compile_seconds,
+    )
+
+
+def _objective(
+    method: MethodSettings, task: Billiards, settings: Settings
+) -> Callable[[Float[Array, ""]], mg.Objective]:
+    """From the scale of the smoothing to what is minimised at it."""
+    own = task.scene.model.pair_margin[0]
+    # In the last tenth of the steps the contact is as it is.
+    last = _FINAL_SCALE**0.9
+
+    def objective(scale: Float[Array, ""]) -> mg.Objective:
+        smoothed = task
+        if method.margin is not None:
+            smoothed = task.with_margin(own + jnp.where(scale > last, method.margin * scale, 0.0))
+        if method.length is not None:
+            smoothed = task.with_smoothing(Smoothing(jnp.maximum(method.length * scale, 1e-6)))
+        return smoothed.objective(method.stddev).with_stddev(method.stddev * scale)
+
+    return objective
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say what solves the stroke from balls that do not touch, and what does not."""
+    apart = [run for run in outcome.runs if not run.touches_at_start]
+    solved, stuck = [run for run in apart if run.is_solved], [run for run in apart if run.is_stuck]
+    between = [run for run in apart if not run.is_solved and not run.is_stuck]
+    sentences = []
+    if solved:
+        sentences.append(
+            f"From balls that do not touch, {_listed(solved)} reach the optimum of {hard_optimum()[0]:.4f} to one per cent, "
+            "also when hard balls play their forces."
+        )
+    if rest := [
+        *([f"no progress beyond standing still (cost {IDLE:g}): {_listed(stuck)}"] if stuck else []),
+        *([f"in between: {_listed(between)}"] if between else []),
+    ]:
+        sentences.append(capitalised("; ".join(rest)) + ".")
+    touching = [run for run in outcome.runs if run.touches_at_start]
+    if touching:
+        sentences.append(f"From a start that touches: {'; '.join(map(_ending, touching))}.")
+    return " ".join(sentences)
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say what costs of soft and hard balls mean beside each other."""
+    best, time, speed = hard_optimum()
+    return [
+        f"Hard balls collide in no time (another program: closed forms and root finding); their optimum over all forces is "
+        f"{best:.6f}, as published, with a hit after {time:.3f} s at {speed:.2f} m/s. The simulated cost may lie below that by "
+        "half a per cent: a soft collision takes time, in which the driven ball goes on pushing."
+    ]
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all descents."""
+    rows = []
+    for run in outcome.runs:
+        costs = [f"{cost:.4f}" for cost in (run.cost[0], run.final_cost, run.hard_cost)]
+        seconds = [f"{time:.1f}" for time in (run.seconds, run.compile_seconds)]
+        touches = "yes" if run.touches_at_start else "no"
+        rows.append([run.method.label, touches, *costs, str(run.num_rollouts), *seconds])
+    costs = ("cost at the start", "best cost", "with hard balls")
+    columns = ("method", "touches at the start", *costs, "rollouts", "s", "s compiling")
+    solved = frozenset((i, 3) for i, run in enumerate(outcome.runs) if run.is_solved)
+    caption = "Costs in m², without noise; bold where the stroke is solved to one per cent."
+    return [Table(columns, rows, caption, solved)]
+
+
+def _listed(runs: list[Run]) -> str:
+    return joined(f"{run.method.label} ({run.final_cost:.3f})" for run in runs)
+
+
+def _ending(run: Run) -> str:
+    what = "solved" if run.is_solved else "no progress" if run.is_stuck else "in between"
+    return f"{run.method.label}: {what} ({run.final_cost:.3f})"
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"cost": cost}
+
+
+def cost(outcome: Outcome):
+    """True cost against steps."""
+    figure, axes = subplots(1, 1, height=4.4)
+    axis = axes[0, 0]
+    for run, look in zip(outcome.runs, looks(run.method.label for run in outcome.runs), strict=True):
+        style = (0, (4, 2)) if run.touches_at_start else "-"
+        axis.plot(run.steps, run.cost, ls=style, ms=4, label=run.method.label, **look)
+    for level in (IDLE, hard_optimum()[0]):
+        axis.axhline(level, color=MUTED, lw=1.0, ls=(0, (1, 2)), zorder=0)
+    axis.set(xlabel="step", ylabel="cost, m²", ylim=(1.3, 2.5))
+    legend_below(figure, axis, 3)
+    caption = (
+        "Cost without noise and with the contact as it is, along each descent. Solid: the balls do not touch at the start; "
+        "dashed: they do. Dotted: standing still, and the optimum for hard balls. Descents that coincide cover each other."
+    )
+    return figure, "Cost against steps", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw a stroke that stands still and the best one, and give the file and its caption."""
+    mj_model = load_scene(scene_path("billiards")).mj_model
+    # Without a GPU fine shadows double the time of a frame, and coarse ones speckle the table.
+    mj_model.light_castshadow[:] = False
+    apart = [run for run in outcome.runs if not run.touches_at_start] or list(outcome.runs)
+    chosen = [max(apart, key=lambda run: run.final_cost), min(apart, key=lambda run: run.final_cost)]
+    return film(
+        workspace,
+        [(mj_model, run.qpos) for run in chosen],
+        VideoSettings(speed=0.5, width=400, height=400),
+        camera="above",
+        caption="The strokes that two descents end with, at 0.5 of real speed; the dark disc is the target.",
+        titles=[f"{run.method.label}: {run.final_cost:.3f}" for run in chosen],
+        columns=2,
+    )

@@ -1,1 +1,0 @@
-"""Optimisation of the published tasks by several methods, at equal rollouts."""

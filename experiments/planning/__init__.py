@@ -1,1 +1,0 @@
-"""Plans through contact on smoothed linear models."""

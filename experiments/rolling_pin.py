@@ -1,0 +1,315 @@
+"""The rolling pin: ways to find a contact that is not there yet."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from pydantic import Field
+
+import mjxgrad as mg
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
+from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
+from experiments.video import film, shown_speed, with_coarse_shadows
+from experiments.words import joined, quantity
+from experiments.workspace import Workspace
+from mjxgrad.dynamics import Smoothing
+from mjxgrad.tasks.rolling_pin import STIFFNESS, RollingPin, rolling_pin
+
+
+class RemedySettings(SettingsTable):
+    """How far each remedy reaches at first; all but proximity shrink on the way."""
+
+    proximity: Positive = 0.3
+    """Weight of the mean square of the distance to the bed, in distances at the start."""
+    radius: Positive = 0.03
+    """By which the pin is larger (m)."""
+    margin: Positive = 0.03
+    """At which force begins (m)."""
+    rest_acceleration: Positive = 50.0
+    """Under which a margin changes no depth (m/s²): about 8 N on a pillar of the bed."""
+    length: Positive = 0.015
+    """Standard deviation of the noise that kernels average over (m)."""
+    last: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """What is left of radius, margin and length in the end, as a share."""
+
+
+class Settings(RunSettings):
+    """A dent in a bed that the pin does not touch, by descent along different derivatives."""
+
+    num_steps: Annotated[int, Field(ge=2)] = 60
+    """Of descent."""
+    num_samples: Annotated[int, Field(ge=2)] = 2
+    """Rollouts per step with derivatives."""
+    learning_rate: Positive = 0.03
+    """Of Adam."""
+    stddev: Positive = 0.01
+    """Of the noise on the controls of the remedies: so little that no sample finds the bed by it (10 N)."""
+    search_stddev: Positive = 0.3
+    """Of the noise by which zeroth order and α-order search, white in time (10 N)."""
+    search_samples: Annotated[int, Field(ge=4)] = 16
+    """Rollouts per step of these."""
+    kernel: Literal["gaussian", "logistic", "log_barrier"] = "gaussian"
+    """Of the smoothing."""
+    solved_below: Positive = 0.1
+    """True cost that counts as solved; the untouched bed has 1."""
+    remedies: RemedySettings = RemedySettings()
+    """Their reach."""
+    video: VideoSettings | None = None
+    """Without it, none is made."""
+
+
+# A way to see the bed, as numbers alone, so that several are one batch of one program: `proximity`, weight of the distance in
+# the cost; `extra` radius of the pin, `margin` and `length` of the kernel at first (m); `stddev` of the noise on the controls.
+Variant = dict[str, Float[Array, "..."]]
+# Mode of the kernel (None has none), estimator, rollouts per step, and by label the variants that share these.
+_Program = tuple[str | None, Callable, int, dict[str, Variant]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Descent:
+    """One descent."""
+
+    label: str  # of the derivative it went along
+    params: Float[np.ndarray, " dim"]  # where it ended
+    costs: Float[np.ndarray, " points"]  # true cost, without noise, before every step and in the end
+    num_samples: int  # rollouts per step
+    num_skipped: int  # steps without a finite estimate
+    heights: Float[np.ndarray, " pillars"]  # in the end, under the true motion (m)
+
+    def steps_to(self, cost: float) -> int | None:
+        """Give the first step whose result is below a cost, from which on it stays there."""
+        above = np.flatnonzero(~(self.costs < cost))
+        first = 0 if not above.size else int(above[-1]) + 1
+        return first if first < len(self.costs) else None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """The numbers."""
+
+    settings: Settings
+    descents: list[Descent]
+    start_gradient: float  # largest element of the gradient of the true cost at the start
+    task: RollingPin
+
+    def is_solved(self, descent: Descent) -> bool:
+        """Say whether a descent ends below the cost that counts as solved."""
+        return bool(descent.costs[-1] < self.settings.solved_below)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give the true cost of every step of every descent, for metrics.csv."""
+        return [
+            {"method": one.label, "step": step, "rollouts": step * one.num_samples, "true_cost": float(cost)}
+            for one in self.descents
+            for step, cost in enumerate(one.costs)
+        ]
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Descend in every way from controls of zero, and judge each by the true cost."""
+    task = rolling_pin()
+    workspace.check(task.scene)
+    key = jax.random.key(settings.seed)
+    slope = jax.jit(jax.grad(task.true_cost))(jnp.zeros(task.horizon * task.num_controls))
+    programs, descents = _programs(settings), []
+    with workspace.stage("descent", "programs", len(programs)) as advance_to:
+        for done, program in enumerate(programs):
+            descents += _descend(task, program, settings, jax.random.fold_in(key, done))
+            advance_to(done + 1)
+    return Outcome(settings, descents, float(jnp.abs(slope).max()), task)
+
+
+@eqx.filter_jit
+def positions(task: RollingPin, params: Float[Array, " dim"]) -> Float[Array, "states nq"]:
+    """Move the pin by flattened controls, under the true motion."""
+    return mg.rollout(task.scene, task.state, params.reshape(task.horizon, task.num_controls)).qpos
+
+
+def _programs(settings: Settings) -> list[_Program]:
+    few, many, reach = settings.num_samples, settings.search_samples, settings.remedies
+
+    def variant(**parts: float) -> Variant:
+        # Lengths must be positive even where no kernel asks for them.
+        given = {"proximity": 0.0, "extra": 0.0, "margin": 0.0, "length": 1.0, "stddev": settings.stddev} | parts
+        return {name: jnp.asarray(value, float) for name, value in given.items()}
+
+    seen = {
+        "first order": variant(),
+        "contact loss": variant(proximity=reach.proximity),
+        "larger pin": variant(extra=reach.radius),
+        "margin, height kept": variant(margin=reach.margin),
+    }
+    kernel, search = variant(length=reach.length), variant(stddev=settings.search_stddev)
+    return [
+        (None, mg.estimators.first_order, few, seen),
+        ("forward", mg.estimators.first_order, few, {"kernel, forward": kernel}),
+        ("backward", mg.estimators.first_order, few, {"kernel, backward only": kernel}),
+        (None, mg.estimators.zeroth_order, many, {"zeroth order": search}),
+        (None, mg.estimators.alpha_order, many, {"α-order": search}),
+    ]
+
+
+def _descend(task: RollingPin, program: _Program, settings: Settings, key: Array) -> list[Descent]:
+    """Descend for several variants at once, with what reaches out shrinking as it goes."""
+    mode, estimator, num_samples, variants = program
+    shrink = optax.exponential_decay(1.0, settings.num_steps, settings.remedies.last)
+    start = jnp.zeros(task.horizon * task.num_controls)
+
+    @eqx.filter_jit
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def run(variant: Variant, key: Array) -> tuple[Array, Array]:
+        descent = mg.estimated_gradient(
+            lambda scale: _seen(task, variant, scale, mode, settings).objective(variant["stddev"]),
+            key,
+            estimator=functools.partial(estimator, num_samples=num_samples),
+            optimiser=optax.adam(settings.learning_rate),
+            annealing=shrink,
+        )
+
+        def step(carry, _):
+            params, state = carry
+            updates, state = descent.update(jnp.zeros_like(params), state, params)
+            return (params + updates, state), params
+
+        (last, state), visited = jax.lax.scan(step, (start, descent.init(start)), length=settings.num_steps)
+        return jnp.concatenate([visited, last[None]]), state.num_skipped
+
+    visited, skipped = run(jax.tree.map(lambda *leaves: jnp.stack(leaves), *variants.values()), key)
+    return [
+        Descent(
+            label=label,
+            params=np.asarray(visited[i, -1]),
+            costs=np.asarray(_judged(task, visited[i])),
+            num_samples=num_samples,
+            num_skipped=int(skipped[i]),
+            heights=np.asarray(positions(task, visited[i, -1])[-1, 2:]),
+        )
+        for i, label in enumerate(variants)
+    ]
+
+
+@eqx.filter_jit
+def _judged(task: RollingPin, visited: Float[Array, "points dim"]) -> Float[Array, " points"]:
+    return jax.vmap(task.true_cost)(visited)
+
+
+def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, settings: Settings) -> RollingPin:
+    """Give the task as a variant sees it."""
+    task = task.with_proximity(variant["proximity"]).enlarged(scale * variant["extra"])
+    # Without a margin this is the contact of the scene.
+    rest = settings.remedies.rest_acceleration
+    task = task.with_softness(mg.Softness(STIFFNESS, 1.0, margin=scale * variant["margin"], rest_acceleration=rest))
+    return task.with_smoothing(None if mode is None else Smoothing(scale * variant["length"], settings.kernel, mode))
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say what plain first order did, and what solved the task."""
+    settings = outcome.settings
+    plain = next(one for one in outcome.descents if one.label == "first order")
+    has_moved = np.ptp(plain.costs) > 1e-6 * plain.costs[0]
+    if outcome.start_gradient == 0 and not has_moved:
+        told = (
+            "First order stays at the start: its gradient is zero, exactly, and after "
+            f"{settings.num_steps} steps the bed is untouched."
+        )
+    else:
+        told = (
+            f"First order begins with a gradient of {quantity(outcome.start_gradient)} and ends at a true cost of "
+            f"{quantity(plain.costs[-1])}."
+        )
+    solved = sorted((one for one in outcome.descents if outcome.is_solved(one)), key=lambda one: one.costs[-1])
+    failed = [one for one in outcome.descents if not outcome.is_solved(one) and one is not plain]
+    below = f"with a true cost below {settings.solved_below:g} of the untouched bed's 1"
+    return " ".join(
+        [
+            told,
+            *([f"Solved, {below}, by {_listed(solved)}."] if solved else []),
+            *([f"Not solved by {_listed(failed)}."] if failed else []),
+        ]
+    )
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say how many steps had no estimate."""
+    lost = sum(one.num_skipped for one in outcome.descents)
+    return [f"{lost} steps were left out, because their estimate was not finite."] if lost else []
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all descents."""
+    target, below = np.asarray(outcome.task.target), f"{outcome.settings.solved_below:g}"
+    rows = []
+    for one in outcome.descents:
+        steps = one.steps_to(outcome.settings.solved_below)
+        reached = ["never", ""] if steps is None else [str(steps), str(steps * one.num_samples)]
+        costs = [quantity(float(cost)) for cost in (one.costs[-1], one.costs.min())]
+        worst = f"{1e3 * abs(one.heights - target).max():.1f}"
+        rows.append([one.label, str(one.num_samples), *costs, *reached, worst])
+    columns = (
+        "descent along", "rollouts a step", "final true cost", "least true cost", f"steps to stay below {below}",
+        "rollouts for that", "worst pillar (mm)",
+    )  # fmt: skip
+    caption = (
+        "The true cost is that of the scene as it is, without noise, whatever the descent saw; 1 is the untouched bed. "
+        f"In bold what ends below {below}. The last column is the largest distance of a pillar from its wanted height "
+        "in the end."
+    )
+    solved = frozenset((row, 2) for row, one in enumerate(outcome.descents) if outcome.is_solved(one))
+    return [Table(columns, rows, caption, solved)]
+
+
+def _listed(descents: list[Descent]) -> str:
+    return joined(f"{one.label} ({quantity(one.costs[-1])})" for one in descents)
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"descent": descent}
+
+
+def descent(outcome: Outcome):
+    """True cost against steps and against rollouts."""
+    figure, axes = subplots(1, 2, height=4.4, sharey=True)
+    left, right = axes[0]
+    for one, look in zip(outcome.descents, looks(one.label for one in outcome.descents), strict=True):
+        steps = np.arange(len(one.costs))
+        look |= {"ms": 4, "markevery": max(1, len(steps) // 8)}
+        left.plot(steps, one.costs, label=one.label, **look)
+        # The first point has cost no rollout, and a logarithm has no place for it.
+        right.plot(steps[1:] * one.num_samples, one.costs[1:], **look)
+    for axis in (left, right):
+        axis.axhline(outcome.settings.solved_below, color=MUTED, lw=0.8, ls=(0, (2, 3)))
+        axis.set_yscale("log")
+    left.set(title="Against steps", xlabel="step", ylabel="true cost")
+    right.set(title="Against rollouts", xlabel="rollouts", xscale="log")
+    legend_below(figure, left, 4)
+    reach = outcome.settings.remedies
+    caption = (
+        "True cost against steps, left, and against rollouts, right: every descent is judged by the same scene, without noise "
+        f"and without its remedy. The dotted line is what counts as solved. At first the pin is {1e3 * reach.radius:g} mm "
+        f"larger, the margin {1e3 * reach.margin:g} mm wide, the kernel {1e3 * reach.length:g} mm long; all shrink to "
+        f"{reach.last:.0%} on the way, so that what is seen becomes what is."
+    )
+    return figure, "True cost of each descent", caption
+
+
+def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+    """Draw the motion of the best controls, and give the file and its caption; nothing if none was asked for."""
+    wanted = outcome.settings.video
+    if wanted is None:
+        return None, ""
+    best = min(outcome.descents, key=lambda one: one.costs[-1])
+    qpos = np.asarray(positions(outcome.task, jnp.asarray(best.params)))
+    caption = (
+        f"The motion that {best.label} ends with, {shown_speed(wanted.speed)}; the green line is the wanted depth."
+    )
+    mj_model = with_coarse_shadows(outcome.task.scene.mj_model)
+    return film(workspace, [(mj_model, qpos)], wanted, camera="side", caption=caption)

@@ -1,1 +1,0 @@
-"""The rolling pin: ways to find a contact that is not there yet."""

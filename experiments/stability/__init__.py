@@ -1,1 +1,0 @@
-"""Where the step is stable, and where its gradient is."""

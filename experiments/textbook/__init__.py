@@ -1,1 +1,0 @@
-"""Estimators on costs whose smoothed gradient is known in closed form."""
