@@ -1,10 +1,11 @@
-"""The answer of the experiment on the thrown cube in words, computed from its numbers."""
+"""The answer of the experiment on the thrown cube: words, tables, pictures."""
 
 import numpy as np
 
 from experiments.cube_toss.measure import CONTACTS, METHODS, PUBLISHED_DERIVATIVE, Course, Outcome, Point
 from experiments.report import Table
-from experiments.words import joined, percent, quantity
+from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, ZEROTH, Drawings, legend_below, power, subplots
+from experiments.words import capitalised, joined, percent, quantity
 
 # Share of the derivative that the verdict asks for.
 TARGET = 0.02
@@ -84,3 +85,80 @@ def tables(outcome: Outcome) -> list[Table]:
 
 def _percent(share: float) -> str:
     return percent(share).replace("-", "−") if np.isfinite(share) else "failed"
+
+
+_LOOKS = {
+    "discrete": {"color": FIRST, "marker": "o"},
+    "event": {"color": ZEROTH, "marker": "s"},
+    "continuous": {"color": ONSET, "marker": "D"},
+    "substeps": {"color": DEFAULT, "marker": "^"},
+    "adaptive": {"color": "#e69f00", "marker": "v"},
+    "quotient": {"color": "#56b4e9", "marker": "P"},
+}
+# DiffMJX's own table (one run each, other hardware): name, relative error to its reference, seconds.
+DIFFMJX = (("Euler 1 ms", 17.77, 3.29), ("Euler 30 µs", 0.0277, 102.5), ("Bosh3 1e-5", 0.0187, 9.20))
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    return {"error": error, "bias": bias}
+
+
+def error(outcome: Outcome):
+    """Error of a single derivative against processor time, one panel per contact."""
+    figure, axes = subplots(1, len(outcome.courses), height=4.6, sharey=True)
+    for axis, course in zip(axes[0], outcome.courses, strict=True):
+        for method, label in METHODS.items():
+            points = _finite(course, method)
+            errors = [course.error(point) for point in points]
+            axis.plot([point.seconds for point in points], errors, ms=5, lw=1.3, label=label, **_LOOKS[method])
+        for name, value, seconds in DIFFMJX if course.contact == "published" else ():
+            axis.plot(seconds, value, "x", color=MUTED, ms=6, mew=1.5)
+            axis.annotate(
+                f"DiffMJX, {name}", (seconds, value), (-4, 6),
+                textcoords="offset points", fontsize=8, color=MUTED, ha="right",
+            )  # fmt: skip
+        axis.axhline(TARGET, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
+        axis.set(xscale="log", yscale="log", xlabel="processor time of one derivative, s")
+    axes[0, 0].set_ylabel("relative error of one derivative")
+    caption = (
+        "Root-mean-square error of a single derivative over four throws, as a share of the derivative, against its processor "
+        "time without compilation. Along a line the time step or the tolerance gets smaller to the right. Grey: what DiffMJX "
+        "published for its own simulator, on other hardware and against its own reference. Dotted: the error that the "
+        "verdict asks for."
+    )
+    return _finished(figure, axes[0], outcome), "Error against time", caption
+
+
+def bias(outcome: Outcome):
+    """Mean and single errors of the methods of fixed step against the step."""
+    figure, axes = subplots(1, len(outcome.courses), height=4.0, sharey=True)
+    for axis, course in zip(axes[0], outcome.courses, strict=True):
+        axis.axhline(0, color=MUTED, lw=0.8)
+        for method in ("discrete", "event", "continuous", "substeps"):
+            points = _finite(course, method)
+            steps, errors = [point.setting for point in points], np.array([course.errors(point) for point in points])
+            axis.plot(steps, errors, color=_LOOKS[method]["color"], lw=0.5, alpha=0.5)
+            axis.plot(steps, errors.mean(axis=1), ms=5, label=METHODS[method], **_LOOKS[method])
+        axis.set(xscale="log", xlabel="time step, s")
+        axis.set_yscale("symlog", linthresh=0.01)
+        ticks = [point.setting for point in course.of("discrete")]
+        axis.set_xticks(ticks, [power(tick) for tick in ticks])
+        axis.minorticks_off()
+    axes[0, 0].set_ylabel("error of the derivative, relative")
+    caption = (
+        "Mean error over the throws (thick), and single throws (thin). A mean over four throws is what noise on the throw "
+        "would leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
+    )
+    return _finished(figure, axes[0], outcome), "Bias and spread", caption
+
+
+def _finite(course: Course, method: str) -> list[Point]:
+    return [point for point in reversed(course.of(method)) if np.isfinite(course.error(point))]
+
+
+def _finished(figure, axes: np.ndarray, outcome: Outcome):
+    for axis, course in zip(axes, outcome.courses, strict=True):
+        axis.set_title(capitalised(CONTACTS[course.contact]))
+    legend_below(figure, axes[0], 3)
+    return figure

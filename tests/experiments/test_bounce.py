@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.bounce.figures import drawings
 from experiments.bounce.measure import Outcome, grid_of
-from experiments.bounce.report import findings, tables, verdict
+from experiments.bounce.report import drawings, findings, tables, verdict
 from experiments.bounce.settings import Settings
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError

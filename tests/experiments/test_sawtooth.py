@@ -7,9 +7,8 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.sawtooth.figures import drawings
 from experiments.sawtooth.measure import Outcome, course
-from experiments.sawtooth.report import verdict
+from experiments.sawtooth.report import drawings, verdict
 from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases
 

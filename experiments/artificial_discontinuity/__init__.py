@@ -1,1 +1,0 @@
-"""Jumps of force that come from the geometry of contact and not from the motion."""
