@@ -106,7 +106,6 @@ class Push(DynamicsTask):
         return jnp.array([0.0, REACH, 0.0, 0.0])
 
     def advance(self, state: Float[Array, " 4"], control: Float[Array, " 1"]) -> Float[Array, " 4"]:
-        """Return the next state."""
         positions, velocities = state[:2], state[2:]
         force = self.stiffness * jnp.maximum(REACH - (positions[1] - positions[0]), 0.0)
         accelerations = jnp.stack([control[0] - force, force]) / MASS
@@ -140,7 +139,6 @@ class Friction(DynamicsTask):
         return jnp.zeros(4)
 
     def advance(self, state: Float[Array, " 4"], control: Float[Array, " 1"]) -> Float[Array, " 4"]:
-        """Return the next state."""
         positions, velocities = state[:2], state[2:]
         is_touching = jnp.abs(positions[1] - positions[0]) < OVERLAP
         drag = jnp.where(is_touching, jnp.clip(SLOPE * (velocities[0] - velocities[1]), -LIMIT, LIMIT), 0.0)
@@ -159,17 +157,9 @@ _START_STDDEV = 0.001
 
 
 class LQR(DynamicsTask):
-    """The state is a vector x, the control a vector u of the same size, and x' = x + u.
+    """The state is a vector x, the control a vector u of the same size, and x' = x + u."""
 
-    Attributes:
-        cost: quadratic.
-        num_controls: size of both.
-        horizon: number of steps.
-    """
-
-    cost: QuadraticCost
     num_controls: int = eqx.field(static=True)
-    horizon: int = eqx.field(static=True)
 
     def nominal_start(self) -> Float[Array, " states"]:
         """Return all ones."""
@@ -180,7 +170,6 @@ class LQR(DynamicsTask):
         return self.nominal_start() + _START_STDDEV * jax.random.normal(key, (self.num_controls,))
 
     def advance(self, state: Float[Array, " states"], control: Float[Array, " states"]) -> Float[Array, " states"]:
-        """Return the next state."""
         return state + control
 
 
@@ -206,7 +195,6 @@ class MotionPlanning(DynamicsTask):
         return jnp.zeros(2)
 
     def advance(self, state: Float[Array, " 2"], control: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        """Return the next position."""
         moved = state + _POINT_TIMESTEP * control
         squared_distances = ((moved - jnp.array(CENTRES)) ** 2).sum(axis=1)
         is_blocked = (squared_distances < jnp.array(RADII) ** 2).any()
@@ -251,7 +239,6 @@ class Tennis(DynamicsTask):
         return jnp.concatenate([position, velocity, pad])
 
     def advance(self, state: Float[Array, " 7"], control: Float[Array, " 3"]) -> Float[Array, " 7"]:
-        """Return the next state."""
         position, velocity, pad = state[:2], state[2:4], state[4:]
         moved, moved_pad = position + _PAD_TIMESTEP * velocity, pad + _PAD_TIMESTEP * control
         cosine, sine = jnp.cos(moved_pad[2]), jnp.sin(moved_pad[2])
