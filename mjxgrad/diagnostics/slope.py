@@ -31,8 +31,6 @@ _FEWEST_PHASES = 32
 _NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
-# Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
-_IRREGULAR = 0.5
 _ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
 
 
@@ -89,11 +87,6 @@ class SlopeComparison(eqx.Module):
         rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
         size = np.abs(rest).max(axis=0)
         return np.asarray(np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale)
-
-    @property
-    def is_regular(self) -> Bool[np.ndarray, "*outcome"]:
-        """Where `irregularity` is at most a half; elsewhere the interval spans too few teeth, or the motion is chaotic."""
-        return np.asarray(self.irregularity <= _IRREGULAR)
 
     @property
     def error(self) -> Float[np.ndarray, "gradients *outcome"]:

@@ -134,18 +134,12 @@ def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float
         Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
         26, 1934.
     """
-    return np.array(_binomial_test(count, total).proportion_ci(checked(confidence)))
+    return np.array(stats.binomtest(count, total).proportion_ci(checked(confidence)))
 
 
 def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
     """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %."""
-    return float(_binomial_test(count, total, "less").proportion_ci(checked(confidence)).high)
-
-
-def _binomial_test(count: int, total: int, alternative: str = "two-sided"):
-    if not 0 <= count <= total or total < 1:
-        raise ValueError(f"count must be between 0 and total, which is at least 1, got {count} of {total}")
-    return stats.binomtest(count, total, alternative=alternative)
+    return float(stats.binomtest(count, total, alternative="less").proportion_ci(checked(confidence)).high)
 
 
 def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
@@ -157,10 +151,7 @@ def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confiden
 
 
 def bootstrap_variance_interval(
-    samples: Float[np.ndarray, "samples dim"],
-    confidence: float = 0.95,
-    *,
-    num_resamples: int = 1000,
+    samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> Float[np.ndarray, " 2"]:
     """Give the percentile bootstrap interval of a total variance, the trace of the covariance.
 
@@ -198,10 +189,7 @@ class VarianceInterval(eqx.Module):
 
 
 def variance_interval(
-    samples: Float[np.ndarray, "samples dim"],
-    confidence: float = 0.95,
-    *,
-    num_resamples: int = 1000,
+    samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> VarianceInterval:
     """Give the interval of a total variance by the method that the samples deserve, and say which.
 

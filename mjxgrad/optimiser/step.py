@@ -11,12 +11,11 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad.estimators import GradientEstimate
+from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, flattened, of_vector
 from mjxgrad.optimiser.annealing import Annealing, as_annealing
 from mjxgrad.optimiser.result import Record
 
-Estimator = Callable[[Objective, Float[Array, " dim"], PRNGKeyArray], GradientEstimate]
 AnnealedObjective = Callable[[Float[Array, ""]], Objective]
 
 
