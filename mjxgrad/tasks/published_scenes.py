@@ -104,18 +104,12 @@ def motion_planning(*, horizon: int = 100) -> ActionTask:
 
 
 class Starts(eqx.Module):
-    """Draws the published starts: a ball on its way to the origin, and a pad near it.
-
-    Attributes:
-        like: a state of the scene.
-        task: the one that has the distribution.
-    """
+    """Draws the published starts of a task, as states like one of the scene."""
 
     like: State
     task: published.Tennis
 
     def __call__(self, key: PRNGKeyArray) -> State:
-        """Draw a state."""
         return self.state(self.task.sample_start(key))
 
     def state(self, vector: Float[Array, " 7"]) -> State:
