@@ -91,10 +91,7 @@ class OnsetResolution(eqx.Module):
         return (self.num_onsets == 0) | ((self.worst >= STEPS_NEEDED) & (self.jump <= LARGEST_JUMP))
 
     def messages(self) -> list[str]:
-        """Say which pairs are not resolved, and what helps.
-
-        Returns:
-            One sentence per pair; none if all are resolved. Batches of rollouts are taken together.
+        """Say in a sentence for each pair that is not resolved what helps; batches of rollouts are taken together.
 
         Raises:
             ValueError: if the values are traced.

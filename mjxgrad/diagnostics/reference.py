@@ -37,16 +37,10 @@ class Landscape(eqx.Module):
     def smoothed_gradient(
         self, params: Float[Array, ""], stddev: Float[Array, ""], centre: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Give the gradient of the smoothed cost with its standard error.
+        """Give the gradient of the smoothed cost, at least `REACH` standard deviations inside the landscape.
 
-        Args:
-            params: where; at least `REACH` standard deviations inside the landscape.
-            stddev: of the noise.
-            centre: a cost to compare with, such as that at `params` itself; it must not be taken from these costs.
-
-        Returns:
-            The gradient and a standard error that is rather too large than too small; both NaN if a cost that carries
-            weight is not finite.
+        With it a standard error that is rather too large than too small; both NaN if a cost that carries weight is not
+        finite. The centre is a cost to compare with, such as that at `params` itself, not taken from these costs.
         """
         offset = (self.points - params) / stddev
         weight = offset / stddev * jax.scipy.stats.norm.pdf(offset) / stddev

@@ -155,14 +155,7 @@ def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, 
     """Give parameters spread over an interval, one in each of equal parts, at a random place in it.
 
     Evenly spaced ones might all meet the same phase of the time step, and so do regular displacements (multiples of the
-    golden ratio) for some lengths of tooth. The places are the same in every call.
-
-    Args:
-        interval: of the parameter.
-        num_phases: how many.
-
-    Returns:
-        The parameters, increasing.
+    golden ratio) for some lengths of tooth. The places are the same in every call, and increase.
 
     Raises:
         ValueError: if the interval is empty or `num_phases` is below 32.

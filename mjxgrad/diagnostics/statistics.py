@@ -22,17 +22,7 @@ def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, 
     It covers as it says for samples near a normal distribution, or many of any with a variance; where a sample in a
     thousand carries most of the mean (the derivative of a stiff contact), a thousand samples are not many.
 
-    Args:
-        mean: of the samples.
-        standard_error: of the mean.
-        count: number of independent samples behind the standard error, at least 2.
-        confidence: chance to cover the truth.
-
-    Returns:
-        Lower and upper ends, NaN where there is no standard error.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1.
+    Arguments, result and refusals are those of `bias_interval`.
     """
     return bias_interval(mean, standard_error, count, 0.0, confidence=confidence)
 

@@ -13,12 +13,7 @@ from mjxgrad.objective import Objective, as_vector
 
 
 def first_order(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
     r"""Estimate the gradient of a smoothed objective by differentiating each sample.
 

@@ -65,12 +65,7 @@ def alpha_order(
 
 
 def control_variate(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
     r"""Estimate the gradient without bias, using derivatives as far as they explain the costs.
 

@@ -78,11 +78,7 @@ class TrustRegion(eqx.Module):
         bias_bound: Float[Array, ""],
         objective: Objective,
     ) -> Float[Array, " dim"]:
-        """Shorten a step along an estimate, not clipped, where it is too long.
-
-        Raises:
-            ValueError: if the objective's noise is not on the parameters and `step_scale` was not given.
-        """
+        """Shorten a step along an estimate, not clipped, where it is too long."""
         unit = self.step_scale
         if unit is None:
             unit = parameter_stddev(objective, step.size)

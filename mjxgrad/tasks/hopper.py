@@ -32,13 +32,7 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     """Load the drop: the foot lands after 70 ms, and what counts is where the torso is at the end.
 
     Model and contact are gymnasium's; steps are Euler's, not RK4's, which costs a quarter. The policy sees angles and speeds
-    of the three joints; at the start it holds the posture like springs and dampers.
-
-    Args:
-        horizon: number of steps of 2 ms.
-
-    Returns:
-        The task.
+    of the three joints; at the start it holds the posture like springs and dampers. A step is 2 ms.
     """
     # Imported here: only this task needs it.
     try:

@@ -87,13 +87,7 @@ def rolling_pin(*, horizon: int = 120) -> RollingPin:
     """Load the task: four of eight pillars are to be 15 mm lower in the end.
 
     Controls are the forces on the pin along x and z, in units of 10 N. The pin begins at rest 30 mm above the first of the
-    four, so that it has to come down, and then to roll along.
-
-    Args:
-        horizon: number of steps of 5 ms.
-
-    Returns:
-        The task.
+    four, so that it has to come down, and then to roll along. A step is 5 ms.
     """
     scene = load_scene(scene_path("rolling_pin"))
     model = scene.mj_model
