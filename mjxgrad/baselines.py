@@ -28,16 +28,10 @@ Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tupl
 
 
 class Population(Method):
-    """Draw candidates, roll them out, move; the state is the width of the search.
+    """Draw candidates, roll them out, move; the state is the width of the search, at the start `stddev`.
 
-    Attributes:
-        objective: what to minimise.
-        stddev: of the search at the start, one number per parameter.
-        move: from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
-            point and width.
-        num_samples: candidates, and so rollouts, per step.
-        least_finite: how many of them must be finite for a step to be taken.
-        has_present: whether the present point is the first of them.
+    `move` goes from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
+    point and width. A step is taken if at least `least_finite` candidates are finite; the present point may be the first.
     """
 
     objective: Objective

@@ -38,7 +38,6 @@ class FeedforwardPolicy(eqx.Module):
     limits: Float[Array, "nu 2"] | None = None
 
     def __call__(self, params: Affine | tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
-        """Return the controls in a state."""
         *layers, last = (params,) if isinstance(params, Affine) else params
         hidden = self.observe(state)
         for layer in layers:

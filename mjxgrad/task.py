@@ -144,11 +144,9 @@ class SceneTask(Task, InScene):
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the number of actuators."""
         return self.scene.model.nu
 
     def nominal_start(self) -> State:
-        """Return `state`."""
         return self.state
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:

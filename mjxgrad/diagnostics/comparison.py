@@ -30,11 +30,7 @@ _MOST_SAMPLES = 1_000_000  # where the search ends, however cheap samples are
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
-    """A budget of rollouts per estimate, those that the estimate itself reports.
-
-    Attributes:
-        count: at most; at least 2.
-    """
+    """A budget of rollouts per estimate, of those that the estimate itself reports; at least 2."""
 
     count: int
 
@@ -45,12 +41,7 @@ class Rollouts:
 
 @dataclasses.dataclass(frozen=True)
 class Seconds:
-    """A budget of wall time per estimate, compiled and warm.
-
-    Attributes:
-        seconds: at most, as the median of the runs.
-        num_runs: timed runs per number of samples that is tried.
-    """
+    """A budget of wall time per estimate, compiled and warm: the median of the runs at each number of samples tried."""
 
     seconds: float
     num_runs: int = 7
@@ -297,8 +288,7 @@ def affordable(
 
 
 def _within_rollouts(run: Callable[..., Any], count: int) -> int:
-    def reported(num_samples: int) -> int:
-        # All but the count is dead code, which is dropped before anything is compiled.
+    def reported(num_samples: int) -> int:  # all but the count is dead code, dropped before anything is compiled
         return int(run(num_samples, True))
 
     num_samples, rollouts = _accepted(reported, count)

@@ -125,13 +125,7 @@ def onset_resolution(scene: Scene, trajectory: Trajectory) -> OnsetResolution:
 
     Traceable; for a batch of rollouts use `jax.vmap`. Collision is found anew from the positions, so that no rollout need
     have kept it. The speed is that of the step in which a pair comes closer than its margin, along its normal after it.
-
-    Args:
-        scene: that was rolled out.
-        trajectory: of it.
-
-    Returns:
-        The onsets. In a contact that is active in the first state, none is counted.
+    In a contact that is active in the first state, no onset is counted.
     """
     distance, speed = jax.vmap(lambda qpos, qvel: _pair_states(scene, qpos, qvel))(trajectory.qpos, trajectory.qvel)
     is_onset = (distance[:-1] >= 0) & (distance[1:] < 0)

@@ -22,13 +22,7 @@ REACH = 6.0
 
 
 class Landscape(eqx.Module):
-    """A cost along one parameter, at one random place in each of many equal cells.
-
-    Attributes:
-        points: ascending, in the parameter's units.
-        costs: at the points.
-        cell: length of a cell.
-    """
+    """A cost along one parameter, at one random place, ascending, in each of many cells of one length."""
 
     points: Float[Array, " cells"]
     costs: Float[Array, "*batch cells"]

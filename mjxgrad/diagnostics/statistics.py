@@ -132,14 +132,6 @@ def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
     return float(stats.binomtest(count, total, alternative="less").proportion_ci(checked(confidence)).high)
 
 
-def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Give the chi-square interval of a variance (with N − 1), exact for normal samples and wrong for heavy tails."""
-    freedom = np.asarray(count, float) - 1
-    tail = (1 - checked(confidence)) / 2
-    sum_of_squares = np.asarray(variance, float) * freedom
-    return np.stack([sum_of_squares / stats.chi2.isf(tail, freedom), sum_of_squares / stats.chi2.ppf(tail, freedom)])
-
-
 def bootstrap_variance_interval(
     samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> Float[np.ndarray, " 2"]:
@@ -190,7 +182,7 @@ def variance_interval(
 
     Samples that are not finite are left out; fewer than two give NaN.
     """
-    checked(confidence)
+    tail = (1 - checked(confidence)) / 2
     samples = np.asarray(samples, float)
     samples = samples[np.isfinite(samples).all(axis=1)]
     if len(samples) < 2:
@@ -202,7 +194,7 @@ def variance_interval(
         return VarianceInterval(total, ends, "bootstrap")
     squares = (covariance**2).sum()
     freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
-    return VarianceInterval(total, chi_square_variance_interval(total, freedom + 1, confidence), "chi_square")
+    return VarianceInterval(total, total * freedom / stats.chi2.isf([tail, 1 - tail], freedom), "chi_square")
 
 
 def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:

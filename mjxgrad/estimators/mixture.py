@@ -170,8 +170,6 @@ class Parts(Summary):
     num_felt: Int[Array, ""]
 
     def merge(self, other: "Parts") -> "Parts":
-        """Give the summary of both sets of samples."""
-
         def both(mine: Any, theirs: Any) -> Any:
             return mine.merge(theirs) if isinstance(mine, Moments) else mine + theirs
 

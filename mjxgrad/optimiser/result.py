@@ -155,7 +155,6 @@ class History(Record):
         return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(seconds))
 
     def __getitem__(self, steps: slice) -> "History":
-        """Give some of the steps."""
         return jax.tree.map(lambda leaf: leaf[..., steps], self)
 
 

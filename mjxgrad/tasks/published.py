@@ -43,12 +43,7 @@ class QuadraticCost(eqx.Module):
 
 
 class DynamicsTask(Task):
-    """A task whose state is a vector; a subclass gives `advance` and the nominal start.
-
-    Attributes:
-        cost: of states and controls.
-        horizon: number of steps.
-    """
+    """A task whose state is a vector; a subclass gives `advance` and the nominal start."""
 
     cost: QuadraticCost
     horizon: int = eqx.field(static=True)
@@ -64,7 +59,6 @@ class DynamicsTask(Task):
         noise: Float[Array, "horizon nu"] | None = None,
         start: Float[Array, " states"] | None = None,
     ) -> Outcome:
-        """Roll out once; see `Task.run`."""
         start = self.nominal_start() if start is None else start
         shape = (self.horizon, self.num_controls)
         rows = jnp.zeros(shape) if callable(controls) else controls
@@ -89,12 +83,8 @@ SLOPE, LIMIT = 1.8, 0.18  # N s/m, N
 class Push(DynamicsTask):
     r"""The state is two positions (m) and two velocities (m/s), the control a force (N) on the first body.
 
-    With $d = x_2 - x_1$ the spring pushes with $F = k(1 - d)$ where $d < 1$. Velocities are stepped first, and
-    positions with the new ones.
-
-    Attributes:
-        stiffness: k, in N/m.
-        velocity_factor: what is left of a velocity after a step.
+    With $d = x_2 - x_1$ the spring of stiffness $k$ (N/m) pushes with $F = k(1 - d)$ where $d < 1$. Velocities are
+    stepped first, of which a factor is left after each step, and positions with the new ones.
     """
 
     stiffness: Float[Array, ""]
@@ -162,7 +152,6 @@ class LQR(DynamicsTask):
     num_controls: int = eqx.field(static=True)
 
     def nominal_start(self) -> Float[Array, " states"]:
-        """Return all ones."""
         return jnp.ones(self.num_controls)
 
     def sample_start(self, key: PRNGKeyArray) -> Float[Array, " states"]:

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.contact import Softness
@@ -134,13 +134,7 @@ def published_state(state: State) -> Float[Array, " 7"]:
 
 
 def _quadratic_task(
-    scene: Scene,
-    cost: published.QuadraticCost,
-    horizon: int,
-    *,
-    start_params: PyTree,
-    state: State | None = None,
-    **options: Any,
+    scene: Scene, cost: published.QuadraticCost, horizon: int, *, state: State | None = None, **options: Any
 ) -> ActionTask:
     """Make a task with a quadratic cost of positions, velocities and controls; from rest unless another start is given."""
     # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
@@ -149,6 +143,5 @@ def _quadratic_task(
         state=initial_state(scene) if state is None else state,
         cost=Partial(quadratic_cost, cost),
         horizon=horizon,
-        start_params=start_params,
         **options,
     )

@@ -48,7 +48,6 @@ class DentCost(eqx.Module):
     reach: Float[Array, ""]
 
     def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
-        """Return the cost of a rollout."""
         error = jnp.sum((trajectory.qpos[-1, 2:] - self.target) ** 2) / jnp.sum(self.target**2)
         effort = CONTROL_WEIGHT * jnp.mean(trajectory.ctrl**2)
         distance = jax.vmap(self.distance)(trajectory.qpos)

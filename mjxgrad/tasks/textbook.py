@@ -122,7 +122,6 @@ class Heaviside(Textbook):
     """See `heaviside`."""
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return 1 from zero on, else 0."""
         return jnp.where(x[0] >= 0, jnp.ones_like(x[0]), 0)
 
     @property
@@ -148,7 +147,6 @@ class SoftHeaviside(Textbook):
     width: Float[Array, ""]
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return the ramp."""
         return jnp.clip(2 * x[0] / self.width, -1, 1)
 
     @property
@@ -203,7 +201,6 @@ class QuadraticSine(Textbook):
     frequency: Float[Array, ""]
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return the rippled parabola."""
         return x[0] ** 2 + self.amplitude * jnp.sin(self.frequency * x[0])
 
     @property
