@@ -262,7 +262,6 @@ class Group(eqx.Module):
 
     @classmethod
     def of(cls, samples: Samples) -> "Group":
-        """Take all samples of a chunk."""
         per_unit = samples.costs.shape[1]
         raw, gradients, scores = (
             leaf.reshape(-1, *leaf.shape[2:]) for leaf in (samples.costs, samples.gradients, samples.scores)

@@ -1,6 +1,5 @@
 """What a run gives: where it ended, what it saw on the way, and why it stopped."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -144,15 +143,6 @@ class History(Record):
 
     noise_free_cost: Float[np.ndarray, "..."]
     seconds: Float[np.ndarray, " steps"]
-
-    @classmethod
-    def of(cls, records: Record, noise_free_cost: np.ndarray, seconds: np.ndarray) -> "History":
-        """Put stacked records of steps together, counts and seconds summed up."""
-        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
-        for name in ("num_rollouts", "num_gradient_rollouts"):
-            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
-            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
-        return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(seconds))
 
     def __getitem__(self, steps: slice) -> "History":
         return jax.tree.map(lambda leaf: leaf[..., steps], self)

@@ -119,8 +119,14 @@ class Saved(NamedTuple):
     seconds: Float[np.ndarray, " steps"]
 
     def history(self) -> History:
-        """Put the history together, as far as any run has come."""
-        return History.of(*self.trace, self.seconds)[: int(np.max(self.carry.num_steps))]
+        """Put the history together, as far as any run has come, counts and seconds summed up."""
+        records, noise_free_cost = self.trace
+        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
+        for name in ("num_rollouts", "num_gradient_rollouts"):
+            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
+            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
+        history = History(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(self.seconds))
+        return history[: int(np.max(self.carry.num_steps))]
 
     def metrics(self) -> dict[str, float]:
         """Give the last step, the mean over the seeds that took it; NaN where there is no such thing."""
@@ -285,7 +291,6 @@ class _Program:
         self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
 
     def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
-        """Run one segment more."""
         began = time.perf_counter()
         if self.compiled is None:
             self.compiled = self.lowered.compile()

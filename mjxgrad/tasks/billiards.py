@@ -48,7 +48,6 @@ class Billiards(InScene):
         return jnp.repeat(params.reshape(self.num_pieces, 2), self.horizon // self.num_pieces, axis=0)
 
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
-        """Play once."""
         start = initial_state(self.scene)
         return rollout(
             self.scene, start, self.controls(params), gradient=self.gradient, onset=self.onset, smoothing=self.smoothing

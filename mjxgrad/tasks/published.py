@@ -180,7 +180,6 @@ class MotionPlanning(DynamicsTask):
     num_controls: int = eqx.field(static=True, default=2)
 
     def nominal_start(self) -> Float[Array, " 2"]:
-        """Return the origin."""
         return jnp.zeros(2)
 
     def advance(self, state: Float[Array, " 2"], control: Float[Array, " 2"]) -> Float[Array, " 2"]:
