@@ -8,6 +8,7 @@ parameters are among the points $\mu$, whose noise-free cost `evaluate` measures
 They are written here, for each is short, and a library of them would bring in a neural-network framework.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -17,28 +18,20 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad.estimators import Reason
 from mjxgrad.objective import ActionNoise, Objective
 from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
 from mjxgrad.optimiser.step import as_objective, parameter_stddev
 
 __all__ = ["cross_entropy", "mppi", "predictive_sampling"]
 
-
 Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tuple[Array, Array]]
 
 
 class Population(Method):
-    """Draw candidates, roll them out, move; the state is the width of the search.
+    """Draw candidates, roll them out, move; the state is the width of the search, at the start `stddev`.
 
-    Attributes:
-        objective: what to minimise.
-        stddev: of the search at the start, one number per parameter.
-        move: from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
-            point and width.
-        num_samples: candidates, and so rollouts, per step.
-        least_finite: how many of them must be finite for a step to be taken.
-        has_present: whether the present point is the first of them.
+    `move` goes from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
+    point and width. A step is taken if at least `least_finite` candidates are finite; the present point may be the first.
     """
 
     objective: Objective
@@ -152,23 +145,9 @@ def mppi(
     objective's alone, without the cited method's extra charge $\lambda\mu^\top\Sigma^{-1}\epsilon$ for control.
     A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
 
-    Args:
-        objective: what to minimise; only its cost is used.
-        params: the first $\mu$, such as controls raveled.
-        key: as in `optimise`.
-        num_samples: candidates, and so rollouts, per step.
-        num_steps: at most.
-        temperature: $\lambda$; low follows the best candidate, high averages over all.
-        is_relative: whether the temperature is in units of the standard deviation of the step's costs, so that the
-            cost's unit has no effect; otherwise in units of the cost.
-        stddev: $\sigma$, as in `cross_entropy`.
-        **options: see `RunOptions`.
-
-    Returns:
-        As `cross_entropy`.
-
-    Raises:
-        ValueError: as `cross_entropy`.
+    The temperature $\lambda$ follows the best candidate where it is low and averages over all where it is high. It is in
+    units of the standard deviation of the step's costs if `is_relative`, so that the cost's unit has no effect, else in
+    units of the cost. All else is as in `cross_entropy`.
 
     References:
         Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based
@@ -204,22 +183,8 @@ def predictive_sampling(
 ) -> Optimisation:
     r"""Minimise a cost by going to the best candidate, the present point among them.
 
-    The cost without noise never rises, unless the task's start is random.
-
-    Args:
-        objective: what to minimise; only its cost is used.
-        params: the first point.
-        key: as in `optimise`.
-        num_samples: candidates, and so rollouts, per step; the first is the present point.
-        num_steps: at most.
-        stddev: width of the search, as in `cross_entropy`.
-        **options: see `RunOptions`.
-
-    Returns:
-        As `cross_entropy`.
-
-    Raises:
-        ValueError: as `cross_entropy`.
+    The cost without noise never rises, unless the task's start is random. Arguments, result and refusals are those of
+    `cross_entropy`.
 
     References:
         Howell, Gileadi, Tunyasuvunakool, Zakka, Erez, Tassa. Predictive sampling: real-time behaviour synthesis with
@@ -275,19 +240,14 @@ def _record(
     count = is_finite.sum()
     mean = jnp.where(count > 0, jnp.mean(costs, where=is_finite), jnp.nan)
     variance = jnp.sum(jnp.where(is_finite, costs - mean, 0) ** 2) / jnp.maximum(count - 1, 1)
-    nan = jnp.full((), jnp.nan, costs.dtype)
-    return Record(
+    error = jnp.where(count > 1, jnp.sqrt(variance / jnp.maximum(count, 1)), jnp.nan)
+    return dataclasses.replace(
+        Record.blank(costs.dtype),
         cost=mean,
-        cost_error=jnp.where(count > 1, jnp.sqrt(variance / jnp.maximum(count, 1)), nan).astype(costs.dtype),
-        gradient_norm=nan,
-        gradient_error=nan,
-        alpha=nan,
-        reason=jax.tree.map(jnp.asarray, Reason.fixed),
-        bias_bound=nan,
-        scale=jnp.ones_like(nan),
+        cost_error=error.astype(costs.dtype),
+        scale=jnp.ones((), costs.dtype),
         step_norm=step_norm,
         finite_fraction=is_finite.mean(dtype=costs.dtype),
         num_rollouts=jnp.asarray(costs.size, jnp.int32),
-        num_gradient_rollouts=jnp.zeros((), jnp.int32),
         is_taken=is_taken,
     )

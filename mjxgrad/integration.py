@@ -97,11 +97,10 @@ def adaptive_rollout(
     asked = known(moments)
     if asked is not None and (not asked.size or asked[0] < 0 or np.any(np.diff(asked) <= 0)):
         raise ValueError(f"times must increase and begin at or after 0, got {asked.tolist()}")
-    resting = scene.data.ctrl
 
     def rates(t: Float[Array, ""], y: Rates, _: None) -> Rates:
         qpos, qvel, act = y
-        ctrl = resting if controls is None else controls(t)
+        ctrl = scene.data.ctrl if controls is None else controls(t)
         now = State(qpos, qvel, act, state.time + t, state.warmstart)
         data = forward(scene.model, data_of(scene, now, ctrl))
         zero = jnp.zeros((), qpos.dtype)

@@ -17,18 +17,12 @@ FINAL_SCALE = 0.01
 
 
 class Affine(eqx.Module):
-    """A linear map with an optional offset.
-
-    Attributes:
-        gain: the matrix.
-        offset: added; None for a linear map without.
-    """
+    """A linear map by a matrix, the gain, with an optional offset."""
 
     gain: Float[Array, "outputs inputs"]
     offset: Float[Array, " outputs"] | None
 
     def __call__(self, inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-        """Apply it."""
         if inputs.shape != self.gain.shape[1:]:
             raise ValueError(
                 f"the policy must observe {self.gain.shape[1]} numbers, got shape {inputs.shape}; "
@@ -44,7 +38,6 @@ class FeedforwardPolicy(eqx.Module):
     limits: Float[Array, "nu 2"] | None = None
 
     def __call__(self, params: Affine | tuple[Affine, ...], state: Any) -> Float[Array, " nu"]:
-        """Return the controls in a state."""
         *layers, last = (params,) if isinstance(params, Affine) else params
         hidden = self.observe(state)
         for layer in layers:
@@ -59,14 +52,7 @@ class FeedforwardPolicy(eqx.Module):
 
 
 def whole_state(state: Any) -> Float[Array, " observed"]:
-    """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order.
-
-    Args:
-        state: what a task hands to its policy, its state or its observations.
-
-    Raises:
-        ValueError: if it is neither.
-    """
+    """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order."""
     if isinstance(state, State):
         return jnp.concatenate([state.qpos, state.qvel, state.act])
     if not isinstance(state, jax.Array) or state.ndim != 1:

@@ -36,7 +36,6 @@ def frames(
     height: int = 360,
     width: int = 640,
     camera: str | int | mujoco.MjvCamera | None = None,
-    show_contacts: bool = False,
 ) -> Frames:
     r"""Draw a trajectory at the times at which a video shows it.
 
@@ -52,7 +51,6 @@ def frames(
         height: in pixels.
         width: in pixels.
         camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view.
-        show_contacts: mark the points of contact.
 
     Returns:
         The frames.
@@ -70,15 +68,14 @@ def frames(
     mj_model = copy.copy(mj_model)
     mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
-    data, option = mujoco.MjData(mj_model), mujoco.MjvOption()
-    option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = show_contacts
+    data = mujoco.MjData(mj_model)
     view = -1 if camera is None else camera
     drawn = []
     with _renderer(mj_model, height, width) as renderer:
         for state in _nearest(len(positions), timestep, speed / fps):
             data.qpos[:] = positions[state]
             mujoco.mj_fwdPosition(mj_model, data)
-            renderer.update_scene(data, view, option)
+            renderer.update_scene(data, view)
             drawn.append(renderer.render())
     return np.stack(drawn)
 

@@ -105,11 +105,7 @@ class InScene(eqx.Module):
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
 
     def with_gradient(self: Same, gradient: Gradient) -> Same:
-        """Return the same with MuJoCo's own motion and one of its derivatives.
-
-        Raises:
-            ValueError: if there is no such gradient.
-        """
+        """Return the same with MuJoCo's own motion and one of its derivatives."""
         check_gradient(gradient)
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
@@ -148,11 +144,9 @@ class SceneTask(Task, InScene):
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the number of actuators."""
         return self.scene.model.nu
 
     def nominal_start(self) -> State:
-        """Return `state`."""
         return self.state
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:

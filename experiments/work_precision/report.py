@@ -1,4 +1,4 @@
-"""The answer : words, tables, pictures."""
+"""The answer: words, tables, pictures."""
 
 import functools
 from collections import Counter

@@ -11,11 +11,7 @@ from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
-from mjxgrad.diagnostics.statistics import (
-    bias_interval,
-    mean_interval,
-    root_mean_square_interval,
-)
+from mjxgrad.diagnostics.statistics import bias_interval, mean_interval, root_mean_square_interval
 
 __all__ = [
     "BiasVariance",

@@ -35,10 +35,7 @@ class BiasVariance(eqx.Module):
         reference_method: "landscape" (see `Landscape`) or "zeroth_order" (a long run).
         bias: first order less reference.
         bias_error: its standard error, from both.
-        first_interval: of the mean of the first-order estimate.
-        zeroth_interval: of the mean of the zeroth-order estimate.
-        reference_interval: of the reference.
-        bias_interval: of the bias.
+        first_interval: of the mean of the first-order estimate; the other intervals likewise of what they are named for.
         first_variance_interval: of the variance of one first-order sample.
         zeroth_variance_interval: of the variance of one zeroth-order sample.
         landscape: the cost along the parameter at every softness, if there is only one parameter, with noise on it.

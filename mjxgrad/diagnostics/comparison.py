@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad.diagnostics.reference import map_in_chunks
 from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval, variance_interval
-from mjxgrad.estimators.estimate import GradientEstimate
+from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, as_vector, flattened
 
 # Rollouts at a time over all repetitions that run together: enough to fill a CPU's vector units.
@@ -25,19 +25,12 @@ _NEIGHBOURS = 3
 # Time grows nearly linearly, so a line through two measurements hits at the second or third try.
 _CORRECTIONS = 4
 _FEWEST_TIMED = 4
-
-# Called as (objective, params, key, *, num_samples), which is what every function of mjxgrad.estimators is; settings are
-# bound by functools.partial.
-Estimator = Callable[..., GradientEstimate]
+_MOST_SAMPLES = 1_000_000  # where the search ends, however cheap samples are
 
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
-    """A budget of rollouts per estimate, those that the estimate itself reports.
-
-    Attributes:
-        count: at most; at least 2.
-    """
+    """A budget of rollouts per estimate, of those that the estimate itself reports; at least 2."""
 
     count: int
 
@@ -48,17 +41,10 @@ class Rollouts:
 
 @dataclasses.dataclass(frozen=True)
 class Seconds:
-    """A budget of wall time per estimate, compiled and warm.
-
-    Attributes:
-        seconds: at most, as the median of the runs.
-        num_runs: timed runs per number of samples that is tried.
-        max_samples: where the search ends, however cheap samples are.
-    """
+    """A budget of wall time per estimate, compiled and warm: the median of the runs at each number of samples tried."""
 
     seconds: float
     num_runs: int = 7
-    max_samples: int = 1_000_000
 
     def __post_init__(self):
         if not 0 < self.seconds < math.inf:
@@ -294,11 +280,7 @@ def affordable(
     key: PRNGKeyArray,
     budget: Rollouts | Seconds,
 ) -> Affordable:
-    """Find the largest number of samples within a budget: of rollouts by tracing alone, of seconds by running.
-
-    Raises:
-        ValueError: if the budget buys no estimate, or the estimator refuses every number of samples.
-    """
+    """Find the largest number of samples within a budget: of rollouts by tracing alone, of seconds by running."""
     run = functools.partial(_estimate, estimator, objective, params, key)
     if isinstance(budget, Rollouts):
         return Affordable(_within_rollouts(run, budget.count), math.nan)
@@ -306,8 +288,7 @@ def affordable(
 
 
 def _within_rollouts(run: Callable[..., Any], count: int) -> int:
-    def reported(num_samples: int) -> int:
-        # All but the count is dead code, which is dropped before anything is compiled.
+    def reported(num_samples: int) -> int:  # all but the count is dead code, dropped before anything is compiled
         return int(run(num_samples, True))
 
     num_samples, rollouts = _accepted(reported, count)
@@ -334,9 +315,9 @@ def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
             f"budget of {budget.seconds:g} s buys no estimate: {low} samples take {low_time:.3g} s; give more seconds"
         )
     high, high_time = low, low_time
-    while high_time <= budget.seconds and high < budget.max_samples:
+    while high_time <= budget.seconds and high < _MOST_SAMPLES:
         low, low_time = high, high_time
-        high, high_time = _accepted(timed, min(8 * high, budget.max_samples))
+        high, high_time = _accepted(timed, min(8 * high, _MOST_SAMPLES))
     if high_time <= budget.seconds:
         return Affordable(high, high_time)
     for _ in range(_CORRECTIONS):
@@ -355,12 +336,7 @@ def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
 
 @eqx.filter_jit
 def _estimate(
-    estimator: Estimator,
-    objective: Objective,
-    params: Array,
-    key: PRNGKeyArray,
-    num_samples: int,
-    is_counted: bool,
+    estimator: Estimator, objective: Objective, params: Array, key: PRNGKeyArray, num_samples: int, is_counted: bool
 ) -> GradientEstimate | Int[Array, ""]:
     estimate = estimator(objective, params, key, num_samples=num_samples)
     return estimate.num_rollouts if is_counted else estimate

@@ -77,10 +77,7 @@ class EmpiricalBias(eqx.Module):
 
 
 def empirical_bias(
-    gradients: ArrayLike,
-    *,
-    reference: tuple[ArrayLike, ArrayLike] | ArrayLike | None = None,
-    confidence: float = 0.95,
+    gradients: ArrayLike, *, reference: tuple[ArrayLike, ArrayLike] | ArrayLike | None = None, confidence: float = 0.95
 ) -> EmpiricalBias:
     r"""Find the event, its chance, and what missing it does, from samples of first-order gradients.
 
@@ -151,16 +148,9 @@ def empirical_bias(
 def first_order_samples(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int
 ) -> Float[Array, "samples dim"]:
-    """Give single samples of the first-order gradient; memory grows with their number.
+    """Give single samples of the first-order gradient, one per row, not finite where a rollout or its derivative is not.
 
-    Args:
-        objective: differentiated once per sample, under `jax.vmap`.
-        params: the point, a vector or a pytree whose floating-point arrays are taken as one.
-        key: consumed here.
-        num_samples: how many.
-
-    Returns:
-        One gradient per row, not finite where a rollout or its derivative is not.
+    Parameters are a vector or a pytree, as for `mjxgrad.estimators.first_order`. Memory grows with the number of samples.
 
     Raises:
         ValueError: if `num_samples` is below 1, or `params` is not a vector of the objective's dimension.

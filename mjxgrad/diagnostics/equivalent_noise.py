@@ -30,6 +30,7 @@ from mjxgrad.scene import Scene
 Profile = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 _ForceAt = Callable[[np.ndarray], np.ndarray]
 
+_NUM_POINTS = 2001  # of the grid
 # Negative mass, of the whole, from which on it is not rounding and not the grid.
 _NEGATIVE = 1e-4
 # A single cell of the grid that holds this share of the mass holds a point mass.
@@ -63,32 +64,29 @@ class EquivalentNoise:
     density: Float[np.ndarray, " n"]
 
 
-def probe(profile: Profile, *, reach: float, num_points: int = 2001) -> EquivalentNoise:
+def probe(profile: Profile, *, reach: float) -> EquivalentNoise:
     """Read a profile of force against distance as a ramp under noise.
 
     Args:
         profile: from distances (m), of any number, to the forces there; see `contact_profile`.
         reach: how far to both sides of the surface to look (m); some 20 lengths, or several widths of the impedance.
             From there on inwards the profile must be a line.
-        num_points: of the grid.
 
     Returns:
-        The noise. Moments are sums over the grid, so that a width below its spacing reads as zero.
+        The noise. Moments are sums over 2001 points, so that a width below their spacing reads as zero.
 
     Raises:
-        ValueError: if reach is not positive, there are fewer than 101 points, or the profile is not finite.
+        ValueError: if reach is not positive, or the profile is not finite.
     """
     if not reach > 0:
         raise ValueError(f"reach must be positive, got {reach}")
-    if num_points < 101:
-        raise ValueError(f"num_points must be at least 101, got {num_points}")
 
     def force_at(distance: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         # Of one shape whatever is asked for, so that a profile under `jax.jit` is compiled once.
-        padded = np.pad(distance, (0, num_points - len(distance)), mode="edge")
+        padded = np.pad(distance, (0, _NUM_POINTS - len(distance)), mode="edge")
         return np.asarray(profile(jnp.asarray(padded)), float)[: len(distance)]
 
-    grid = np.linspace(-reach, reach, num_points)
+    grid = np.linspace(-reach, reach, _NUM_POINTS)
     force = force_at(grid)
     if not np.isfinite(force).all():
         where = grid[~np.isfinite(force)][0]
@@ -115,17 +113,14 @@ def probe(profile: Profile, *, reach: float, num_points: int = 2001) -> Equivale
     return EquivalentNoise(True, reason, mean, stddev, slope, w, mass / (grid[1] - grid[0]))
 
 
-def contact_profile(
-    scene: Scene, pair: int = 0, *, smoothing: Smoothing | None = None, acceleration: float = 0.0
-) -> Profile:
-    """Give the force of one contact against distance, at rest and at a given acceleration.
+def contact_profile(scene: Scene, *, smoothing: Smoothing | None = None, acceleration: float = 0.0) -> Profile:
+    """Give the force of the scene's first contact pair against distance, at rest and at a given acceleration.
 
     The distance is that between the geoms, so that a margin shifts the profile, and the force that of a frictionless row: as the
     solver would have it if the bodies had this acceleration.
 
     Args:
         scene: with the contact's parameters.
-        pair: its index in `scene.pairs`.
         smoothing: the noise over which it is averaged, if any.
         acceleration: of the distance (m/s²).
 
@@ -133,14 +128,14 @@ def contact_profile(
         From distances (m) to forces per unit of the contact's effective mass (N/kg).
 
     Raises:
-        ValueError: if the scene has no such pair.
+        ValueError: if the scene has no pair.
     """
-    if not 0 <= pair < len(scene.pairs):
-        raise ValueError(f"pair must be the index of one of the scene's {len(scene.pairs)} pairs, got {pair}")
+    if not scene.pairs:
+        raise ValueError("scene must have a pair of geoms that can touch, got none")
 
     @jax.jit
     def profile(distance: Float[Array, " n"]) -> Float[Array, " n"]:
-        parameters = contact_parameters(scene.model, scene.pairs[pair : pair + 1])
+        parameters = contact_parameters(scene.model, scene.pairs[:1])
         ones = jnp.ones_like(distance)
         of_pair = (parameters.margin, parameters.solref, parameters.solimp)
         block = one_sided(DenseRows(ones[:, None]), distance, ones, np.zeros(len(distance), int), *of_pair)

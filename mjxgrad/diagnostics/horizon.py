@@ -82,7 +82,6 @@ def crossover(
     *,
     confidence: float = 0.95,
     num_resamples: int = 1000,
-    seed: int = 0,
 ) -> Crossover:
     """Find where two estimators' mean squared errors cross for good, with a bootstrap interval over repeats.
 
@@ -95,7 +94,6 @@ def crossover(
         second: by the second, as often; repeats of both are drawn alike, for they may share rollouts.
         confidence: of the interval.
         num_resamples: of the bootstrap.
-        seed: of its draws.
 
     Returns:
         The horizon and its interval.
@@ -113,7 +111,7 @@ def crossover(
     if not (np.diff(horizons) > 0).all():
         raise ValueError(f"horizons must increase, got {horizons.tolist()}")
     log_ratio = _log_ratio(first.mean(axis=0), second.mean(axis=0))
-    draws = np.random.default_rng(seed).integers(len(first), size=(num_resamples, len(first)))
+    draws = np.random.default_rng(0).integers(len(first), size=(num_resamples, len(first)))
     found = [_last_crossing(horizons, _log_ratio(first[one].mean(axis=0), second[one].mean(axis=0))) for one in draws]
     # The nearest ones, not between: infinity minus infinity is no number.
     low, high = np.quantile(found, [tail, 1 - tail], method="nearest")

@@ -102,7 +102,9 @@ def check_omissions(scene: Scene, trajectory: Trajectory, act: Float[ArrayLike, 
     qpos, qvel, ctrl = _rollouts(full, trajectory)
     start = np.asarray(scene.data.act if act is None else act, dtype=float)
     start = np.broadcast_to(start, (len(qpos), full.na))
-    ledger = _Ledger(scene, full, lean)
+    pairs = {frozenset((pair.geom1, pair.geom2)): str(pair) for pair in scene.omitted_pairs}
+    joints = np.flatnonzero(full.jnt_limited.astype(bool) & ~lean.jnt_limited.astype(bool))
+    found: dict[str, list[tuple[int, float]]] = {}
     force, scale, step, recorded = 0.0, 0.0, 0.0, 0.0
     whole, less = mujoco.MjData(full), mujoco.MjData(lean)
     # From its first bad step on a rollout stays where it is, which no model does.
@@ -118,7 +120,8 @@ def check_omissions(scene: Scene, trajectory: Trajectory, act: Float[ArrayLike, 
                 getattr(less, name)[:] = getattr(whole, name)
             mujoco.mj_forward(full, whole)
             mujoco.mj_forward(lean, less)
-            ledger.enter(whole, t)
+            for what, depth in _acting(full, whole, pairs, joints).items():
+                found.setdefault(what, []).append((t, depth))
             force = max(force, _largest(whole.qfrc_constraint - less.qfrc_constraint))
             scale = max(scale, _largest(whole.qfrc_constraint))
             if t == last[i]:
@@ -127,7 +130,12 @@ def check_omissions(scene: Scene, trajectory: Trajectory, act: Float[ArrayLike, 
             mujoco.mj_step(lean, less)
             step = max(step, _largest(whole.qpos - less.qpos), _largest(whole.qvel - less.qvel))
             recorded = max(recorded, _largest(whole.qpos - qpos[i, t + 1]), _largest(whole.qvel - qvel[i, t + 1]))
-    return OmissionCheck(ledger.missed(full.opt.timestep), int((last + 1).sum()), force, scale, step, recorded)
+    missed = [
+        Missed(what, min(t for t, _ in seen) * full.opt.timestep, len(seen), max(depth for _, depth in seen))
+        for what, seen in found.items()
+    ]
+    missed = tuple(sorted(missed, key=lambda one: one.time))
+    return OmissionCheck(missed, int((last + 1).sum()), force, scale, step, recorded)
 
 
 def unused(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01, limit_clearance: float = 0.05) -> LeaveOut:
@@ -173,37 +181,21 @@ def without_omissions(scene: Scene, full: mujoco.MjModel) -> mujoco.MjModel:
     return lean
 
 
-class _Ledger:
-    """Collects in which states what was left out acted."""
-
-    def __init__(self, scene: Scene, full: mujoco.MjModel, lean: mujoco.MjModel):
-        self._model = full
-        self._pairs = {frozenset((pair.geom1, pair.geom2)): str(pair) for pair in scene.omitted_pairs}
-        self._joints = np.flatnonzero(full.jnt_limited.astype(bool) & ~lean.jnt_limited.astype(bool))
-        self._found: dict[str, list[tuple[int, float]]] = {}
-
-    def enter(self, data: mujoco.MjData, index: int) -> None:
-        """Note what acts in a state."""
-        deepest: dict[str, float] = {}
-        depths = data.contact.includemargin - data.contact.dist
-        for geoms, depth in zip(data.contact.geom.tolist(), depths.tolist(), strict=True):
-            what = self._pairs.get(frozenset(geoms))
-            if what is not None and depth > 0:
-                deepest[f"contact of {what}"] = max(deepest.get(f"contact of {what}", 0.0), depth)
-        beyond = _beyond_limit(self._model, data.qpos)
-        for joint in self._joints[beyond[self._joints] > 0]:
-            name = element_name(self._model, mujoco.mjtObj.mjOBJ_JOINT, int(joint))
-            deepest[f"limit of {name}"] = float(beyond[joint])
-        for what, depth in deepest.items():
-            self._found.setdefault(what, []).append((index, depth))
-
-    def missed(self, timestep: float) -> tuple[Missed, ...]:
-        """Sum up."""
-        found = [
-            Missed(what, min(i for i, _ in seen) * timestep, len(seen), max(depth for _, depth in seen))
-            for what, seen in self._found.items()
-        ]
-        return tuple(sorted(found, key=lambda one: one.time))
+def _acting(
+    full: mujoco.MjModel, data: mujoco.MjData, pairs: dict[frozenset[int], str], joints: np.ndarray
+) -> dict[str, float]:
+    """Say how deep each of the omitted pairs and limits is that acts in a state."""
+    deepest: dict[str, float] = {}
+    depths = data.contact.includemargin - data.contact.dist
+    for geoms, depth in zip(data.contact.geom.tolist(), depths.tolist(), strict=True):
+        what = pairs.get(frozenset(geoms))
+        if what is not None and depth > 0:
+            deepest[f"contact of {what}"] = max(deepest.get(f"contact of {what}", 0.0), depth)
+    beyond = _beyond_limit(full, data.qpos)
+    for joint in joints[beyond[joints] > 0]:
+        name = element_name(full, mujoco.mjtObj.mjOBJ_JOINT, int(joint))
+        deepest[f"limit of {name}"] = float(beyond[joint])
+    return deepest
 
 
 def _beyond_limit(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

@@ -91,10 +91,7 @@ class OnsetResolution(eqx.Module):
         return (self.num_onsets == 0) | ((self.worst >= STEPS_NEEDED) & (self.jump <= LARGEST_JUMP))
 
     def messages(self) -> list[str]:
-        """Say which pairs are not resolved, and what helps.
-
-        Returns:
-            One sentence per pair; none if all are resolved. Batches of rollouts are taken together.
+        """Say in a sentence for each pair that is not resolved what helps; batches of rollouts are taken together.
 
         Raises:
             ValueError: if the values are traced.
@@ -128,13 +125,7 @@ def onset_resolution(scene: Scene, trajectory: Trajectory) -> OnsetResolution:
 
     Traceable; for a batch of rollouts use `jax.vmap`. Collision is found anew from the positions, so that no rollout need
     have kept it. The speed is that of the step in which a pair comes closer than its margin, along its normal after it.
-
-    Args:
-        scene: that was rolled out.
-        trajectory: of it.
-
-    Returns:
-        The onsets. In a contact that is active in the first state, none is counted.
+    In a contact that is active in the first state, no onset is counted.
     """
     distance, speed = jax.vmap(lambda qpos, qvel: _pair_states(scene, qpos, qvel))(trajectory.qpos, trajectory.qvel)
     is_onset = (distance[:-1] >= 0) & (distance[1:] < 0)

@@ -22,13 +22,7 @@ REACH = 6.0
 
 
 class Landscape(eqx.Module):
-    """A cost along one parameter, at one random place in each of many equal cells.
-
-    Attributes:
-        points: ascending, in the parameter's units.
-        costs: at the points.
-        cell: length of a cell.
-    """
+    """A cost along one parameter, at one random place, ascending, in each of many cells of one length."""
 
     points: Float[Array, " cells"]
     costs: Float[Array, "*batch cells"]
@@ -37,16 +31,10 @@ class Landscape(eqx.Module):
     def smoothed_gradient(
         self, params: Float[Array, ""], stddev: Float[Array, ""], centre: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Give the gradient of the smoothed cost with its standard error.
+        """Give the gradient of the smoothed cost, at least `REACH` standard deviations inside the landscape.
 
-        Args:
-            params: where; at least `REACH` standard deviations inside the landscape.
-            stddev: of the noise.
-            centre: a cost to compare with, such as that at `params` itself; it must not be taken from these costs.
-
-        Returns:
-            The gradient and a standard error that is rather too large than too small; both NaN if a cost that carries
-            weight is not finite.
+        With it a standard error that is rather too large than too small; both NaN if a cost that carries weight is not
+        finite. The centre is a cost to compare with, such as that at `params` itself, not taken from these costs.
         """
         offset = (self.points - params) / stddev
         weight = offset / stddev * jax.scipy.stats.norm.pdf(offset) / stddev

@@ -31,8 +31,6 @@ _FEWEST_PHASES = 32
 _NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
-# Beyond this the slope differs from one quarter of the interval to the next by as much as errors are measured by.
-_IRREGULAR = 0.5
 _ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
 
 
@@ -89,11 +87,6 @@ class SlopeComparison(eqx.Module):
         rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
         size = np.abs(rest).max(axis=0)
         return np.asarray(np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale)
-
-    @property
-    def is_regular(self) -> Bool[np.ndarray, "*outcome"]:
-        """Where `irregularity` is at most a half; elsewhere the interval spans too few teeth, or the motion is chaotic."""
-        return np.asarray(self.irregularity <= _IRREGULAR)
 
     @property
     def error(self) -> Float[np.ndarray, "gradients *outcome"]:
@@ -162,14 +155,7 @@ def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, 
     """Give parameters spread over an interval, one in each of equal parts, at a random place in it.
 
     Evenly spaced ones might all meet the same phase of the time step, and so do regular displacements (multiples of the
-    golden ratio) for some lengths of tooth. The places are the same in every call.
-
-    Args:
-        interval: of the parameter.
-        num_phases: how many.
-
-    Returns:
-        The parameters, increasing.
+    golden ratio) for some lengths of tooth. The places are the same in every call, and increase.
 
     Raises:
         ValueError: if the interval is empty or `num_phases` is below 32.

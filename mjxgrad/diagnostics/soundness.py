@@ -61,10 +61,7 @@ def soundness(gradient: PyTree, diverged: Bool[ArrayLike, ""] = False, *, bound:
 
 
 def check_soundness(found: Soundness) -> None:
-    """Raise if any gradient, batched or not, is unsound. Call it on the host.
-
-    Args:
-        found: by `soundness`.
+    """Raise if any gradient that `soundness` looked at, batched or not, is unsound. Call it on the host.
 
     Raises:
         UnsoundGradientError: naming how many are unsound, and why.

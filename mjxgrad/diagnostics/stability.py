@@ -82,7 +82,6 @@ class Spring:
     pyramid: float | None = None
 
     def __str__(self) -> str:
-        """The name, as messages print it."""
         return self.name
 
     @property
@@ -204,7 +203,6 @@ class StabilityReport:
         )
 
     def __str__(self) -> str:
-        """The summary."""
         return self.summary()
 
     @property

@@ -22,17 +22,7 @@ def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, 
     It covers as it says for samples near a normal distribution, or many of any with a variance; where a sample in a
     thousand carries most of the mean (the derivative of a stiff contact), a thousand samples are not many.
 
-    Args:
-        mean: of the samples.
-        standard_error: of the mean.
-        count: number of independent samples behind the standard error, at least 2.
-        confidence: chance to cover the truth.
-
-    Returns:
-        Lower and upper ends, NaN where there is no standard error.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1.
+    Arguments, result and refusals are those of `bias_interval`.
     """
     return bias_interval(mean, standard_error, count, 0.0, confidence=confidence)
 
@@ -134,33 +124,16 @@ def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float
         Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
         26, 1934.
     """
-    return np.array(_binomial_test(count, total).proportion_ci(checked(confidence)))
+    return np.array(stats.binomtest(count, total).proportion_ci(checked(confidence)))
 
 
 def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
     """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %."""
-    return float(_binomial_test(count, total, "less").proportion_ci(checked(confidence)).high)
-
-
-def _binomial_test(count: int, total: int, alternative: str = "two-sided"):
-    if not 0 <= count <= total or total < 1:
-        raise ValueError(f"count must be between 0 and total, which is at least 1, got {count} of {total}")
-    return stats.binomtest(count, total, alternative=alternative)
-
-
-def chi_square_variance_interval(variance: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Give the chi-square interval of a variance (with N − 1), exact for normal samples and wrong for heavy tails."""
-    freedom = np.asarray(count, float) - 1
-    tail = (1 - checked(confidence)) / 2
-    sum_of_squares = np.asarray(variance, float) * freedom
-    return np.stack([sum_of_squares / stats.chi2.isf(tail, freedom), sum_of_squares / stats.chi2.ppf(tail, freedom)])
+    return float(stats.binomtest(count, total, alternative="less").proportion_ci(checked(confidence)).high)
 
 
 def bootstrap_variance_interval(
-    samples: Float[np.ndarray, "samples dim"],
-    confidence: float = 0.95,
-    *,
-    num_resamples: int = 1000,
+    samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> Float[np.ndarray, " 2"]:
     """Give the percentile bootstrap interval of a total variance, the trace of the covariance.
 
@@ -198,10 +171,7 @@ class VarianceInterval(eqx.Module):
 
 
 def variance_interval(
-    samples: Float[np.ndarray, "samples dim"],
-    confidence: float = 0.95,
-    *,
-    num_resamples: int = 1000,
+    samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> VarianceInterval:
     """Give the interval of a total variance by the method that the samples deserve, and say which.
 
@@ -212,7 +182,7 @@ def variance_interval(
 
     Samples that are not finite are left out; fewer than two give NaN.
     """
-    checked(confidence)
+    tail = (1 - checked(confidence)) / 2
     samples = np.asarray(samples, float)
     samples = samples[np.isfinite(samples).all(axis=1)]
     if len(samples) < 2:
@@ -224,7 +194,7 @@ def variance_interval(
         return VarianceInterval(total, ends, "bootstrap")
     squares = (covariance**2).sum()
     freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
-    return VarianceInterval(total, chi_square_variance_interval(total, freedom + 1, confidence), "chi_square")
+    return VarianceInterval(total, total * freedom / stats.chi2.isf([tail, 1 - tail], freedom), "chi_square")
 
 
 def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:

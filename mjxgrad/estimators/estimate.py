@@ -89,6 +89,10 @@ class GradientEstimate(eqx.Module):
         return self.num_finite / self.num_samples
 
 
+# Called as (objective, params, key), with its settings, such as num_samples, as keywords or bound by functools.partial.
+Estimator = Callable[..., GradientEstimate]
+
+
 def is_nothing_felt(plan: Plan, costs: Moments, num_felt: Int[Array, ""]) -> Bool[Array, ""]:
     """Say whether the noise of no unit made a difference, to a derivative or from one cost to another.
 

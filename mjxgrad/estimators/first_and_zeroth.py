@@ -13,12 +13,7 @@ from mjxgrad.objective import Objective, as_vector
 
 
 def first_order(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
     r"""Estimate the gradient of a smoothed objective by differentiating each sample.
 
@@ -109,21 +104,11 @@ def first_and_zeroth_order(
     Each is what `first_order` and `zeroth_order` give from the same key. They are dependent,
     and each reports what was spent on both: do not add the two.
 
-    Args:
-        objective: differentiated once per sample, under `jax.vmap`.
-        params: as in `first_order`.
-        key: consumed here; do not use it again.
-        num_samples: as in `zeroth_order`.
-        baseline: as in `zeroth_order`.
-        antithetic: as in `zeroth_order`; the first-order estimate then uses pairs, too.
-        chunk_size: as in `zeroth_order`.
+    Arguments and refusals are those of `zeroth_order`. With antithetic pairs the first-order estimate uses pairs, too.
 
     Returns:
         The first-order and the zeroth-order estimate. A sample with a finite cost whose
         derivative is not finite counts in the second only.
-
-    Raises:
-        ValueError: as in `zeroth_order`.
     """
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
     objective, vector, restore = as_vector(objective, params)

@@ -11,12 +11,7 @@ from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, as_vector
 
 
 def least_squares(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
     r"""Estimate the gradient of a smoothed objective by a linear fit to its samples, without derivatives.
 

@@ -65,12 +65,7 @@ def alpha_order(
 
 
 def control_variate(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
     r"""Estimate the gradient without bias, using derivatives as far as they explain the costs.
 
@@ -82,18 +77,7 @@ def control_variate(
     The standard error does not count that terms depend on each other through the mean derivative: at four samples it was
     up to 8 % too small in the tests, from ten on less than 2 %.
 
-    Args:
-        objective: differentiated once per sample by its noise, under `jax.vmap`.
-        params: as in `alpha_order`.
-        key: consumed here; do not use it again.
-        num_samples: as in `alpha_order`.
-        chunk_size: as in `alpha_order`.
-
-    Returns:
-        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
-
-    Raises:
-        ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
+    Arguments, units and refusals are those of `alpha_order`.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
@@ -117,22 +101,13 @@ def per_step(
     estimate is the mean of $P_j^\top(\alpha\odot\lambda_j + (1 - \alpha)\odot z_j)$. Derivatives far from the end of a
     long rollout may explode while those near it are exact, so that one weight for all would waste the latter.
 
-    Args:
-        objective: as in `alpha_order`. With noise on the parameters the steps are the parameters.
-        params: as in `alpha_order`.
-        key: consumed here; do not use it again.
-        num_samples: as in `alpha_order`.
-        rule: chooses each $\alpha_{t,a}$. None is `Consistent()`, whose first question is one for all steps;
-            `InverseVariance()` is the published IVW-H.
-        control_variate: whether the unbiased terms use derivatives.
-        chunk_size: rollouts at a time, at least 4; $\alpha$ is chosen within a chunk.
+    Arguments and refusals are those of `alpha_order`. The rule chooses each $\alpha_{t,a}$, within a chunk:
+    `Consistent()`, the default, has one first question for all steps, and `InverseVariance()` is the published IVW-H.
+    With noise on the parameters the steps are the parameters.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number for each
         step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not bounded.
-
-    Raises:
-        ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
 
     References:
         Onoda et al., arXiv:2604.18161 (IVW-H).
@@ -195,8 +170,6 @@ class Parts(Summary):
     num_felt: Int[Array, ""]
 
     def merge(self, other: "Parts") -> "Parts":
-        """Give the summary of both sets of samples."""
-
         def both(mine: Any, theirs: Any) -> Any:
             return mine.merge(theirs) if isinstance(mine, Moments) else mine + theirs
 

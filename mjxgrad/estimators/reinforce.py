@@ -1,17 +1,13 @@
 r"""REINFORCE with reward-to-go: an action answers only for what comes after it."""
 
-from typing import Literal, get_args
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.samples import Plan
+from mjxgrad.estimators.samples import Plan, check_baseline
 from mjxgrad.objective import ActionNoise, Objective, as_vector
-
-ReinforceBaseline = Literal["leave_one_out", "none"]
 
 
 def reinforce(
@@ -20,7 +16,7 @@ def reinforce(
     key: PRNGKeyArray,
     *,
     num_samples: int,
-    baseline: ReinforceBaseline = "leave_one_out",
+    baseline: str = "leave_one_out",
 ) -> GradientEstimate:
     r"""Estimate the gradient by the policy gradient theorem, an estimator for `optimise`.
 
@@ -106,7 +102,5 @@ def _checked(objective: Objective, baseline: str) -> ActionNoise:
             f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
             "use zeroth_order where there are no steps"
         )
-    choices = get_args(ReinforceBaseline)
-    if baseline not in choices:
-        raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")
+    check_baseline(baseline, ("leave_one_out", "none"))
     return objective

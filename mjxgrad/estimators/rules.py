@@ -52,7 +52,6 @@ class Evidence(eqx.Module):
 
     @property
     def real_count(self) -> Float[Array, "*blocks"]:
-        """Give the count as a real number."""
         return self.count.astype(self.first_norm.dtype)
 
     def least_variance(self) -> Float[Array, "*blocks"]:
@@ -62,12 +61,9 @@ class Evidence(eqx.Module):
 
 
 class Weights(eqx.Module):
-    """What a rule decides.
+    """What a rule decides: the weight of the first-order part, from 0 to 1, and why.
 
-    Attributes:
-        alpha: weight of the first-order part, from 0 to 1.
-        reason: why.
-        bias_bound: on the norm of the bias; NaN where the rule knows none.
+    `bias_bound` is on the norm of the bias, NaN where the rule knows none.
     """
 
     alpha: Float[Array, "*blocks"]
@@ -79,11 +75,7 @@ Rule = Callable[[Evidence], Weights]
 
 
 class FixedAlpha(eqx.Module):
-    """The same weight always.
-
-    Attributes:
-        alpha: from 0 to 1.
-    """
+    """The same weight always, from 0 to 1."""
 
     alpha: ArrayLike
 
@@ -143,11 +135,8 @@ class BiasConstrained(eqx.Module):
         """Give ε, which the error of the unbiased part exceeds with chance δ at most."""
         if self.bound is None:
             return confidence_radius(evidence.zeroth_variance, evidence.count, self.failure_probability)
-        logarithm = jnp.log((evidence.dim + 1) / self.failure_probability)
-        count = evidence.real_count
-        return jnp.sqrt(2 * evidence.zeroth_variance * logarithm / count) + 2 * jnp.asarray(self.bound) * logarithm / (
-            3 * count
-        )
+        rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.real_count
+        return jnp.sqrt(2 * evidence.zeroth_variance * rate) + 2 / 3 * jnp.asarray(self.bound) * rate
 
 
 class Concavity(eqx.Module):

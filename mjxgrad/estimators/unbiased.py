@@ -64,9 +64,7 @@ def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, w
 
 
 def _fitted_share(
-    samples: Group,
-    slopes: Float[Array, "samples samples"],
-    others: Float[Array, "samples samples"],
+    samples: Group, slopes: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 

@@ -236,13 +236,8 @@ def closed_loop(
     """
     stddev = _action_stddev(task, stddev)
     flat, unravel = (None, unchanged) if params is None else _flat(params)
-    return ClosedLoop(
-        task=task,
-        policy=as_pytree(policy),
-        stddev=stddev,
-        unravel=unravel,
-        dim=None if flat is None else flat.size,
-    )
+    dim = None if flat is None else flat.size
+    return ClosedLoop(task=task, policy=as_pytree(policy), stddev=stddev, unravel=unravel, dim=dim)
 
 
 def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:

@@ -1,6 +1,6 @@
 """What a run gives: where it ended, what it saw on the way, and why it stopped."""
 
-import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,22 +27,42 @@ class Stopped(eqx.Enumeration):
     max_seconds = "the budget of seconds was spent"
 
 
-class Record(eqx.Module):
-    """What one step of one run did, with the fields of `History`; NaN where a method has no such thing."""
+# Of JAX in the loop, of NumPy afterwards.
+Numbers, Counts = Float[Any, "..."], Int[Any, "..."]
 
-    cost: Float[Array, ""]
-    cost_error: Float[Array, ""]
-    gradient_norm: Float[Array, ""]
-    gradient_error: Float[Array, ""]
-    alpha: Float[Array, ""]
+
+class Record(eqx.Module):
+    """What one step of one run did; NaN where a method has no such thing.
+
+    Attributes:
+        cost: mean cost under noise at the parameters before the step.
+        cost_error: its standard error.
+        gradient_norm: norm of the estimate.
+        gradient_error: norm of its standard error.
+        alpha: weight of the first-order part, the mean where there are several.
+        reason: why, for the least of them.
+        bias_bound: on the norm of the bias; NaN where nothing is known.
+        scale: of the annealing; 1 without any.
+        step_norm: norm of the change of the parameters.
+        finite_fraction: share of the samples that were finite.
+        num_rollouts: spent by the step.
+        num_gradient_rollouts: of those, the ones differentiated.
+        is_taken: False for a step whose estimate was not finite.
+    """
+
+    cost: Numbers
+    cost_error: Numbers
+    gradient_norm: Numbers
+    gradient_error: Numbers
+    alpha: Numbers
     reason: Reason
-    bias_bound: Float[Array, ""]
-    scale: Float[Array, ""]
-    step_norm: Float[Array, ""]
-    finite_fraction: Float[Array, ""]
-    num_rollouts: Int[Array, ""]
-    num_gradient_rollouts: Int[Array, ""]
-    is_taken: Bool[Array, ""]
+    bias_bound: Numbers
+    scale: Numbers
+    step_norm: Numbers
+    finite_fraction: Numbers
+    num_rollouts: Counts
+    num_gradient_rollouts: Counts
+    is_taken: Bool[Any, "..."]
 
     @classmethod
     def blank(cls, dtype: jnp.dtype) -> "Record":
@@ -109,59 +129,22 @@ class Best(eqx.Module):
         return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 
 
-class History(eqx.Module):
+class History(Record):
     """A run step by step; leaves have the seeds on their first axis if there are many, and steps on their last.
 
-    A run that stopped before the others goes on as NaN, its counts as they were.
+    The fields are those of `Record`, in NumPy, the counts summed up. A run that stopped before the others goes on as
+    NaN, its counts as they were.
 
     Attributes:
-        cost: mean cost under noise at the parameters before the step.
-        cost_error: its standard error.
         noise_free_cost: what `evaluate` gave for the parameters before the step, NaN where it was not due.
-        gradient_norm: norm of the estimate; NaN where a method has none.
-        gradient_error: norm of its standard error.
-        alpha: weight of the first-order part, the mean where there are several.
-        reason: why, for the least of them.
-        bias_bound: on the norm of the bias; NaN where nothing is known.
-        scale: of the annealing; 1 without any.
-        step_norm: norm of the change of the parameters.
-        finite_fraction: share of the samples that were finite.
-        num_rollouts: spent up to and including the step.
-        num_gradient_rollouts: of those, the ones differentiated.
-        is_taken: False for a step whose estimate was not finite.
         seconds: wall-clock time up to the end of the step, without compilation, the same for all seeds. It is measured
             per segment and divided evenly among the steps of it.
     """
 
-    cost: Float[np.ndarray, "..."]
-    cost_error: Float[np.ndarray, "..."]
     noise_free_cost: Float[np.ndarray, "..."]
-    gradient_norm: Float[np.ndarray, "..."]
-    gradient_error: Float[np.ndarray, "..."]
-    alpha: Float[np.ndarray, "..."]
-    reason: Reason
-    bias_bound: Float[np.ndarray, "..."]
-    scale: Float[np.ndarray, "..."]
-    step_norm: Float[np.ndarray, "..."]
-    finite_fraction: Float[np.ndarray, "..."]
-    num_rollouts: Int[np.ndarray, "..."]
-    num_gradient_rollouts: Int[np.ndarray, "..."]
-    is_taken: np.ndarray
     seconds: Float[np.ndarray, " steps"]
 
-    @classmethod
-    def of(
-        cls, records: Record, noise_free_cost: Float[np.ndarray, "..."], seconds: Float[np.ndarray, " steps"]
-    ) -> "History":
-        """Put stacked records of steps together, counts and seconds summed up."""
-        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
-        for name in ("num_rollouts", "num_gradient_rollouts"):
-            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
-            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
-        return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(seconds))
-
     def __getitem__(self, steps: slice) -> "History":
-        """Give some of the steps."""
         return jax.tree.map(lambda leaf: leaf[..., steps], self)
 
 

@@ -16,13 +16,13 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad.estimators import Reason
+from mjxgrad.estimators.estimate import Estimator, Reason
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.parameters import Restored
 from mjxgrad.optimiser import checkpoint
 from mjxgrad.optimiser.annealing import Annealing
 from mjxgrad.optimiser.result import Best, History, Optimisation, Record, Stopped
-from mjxgrad.optimiser.step import AnnealedObjective, Estimator, GradientStep, Method, TrustRegion
+from mjxgrad.optimiser.step import AnnealedObjective, GradientStep, Method, TrustRegion
 from mjxgrad.optimiser.stopping import Convergence, Recent, has_converged
 
 # Progress shows in steps of five per cent; each costs one return from the device.
@@ -31,6 +31,10 @@ DEFAULT_NUM_SEGMENTS = 20
 # Where nothing was felt and nothing moved, the next step differs by its noise alone. Three draws of it: a jump that one
 # sample in thirty meets goes unseen by three steps of 50 with a chance of 0.6 %.
 STILL_STEPS = 3
+
+
+def _as_path(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 class RunOptions(eqx.Module):
@@ -65,7 +69,7 @@ class RunOptions(eqx.Module):
     max_seconds: float | None = None
     segment: int | None = None
     log: Callable[[int, Mapping[str, float]], None] | None = None
-    checkpoint: str | Path | None = None
+    checkpoint: Path | None = eqx.field(default=None, converter=_as_path)
     checkpoint_every: int = 1
 
     def __check_init__(self):
@@ -78,14 +82,9 @@ class RunOptions(eqx.Module):
             raise ValueError(f"max_rollouts must be below 2**30, got {self.max_rollouts}; leave it out for no limit")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ValueError(f"max_seconds must be positive, got {self.max_seconds}")
-        if self.path is not None and not self.path.parent.is_dir():
-            folder = self.path.parent
-            raise ValueError(f"checkpoint must be in a folder that exists, got {self.path}; make {folder} first")
-
-    @property
-    def path(self) -> Path | None:
-        """Return the file of the checkpoint."""
-        return None if self.checkpoint is None else Path(self.checkpoint)
+        if self.checkpoint is not None and not self.checkpoint.parent.is_dir():
+            folder = self.checkpoint.parent
+            raise ValueError(f"checkpoint must be in a folder that exists, got {self.checkpoint}; make {folder} first")
 
     @property
     def segment_size(self) -> int:
@@ -120,8 +119,14 @@ class Saved(NamedTuple):
     seconds: Float[np.ndarray, " steps"]
 
     def history(self) -> History:
-        """Put the history together, as far as any run has come."""
-        return History.of(*self.trace, self.seconds)[: int(np.max(self.carry.num_steps))]
+        """Put the history together, as far as any run has come, counts and seconds summed up."""
+        records, noise_free_cost = self.trace
+        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
+        for name in ("num_rollouts", "num_gradient_rollouts"):
+            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
+            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
+        history = History(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(self.seconds))
+        return history[: int(np.max(self.carry.num_steps))]
 
     def metrics(self) -> dict[str, float]:
         """Give the last step, the mean over the seeds that took it; NaN where there is no such thing."""
@@ -230,10 +235,10 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
     nothing = Record.blank(params.dtype), jnp.zeros((), params.dtype)
     saved = Saved(carry, jax.tree.map(lambda x: np.zeros((*key.shape, 0), x.dtype), nothing), np.zeros(0))
     fingerprint = {}
-    if options.path is not None:
+    if options.checkpoint is not None:
         fingerprint = _fingerprint(options, params, key, arrays, lowered)
-        if options.path.exists():
-            saved = checkpoint.load(options.path, saved, fingerprint)
+        if options.checkpoint.exists():
+            saved = checkpoint.load(options.checkpoint, saved, fingerprint)
 
     saved, stopped = _loop(functools.partial(program.advance, arrays, key), saved, options, fingerprint)
     final_cost, best = over_seeds(_finish, None, 0)(arrays, saved.carry)
@@ -266,15 +271,15 @@ def _loop(
                 break
             saved = advance(saved)
             is_due = saved.seconds.size - on_disk >= options.checkpoint_every * options.segment_size
-            if options.path is not None and is_due:
-                checkpoint.save(options.path, saved, fingerprint)
+            if options.checkpoint is not None and is_due:
+                checkpoint.save(options.checkpoint, saved, fingerprint)
                 on_disk = saved.seconds.size
             if options.log is not None:
                 options.log(int(np.max(saved.carry.num_steps)), saved.metrics())
     finally:
         # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
-        if options.path is not None and saved.seconds.size > on_disk:
-            checkpoint.save(options.path, saved, fingerprint)
+        if options.checkpoint is not None and saved.seconds.size > on_disk:
+            checkpoint.save(options.checkpoint, saved, fingerprint)
     is_cut = (saved.carry.stopped == Stopped.running) & is_late
     return saved, jax.tree.map(lambda x, y: jnp.where(is_cut, x, y), Stopped.max_seconds, saved.carry.stopped)
 
@@ -286,7 +291,6 @@ class _Program:
         self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
 
     def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
-        """Run one segment more."""
         began = time.perf_counter()
         if self.compiled is None:
             self.compiled = self.lowered.compile()

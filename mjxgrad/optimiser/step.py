@@ -11,12 +11,11 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad.estimators import GradientEstimate
+from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, flattened, of_vector
 from mjxgrad.optimiser.annealing import Annealing, as_annealing
 from mjxgrad.optimiser.result import Record
 
-Estimator = Callable[[Objective, Float[Array, " dim"], PRNGKeyArray], GradientEstimate]
 AnnealedObjective = Callable[[Float[Array, ""]], Objective]
 
 
@@ -79,11 +78,7 @@ class TrustRegion(eqx.Module):
         bias_bound: Float[Array, ""],
         objective: Objective,
     ) -> Float[Array, " dim"]:
-        """Shorten a step along an estimate, not clipped, where it is too long.
-
-        Raises:
-            ValueError: if the objective's noise is not on the parameters and `step_scale` was not given.
-        """
+        """Shorten a step along an estimate, not clipped, where it is too long."""
         unit = self.step_scale
         if unit is None:
             unit = parameter_stddev(objective, step.size)
@@ -231,17 +226,9 @@ def estimated_gradient(
             params = optax.apply_updates(params, change)
         state.estimate  # the last one, with its error bars
 
-    Update number n draws its noise from `fold_in(key, n)`, as `optimise` does, so both give the same trajectory.
-
-    Args:
-        objective: what to minimise, or with `annealing` a function from a scale to it.
-        key: of all updates.
-        estimator: called as `estimator(objective, params, key)`.
-        optimiser: from optax. None gives the gradient itself, clipped, to be chained with others; a trust region needs
-            an optimiser, for it limits steps.
-        annealing: a schedule from step to scale, or a `Plateau`.
-        trust_region: how far a step may go.
-        clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
+    Update number n draws its noise from `fold_in(key, n)`, as `optimise` does, so both give the same trajectory. The
+    arguments are those of `optimise`, but `optimiser` may be None, which gives the gradient itself, clipped, to be chained
+    with others; a trust region needs an optimiser, for it limits steps.
 
     Returns:
         A transformation of a vector, or of a pytree as in `optimise`. What it is given as updates is added to the

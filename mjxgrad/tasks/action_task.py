@@ -30,14 +30,9 @@ class ActionTask(SceneTask):
     def objective(
         self, stddev: float | Float[Array, "..."] | None = None, softness: Softness | None = None
     ) -> ActionNoise:
-        """Return the cost under noise on the actions.
+        """Return the cost under noise on the actions, a function of the controls, or of the policy's parameters.
 
-        Args:
-            stddev: of the noise, in units of the controls; None takes that of the task.
-            softness: of contact; None leaves it as it is.
-
-        Returns:
-            The objective; its parameters are the controls, or those of the policy.
+        The noise is in units of the controls; None takes that of the task, and leaves the softness of contact as it is.
         """
         task = self if softness is None else self.with_softness(softness)
         stddev = self.stddev if stddev is None else stddev
@@ -51,13 +46,7 @@ class ActionTask(SceneTask):
 
 
 def scene_path(name: str) -> Path:
-    """Find the MJCF file of a task.
-
-    Args:
-        name: the task's.
-
-    Returns:
-        The path of its scene.
+    """Find the MJCF file of a task by its name.
 
     Raises:
         FileNotFoundError: if there is no such file; the message says where it was looked for.

@@ -39,13 +39,8 @@ class BallWall(InScene):
     def trajectory(self, angle: Float[Array, " 1"]) -> Trajectory:
         """Throw once, at an angle above the floor, in rad."""
         qvel = self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])])
-        return rollout(
-            self.scene,
-            initial_state(self.scene, qvel=qvel),
-            horizon=self.horizon,
-            gradient=self.gradient,
-            onset=self.onset,
-        )
+        start = initial_state(self.scene, qvel=qvel)
+        return rollout(self.scene, start, horizon=self.horizon, gradient=self.gradient, onset=self.onset)
 
     def cost(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
         """Return the squared distance from the ball's end to the target, in m²; NaN if the rollout diverged."""
@@ -53,42 +48,21 @@ class BallWall(InScene):
         return finite_cost((trajectory.qpos[-1, 0] - self.target) ** 2, trajectory)
 
     def objective(self, stddev: float | Float[Array, ""] = 0.1, softness: Softness | None = None) -> ParameterNoise:
-        """Return the cost as a function of the angle, with noise on the angle.
+        """Return the cost as a function of the angle, with noise on the angle (`stddev` in rad).
 
-        Args:
-            stddev: of the noise, in rad.
-            softness: of contact; None leaves it as it is. For the wall alone see `wall_softness`.
-
-        Returns:
-            The objective; its parameter is the angle.
+        Softness is of all contact, None leaves it as it is; for the wall alone see `wall_softness`.
         """
         task = self if softness is None else self.with_softness(softness)
         return parameter_noise(task.cost, stddev, dim=1)
 
 
-def ball_wall(
-    *,
-    speed: float = 2.0,
-    target: float = 0.38,
-    horizon: int = 210,
-    timestep: float | None = None,
-) -> BallWall:
-    """Load the throw.
+def ball_wall() -> BallWall:
+    """Load the throw, at 2 m/s at a target 0.38 m away, over 0.42 s, when every throw has landed and stopped.
 
-    With the scene's wall (0.2 m away, 8 cm high) and speed a throw between about 35 and 74 degrees clears the wall, and
-    the landscape jumps at 35; the best throw at the target is at 57 degrees.
-
-    Args:
-        speed: of the throw, in m/s.
-        target: where the ball should end, in m from the start.
-        horizon: number of steps; the default is 0.42 s, when every throw has landed and stopped.
-        timestep: in s; None takes the scene's, 2 ms.
-
-    Returns:
-        The task.
+    With the scene's wall (0.2 m away, 8 cm high) a throw between about 35 and 74 degrees clears the wall, and the
+    landscape jumps at 35; the best throw at the target is at 57 degrees.
     """
-    scene = load_scene(scene_path("ball_wall"), timestep=timestep)
-    return BallWall(scene, jnp.asarray(speed), jnp.asarray(target), horizon)
+    return BallWall(load_scene(scene_path("ball_wall")), jnp.asarray(2.0), jnp.asarray(0.38), horizon=210)
 
 
 def wall_softness(stiffness: float | Float[Array, "..."], damping_ratio: float | Float[Array, "..."] = 1.0) -> Softness:

@@ -21,7 +21,6 @@ from mjxgrad.scene import load_scene
 from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.action_task import scene_path
 
-BILLIARDS_CONTACT = (("driven", "knocked"),)
 _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)
 
 
@@ -49,7 +48,6 @@ class Billiards(InScene):
         return jnp.repeat(params.reshape(self.num_pieces, 2), self.horizon // self.num_pieces, axis=0)
 
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
-        """Play once."""
         start = initial_state(self.scene)
         return rollout(
             self.scene, start, self.controls(params), gradient=self.gradient, onset=self.onset, smoothing=self.smoothing
@@ -69,32 +67,24 @@ class Billiards(InScene):
         return dataclasses.replace(self, scene=scene)
 
     def objective(self, stddev: float | Float[Array, ""]) -> ParameterNoise:
-        """Return the cost as a function of the forces, with noise on each of them.
-
-        Args:
-            stddev: of the noise, in N.
-
-        Returns:
-            The objective.
-        """
+        """Return the cost as a function of the forces, with noise on each of them, in N."""
         return parameter_noise(self.cost, stddev, dim=2 * self.num_pieces)
 
 
-def billiards(*, num_pieces: int = 20, timestep: float | None = None) -> Billiards:
+def billiards(*, num_pieces: int = 20) -> Billiards:
     """Load the stroke: the balls are 1.01 m apart, the target is 1.41 m behind the second, and there is one second of time.
 
     Args:
         num_pieces: the force is constant over as many pieces of the second; with 20 the optimum is dearer by 0.0005 than
-            that of a force that may change at any time.
-        timestep: in s; None takes the scene's, 1/960 s. It must divide a piece.
+            that of a force that may change at any time. It must divide 960, the steps of a second.
 
     Returns:
         The task; its parameters are the forces, in N.
 
     Raises:
-        ValueError: if the pieces are not whole numbers of steps.
+        ValueError: if `num_pieces` does not divide the steps.
     """
-    scene = load_scene(scene_path("billiards"), timestep=timestep)
+    scene = load_scene(scene_path("billiards"))
     horizon = round(1 / scene.mj_model.opt.timestep)
     if num_pieces < 1 or horizon % num_pieces:
         raise ValueError(f"num_pieces must divide the {horizon} steps of a second, got {num_pieces}")

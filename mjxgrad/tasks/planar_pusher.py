@@ -14,7 +14,7 @@ from mjxgrad.planning.system import SceneSystem
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import scene_path
 
-# 0.1 s per decision: four time constants of the damped rod.
+# Of 0.01 s; a decision every 0.1 s, four time constants of the damped rod.
 _NUM_SUBSTEPS = 10
 _HALF_LENGTH = 0.1  # m, of the rod's axis
 _BESIDE = 0.045  # m from that axis to the finger's centre: both radii and 5 mm
@@ -25,7 +25,7 @@ class PlanarPusher(eqx.Module):
     """Where the rod is and where it is to be.
 
     Attributes:
-        system: finger and rod, a decision every 0.1 s.
+        system: finger and rod.
         start: the first state, at rest.
         goal: with the rod where it is to be; only its coordinates count.
         speed_limit: of the finger (m/s).
@@ -53,28 +53,23 @@ def beside_rod(key: PRNGKeyArray, state: Float[Array, " state"]) -> Float[Array,
 
 def planar_pusher(
     finger: tuple[float, float] = (0.0, -0.15),
-    rod: tuple[float, float, float] = (0.0, 0.0, 0.0),
     goal: tuple[float, float, float] = (0.0, 0.12, 0.0),
-    *,
-    num_substeps: int = _NUM_SUBSTEPS,
 ) -> PlanarPusher:
-    """Load the pusher.
+    """Load the pusher; the rod, a capsule of radius 0.02 m and length 0.24 m, starts at the origin.
 
     Args:
         finger: where it starts, x and y (m). It has a radius of 0.02 m.
-        rod: where it starts, x, y (m) and turn (rad). It is a capsule of radius 0.02 m and length 0.24 m.
-        goal: where the rod is to be.
-        num_substeps: of 0.01 s, per decision.
+        goal: where the rod is to be, x, y (m) and turn (rad).
 
     Returns:
         The task.
     """
     scene = load_scene(scene_path("planar_pusher"))
     # The sizes are the scene's; pyright takes them for arguments, since `System` declares them as variables.
-    system = SceneSystem(scene=scene, num_substeps=num_substeps)  # pyright: ignore[reportCallIssue]
+    system = SceneSystem(scene=scene, num_substeps=_NUM_SUBSTEPS)  # pyright: ignore[reportCallIssue]
 
     def at(pose: tuple[float, float, float]) -> Float[Array, " state"]:
         qpos = jnp.concatenate([jnp.asarray(finger, float), jnp.asarray(pose, float)])
         return system.flatten(initial_state(system.scene, qpos=qpos))
 
-    return PlanarPusher(system, at(rod), at(goal))
+    return PlanarPusher(system, at((0.0, 0.0, 0.0)), at(goal))

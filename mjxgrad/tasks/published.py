@@ -43,12 +43,7 @@ class QuadraticCost(eqx.Module):
 
 
 class DynamicsTask(Task):
-    """A task whose state is a vector; a subclass gives `advance` and the nominal start.
-
-    Attributes:
-        cost: of states and controls.
-        horizon: number of steps.
-    """
+    """A task whose state is a vector; a subclass gives `advance` and the nominal start."""
 
     cost: QuadraticCost
     horizon: int = eqx.field(static=True)
@@ -64,7 +59,6 @@ class DynamicsTask(Task):
         noise: Float[Array, "horizon nu"] | None = None,
         start: Float[Array, " states"] | None = None,
     ) -> Outcome:
-        """Roll out once; see `Task.run`."""
         start = self.nominal_start() if start is None else start
         shape = (self.horizon, self.num_controls)
         rows = jnp.zeros(shape) if callable(controls) else controls
@@ -89,12 +83,8 @@ SLOPE, LIMIT = 1.8, 0.18  # N s/m, N
 class Push(DynamicsTask):
     r"""The state is two positions (m) and two velocities (m/s), the control a force (N) on the first body.
 
-    With $d = x_2 - x_1$ the spring pushes with $F = k(1 - d)$ where $d < 1$. Velocities are stepped first, and
-    positions with the new ones.
-
-    Attributes:
-        stiffness: k, in N/m.
-        velocity_factor: what is left of a velocity after a step.
+    With $d = x_2 - x_1$ the spring of stiffness $k$ (N/m) pushes with $F = k(1 - d)$ where $d < 1$. Velocities are
+    stepped first, of which a factor is left after each step, and positions with the new ones.
     """
 
     stiffness: Float[Array, ""]
@@ -106,7 +96,6 @@ class Push(DynamicsTask):
         return jnp.array([0.0, REACH, 0.0, 0.0])
 
     def advance(self, state: Float[Array, " 4"], control: Float[Array, " 1"]) -> Float[Array, " 4"]:
-        """Return the next state."""
         positions, velocities = state[:2], state[2:]
         force = self.stiffness * jnp.maximum(REACH - (positions[1] - positions[0]), 0.0)
         accelerations = jnp.stack([control[0] - force, force]) / MASS
@@ -140,7 +129,6 @@ class Friction(DynamicsTask):
         return jnp.zeros(4)
 
     def advance(self, state: Float[Array, " 4"], control: Float[Array, " 1"]) -> Float[Array, " 4"]:
-        """Return the next state."""
         positions, velocities = state[:2], state[2:]
         is_touching = jnp.abs(positions[1] - positions[0]) < OVERLAP
         drag = jnp.where(is_touching, jnp.clip(SLOPE * (velocities[0] - velocities[1]), -LIMIT, LIMIT), 0.0)
@@ -159,20 +147,11 @@ _START_STDDEV = 0.001
 
 
 class LQR(DynamicsTask):
-    """The state is a vector x, the control a vector u of the same size, and x' = x + u.
+    """The state is a vector x, the control a vector u of the same size, and x' = x + u."""
 
-    Attributes:
-        cost: quadratic.
-        num_controls: size of both.
-        horizon: number of steps.
-    """
-
-    cost: QuadraticCost
     num_controls: int = eqx.field(static=True)
-    horizon: int = eqx.field(static=True)
 
     def nominal_start(self) -> Float[Array, " states"]:
-        """Return all ones."""
         return jnp.ones(self.num_controls)
 
     def sample_start(self, key: PRNGKeyArray) -> Float[Array, " states"]:
@@ -180,7 +159,6 @@ class LQR(DynamicsTask):
         return self.nominal_start() + _START_STDDEV * jax.random.normal(key, (self.num_controls,))
 
     def advance(self, state: Float[Array, " states"], control: Float[Array, " states"]) -> Float[Array, " states"]:
-        """Return the next state."""
         return state + control
 
 
@@ -202,11 +180,9 @@ class MotionPlanning(DynamicsTask):
     num_controls: int = eqx.field(static=True, default=2)
 
     def nominal_start(self) -> Float[Array, " 2"]:
-        """Return the origin."""
         return jnp.zeros(2)
 
     def advance(self, state: Float[Array, " 2"], control: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        """Return the next position."""
         moved = state + _POINT_TIMESTEP * control
         squared_distances = ((moved - jnp.array(CENTRES)) ** 2).sum(axis=1)
         is_blocked = (squared_distances < jnp.array(RADII) ** 2).any()
@@ -251,7 +227,6 @@ class Tennis(DynamicsTask):
         return jnp.concatenate([position, velocity, pad])
 
     def advance(self, state: Float[Array, " 7"], control: Float[Array, " 3"]) -> Float[Array, " 7"]:
-        """Return the next state."""
         position, velocity, pad = state[:2], state[2:4], state[4:]
         moved, moved_pad = position + _PAD_TIMESTEP * velocity, pad + _PAD_TIMESTEP * control
         cosine, sine = jnp.cos(moved_pad[2]), jnp.sin(moved_pad[2])

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.contact import Softness
@@ -36,16 +36,10 @@ def quadratic_cost(quadratic: published.QuadraticCost, trajectory: Trajectory) -
 
 
 def push(stiffness: float = 10.0, *, horizon: int = 200) -> ActionTask:
-    """Load the push: both balls are to be 1 m ahead and at rest, the second above all.
+    """Load the push: both balls are to be 1 m ahead and at rest, the second above all; 200 steps are 1 s.
 
-    The published tasks of 10 and 1000 N/m differ in damping and horizon, too; here in stiffness alone.
-
-    Args:
-        stiffness: of the contact, in N/m.
-        horizon: number of steps; the default is 1 s.
-
-    Returns:
-        The task. The state is how far both have come, then their velocities; the control is the force on the first, in N.
+    The published tasks of 10 and 1000 N/m differ in damping and horizon, too; here in stiffness (N/m) alone. The state is
+    how far both have come, then their velocities; the control is the force on the first, in N.
     """
     scene = load_scene(scene_path("push"), softness=push_softness(stiffness))
     weight = jnp.array([0.1, 10.0, 0.1, 0.1])
@@ -69,16 +63,10 @@ def push_softness(stiffness: float | Float[Array, "..."], damping_ratio: float |
 
 
 def friction(*, horizon: int = 400) -> ActionTask:
-    """Load the tray and the puck: both are to be 2 m ahead and at rest, the puck above all.
+    """Load the tray and the puck: both are to be 2 m ahead and at rest, the puck above all; 400 steps are 2 s.
 
-    A puck that is off the tray falls, at the speed ahead that it has.
-
-    Args:
-        horizon: number of steps; the default is 2 s.
-
-    Returns:
-        The task. The state is the positions of the tray and of the puck (ahead, and above the tray's level), then
-        their velocities; the control is the force on the tray, in N.
+    A puck that is off the tray falls, at the speed ahead that it has. The state is the positions of the tray and of the
+    puck (ahead, and above the tray's level), then their velocities; the control is the force on the tray, in N.
     """
     scene = load_scene(scene_path("friction"))
     weight = jnp.array([0.1, 10.0, 0.0, 0.1, 0.1, 0.0])
@@ -87,15 +75,10 @@ def friction(*, horizon: int = 400) -> ActionTask:
 
 
 def motion_planning(*, horizon: int = 100) -> ActionTask:
-    """Load the robot and the pillars: it is to reach the point 4 m ahead and stay.
+    """Load the robot and the pillars: it is to reach the point 4 m ahead and stay; 100 steps are 2 s.
 
-    There are half as many steps as published, of twice the length.
-
-    Args:
-        horizon: number of steps; the default is 2 s.
-
-    Returns:
-        The task. The state is position and velocity; the controls are the velocities asked for, in m/s.
+    There are half as many steps as published, of twice the length. The state is position and velocity; the controls are
+    the velocities asked for, in m/s.
     """
     scene = load_scene(scene_path("motion_planning"))
     weight = jnp.array([1.0, 1.0, 0.0, 0.0])
@@ -104,18 +87,12 @@ def motion_planning(*, horizon: int = 100) -> ActionTask:
 
 
 class Starts(eqx.Module):
-    """Draws the published starts: a ball on its way to the origin, and a pad near it.
-
-    Attributes:
-        like: a state of the scene.
-        task: the one that has the distribution.
-    """
+    """Draws the published starts of a task, as states like one of the scene."""
 
     like: State
     task: published.Tennis
 
     def __call__(self, key: PRNGKeyArray) -> State:
-        """Draw a state."""
         return self.state(self.task.sample_start(key))
 
     def state(self, vector: Float[Array, " 7"]) -> State:
@@ -129,14 +106,10 @@ class Starts(eqx.Module):
 
 
 def tennis(*, horizon: int = 200) -> ActionTask:
-    """Load the ball and the pad: the ball is to end at rest 2.5 m from where the pad begins.
+    """Load the ball and the pad: the ball is to end at rest 2.5 m from where the pad begins; 200 steps are 10 s.
 
-    Args:
-        horizon: number of steps; the default is 10 s.
-
-    Returns:
-        The task. The policy sees the ball's position and velocity, then the pad's position and angle, and gives the pad's
-        velocity and rate of turning (m, m/s, rad, rad/s).
+    The policy sees the ball's position and velocity, then the pad's position and angle, and gives the pad's velocity and
+    rate of turning (m, m/s, rad, rad/s).
     """
     scene = load_scene(scene_path("tennis"))
     original = published.tennis()
@@ -161,13 +134,7 @@ def published_state(state: State) -> Float[Array, " 7"]:
 
 
 def _quadratic_task(
-    scene: Scene,
-    cost: published.QuadraticCost,
-    horizon: int,
-    *,
-    start_params: PyTree,
-    state: State | None = None,
-    **options: Any,
+    scene: Scene, cost: published.QuadraticCost, horizon: int, *, state: State | None = None, **options: Any
 ) -> ActionTask:
     """Make a task with a quadratic cost of positions, velocities and controls; from rest unless another start is given."""
     # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
@@ -176,6 +143,5 @@ def _quadratic_task(
         state=initial_state(scene) if state is None else state,
         cost=Partial(quadratic_cost, cost),
         horizon=horizon,
-        start_params=start_params,
         **options,
     )

@@ -28,6 +28,7 @@ from mjxgrad.tasks.action_task import ActionTask, scene_path
 NUM_PILLARS = 8
 DENT = (2, 3, 4, 5)
 DEPTH = 0.015  # m
+CONTROL_WEIGHT = 1e-3  # of the mean square of the controls
 STIFFNESS = 1e4  # 1/s², of the scene's contact, which is critically damped
 
 
@@ -36,22 +37,19 @@ class DentCost(eqx.Module):
 
     Attributes:
         target: heights of the pillars, less those at rest (m).
-        control_weight: of the mean square of the controls.
         proximity_weight: of the mean square of the distance between pin and bed, over that at the start.
         centre: of the pin at rest, less those of the pillars' caps (m): x, z.
         reach: radii of pin and cap together (m).
     """
 
     target: Float[Array, " pillars"]
-    control_weight: Float[Array, ""]
     proximity_weight: Float[Array, ""]
     centre: Float[Array, "pillars 2"]
     reach: Float[Array, ""]
 
     def __call__(self, trajectory: Trajectory) -> Float[Array, ""]:
-        """Return the cost of a rollout."""
         error = jnp.sum((trajectory.qpos[-1, 2:] - self.target) ** 2) / jnp.sum(self.target**2)
-        effort = self.control_weight * jnp.mean(trajectory.ctrl**2)
+        effort = CONTROL_WEIGHT * jnp.mean(trajectory.ctrl**2)
         distance = jax.vmap(self.distance)(trajectory.qpos)
         far = jnp.maximum(distance, 0.0) / self.distance(jnp.zeros_like(trajectory.qpos[0]))
         return error + effort + self.proximity_weight * jnp.mean(far**2)
@@ -84,18 +82,11 @@ class RollingPin(ActionTask):
         return self.run(params.reshape(self.horizon, self.num_controls)).cost
 
 
-def rolling_pin(*, horizon: int = 120, control_weight: float = 1e-3) -> RollingPin:
+def rolling_pin(*, horizon: int = 120) -> RollingPin:
     """Load the task: four of eight pillars are to be 15 mm lower in the end.
 
     Controls are the forces on the pin along x and z, in units of 10 N. The pin begins at rest 30 mm above the first of the
-    four, so that it has to come down, and then to roll along.
-
-    Args:
-        horizon: number of steps of 5 ms.
-        control_weight: of the mean square of the controls.
-
-    Returns:
-        The task.
+    four, so that it has to come down, and then to roll along. A step is 5 ms.
     """
     scene = load_scene(scene_path("rolling_pin"))
     model = scene.mj_model
@@ -106,7 +97,6 @@ def rolling_pin(*, horizon: int = 120, control_weight: float = 1e-3) -> RollingP
     target[list(DENT)] = -DEPTH
     cost = DentCost(
         target=jnp.asarray(target),
-        control_weight=jnp.asarray(control_weight, float),
         proximity_weight=jnp.zeros(()),
         centre=jnp.asarray((at_rest[pin] - at_rest[caps])[:, [0, 2]]),
         reach=jnp.asarray(model.geom_size[pin, 0] + model.geom_size[caps[0], 0]),

@@ -23,24 +23,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mjxgrad._static import known
-from mjxgrad.contact.bounce import Bounce, integrated_restitution
+from mjxgrad.contact.bounce import Bounce, integrated_restitution  # noqa: F401  # what a bounce should give
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import Scene, load_scene
-
-__all__ = [
-    "BallOverWall",
-    "Bounce",
-    "Heaviside",
-    "QuadraticSine",
-    "SoftHeaviside",
-    "Textbook",
-    "ball_over_wall",
-    "bounce_scene",
-    "heaviside",
-    "integrated_restitution",
-    "quadratic_sine",
-    "soft_heaviside",
-]
 
 # Beyond nine standard deviations a Gaussian is below 1e-17. Pieces of at most one standard deviation with 16 nodes are
 # exact to rounding for all costs here (a sine of two periods per standard deviation included).
@@ -83,13 +68,8 @@ class Textbook(eqx.Module):
     def zeroth_order_variance(self, point: ArrayLike, stddev: ArrayLike, baseline: ArrayLike = 0.0) -> Float[Array, ""]:
         r"""Return the variance of one sample of the zeroth-order estimate, $(f(\theta + w) - b)\,w/\sigma^2$.
 
-        Args:
-            point: $\theta$.
-            stddev: $\sigma$.
-            baseline: $b$, a number that does not depend on the sample: 0, the cost without noise, or any other.
-
-        Returns:
-            $\mathbb{E}[(f - b)^2 w^2]/\sigma^4 - F'^2$, by quadrature where there is no closed form.
+        It is $\mathbb{E}[(f - b)^2 w^2]/\sigma^4 - F'^2$, by quadrature where there is no closed form. The baseline $b$
+        does not depend on the sample: 0, the cost without noise, or any other number.
         """
         second = self._mean(lambda x, z: ((jax.vmap(self)(x[:, None]) - baseline) * z / stddev) ** 2, point, stddev)
         return second - self.gradient(point, stddev) ** 2
@@ -98,15 +78,8 @@ class Textbook(eqx.Module):
         r"""Return the variance of the whole zeroth-order estimate with its leave-one-out baseline.
 
         The estimate is the sample covariance of cost and score, whose variance is
-        $\mathrm{Var}[(f - F)s]/N + (\mathrm{Var} f\,\mathrm{Var} s + F'^2)/(N(N - 1))$ for every $N \ge 2$.
-
-        Args:
-            point: $\theta$.
-            stddev: $\sigma$.
-            num_samples: $N$.
-
-        Returns:
-            The variance; times $N$ it tends to `zeroth_order_variance` with baseline $F$.
+        $\mathrm{Var}[(f - F)s]/N + (\mathrm{Var} f\,\mathrm{Var} s + F'^2)/(N(N - 1))$ for every number of samples
+        $N \ge 2$. Times $N$ it tends to `zeroth_order_variance` with baseline $F$.
         """
         mean = self.smoothed(point, stddev)
         single = self.zeroth_order_variance(point, stddev, mean)
@@ -149,7 +122,6 @@ class Heaviside(Textbook):
     """See `heaviside`."""
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return 1 from zero on, else 0."""
         return jnp.where(x[0] >= 0, jnp.ones_like(x[0]), 0)
 
     @property
@@ -175,7 +147,6 @@ class SoftHeaviside(Textbook):
     width: Float[Array, ""]
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return the ramp."""
         return jnp.clip(2 * x[0] / self.width, -1, 1)
 
     @property
@@ -230,7 +201,6 @@ class QuadraticSine(Textbook):
     frequency: Float[Array, ""]
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
-        """Return the rippled parabola."""
         return x[0] ** 2 + self.amplitude * jnp.sin(self.frequency * x[0])
 
     @property
@@ -393,12 +363,8 @@ _SCENE = """
 
 
 def bounce_scene(timestep: float = 1e-3) -> Scene:
-    """Load the ball over the floor; its position is its height above it, in m. Contact is MuJoCo's default.
+    """Load the ball over the floor, without gravity and `refsafe`; the time step is in s.
 
-    Args:
-        timestep: in s.
-
-    Returns:
-        The scene, without gravity and without `refsafe`.
+    Its position is its height above the floor, in m. Contact is MuJoCo's default.
     """
     return load_scene(_SCENE.format(timestep=timestep))

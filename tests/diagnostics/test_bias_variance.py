@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from mjxgrad.diagnostics import Landscape, bias_variance, mean_interval
 from mjxgrad.diagnostics.reference import cell_points
-from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, chi_square_variance_interval
+from mjxgrad.diagnostics.statistics import bootstrap_variance_interval
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import STDDEV
@@ -190,12 +190,6 @@ def test_intervals_of_means_cover_as_often_as_they_say():
     error = samples.std(axis=1, ddof=1) / np.sqrt(6)
     low, high = mean_interval(samples.mean(axis=1), error, 6, 0.9)
     assert ((low < 3) & (high > 3)).mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
-
-
-def test_chi_square_intervals_cover_as_often_as_they_say_for_normal_samples():
-    samples = np.random.default_rng(1).normal(3.0, 2.0, (4000, 6))
-    low, high = chi_square_variance_interval(samples.var(axis=1, ddof=1), 6, 0.9)
-    assert ((low < 4) & (high > 4)).mean() == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
 
 
 def test_bootstrap_intervals_cover_where_samples_are_not_normal():

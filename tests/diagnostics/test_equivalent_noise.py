@@ -70,7 +70,6 @@ def test_profiles_of_any_kind_are_told_apart():
     ("profile", "settings", "message"),
     [
         (lambda r: -r, {"reach": 0.0}, "reach must be positive, got 0"),
-        (lambda r: -r, {"reach": 1.0, "num_points": 5}, "num_points must be at least 101, got 5"),
         (lambda r: jnp.sqrt(-r), {"reach": 1.0}, "profile must be finite, got nan"),
     ],
 )
