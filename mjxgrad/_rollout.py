@@ -302,12 +302,7 @@ def check_trajectory(trajectory: Trajectory) -> None:
 def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
     """Give data in a state, ready to be stepped."""
     return scene.data.replace(
-        qpos=state.qpos,
-        qvel=state.qvel,
-        act=state.act,
-        time=state.time,
-        qacc_warmstart=state.warmstart,
-        ctrl=ctrl,
+        qpos=state.qpos, qvel=state.qvel, act=state.act, time=state.time, qacc_warmstart=state.warmstart, ctrl=ctrl
     )
 
 

@@ -230,11 +230,7 @@ def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
     solref1, solref2 = model.geom_solref[geom1], model.geom_solref[geom2]
     both_standard = (solref1[:, :1] > 0) & (solref2[:, :1] > 0)
     # Numbers of the direct format are negative, so the smaller one is the stiffer one.
-    solref = jnp.where(
-        both_standard,
-        weight * solref1 + (1 - weight) * solref2,
-        jnp.minimum(solref1, solref2),
-    )
+    solref = jnp.where(both_standard, weight * solref1 + (1 - weight) * solref2, jnp.minimum(solref1, solref2))
     solimp = weight * model.geom_solimp[geom1] + (1 - weight) * model.geom_solimp[geom2]
     friction = jnp.maximum(model.geom_friction[geom1], model.geom_friction[geom2])
 

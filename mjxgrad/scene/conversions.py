@@ -233,11 +233,7 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
         names = [element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in np.flatnonzero(differs).tolist()]
         reason = "its velocity derivative ignores force and control limits and muscles"
         yield Conversion(
-            f"integrator at {name_pairs(names)}",
-            "implicitfast",
-            "MJX's implicitfast",
-            reason,
-            exact=False,
+            f"integrator at {name_pairs(names)}", "implicitfast", "MJX's implicitfast", reason, exact=False
         )
 
 

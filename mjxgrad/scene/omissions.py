@@ -100,8 +100,7 @@ def _num_visual_geoms(model: mujoco.MjModel) -> int:
 def _num_unused_sites(model: mujoco.MjModel) -> int:
     """Sites at which no tendon, actuator or equality constraint acts."""
     wraps_site = np.isin(
-        model.wrap_type,
-        [mujoco.mjtWrap.mjWRAP_SITE, mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER],
+        model.wrap_type, [mujoco.mjtWrap.mjWRAP_SITE, mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER]
     )
     if wraps_site.any() or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any():
         return 0
