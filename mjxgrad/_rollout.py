@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import known
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene, SceneWarning

@@ -24,8 +24,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known_to_be
 
 # Halvings of the bracket; a Newton step ends the search.
 _HALVINGS = 50

@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import geom_pairs, mjx
 from mjxgrad.contact.law import rest_depth, stiffness_damping
 

@@ -16,9 +16,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import as_float, is_known, safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.law import compensated_stiffness
 from mjxgrad.contact.parameters import (
     ContactPair,
@@ -37,15 +36,6 @@ _Pairs = tuple[ContactPair, ...]
 # As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
 _ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
-
-
-def _as_float(value: Any) -> Array:
-    # Integers are converted too: 10000 is a natural way to write a stiffness.
-    return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
-def _as_optional_float(value: Any) -> Array | None:
-    return None if value is None else _as_float(value)
 
 
 class Softness(eqx.Module):
@@ -80,12 +70,12 @@ class Softness(eqx.Module):
         groups: change only pairs with at least one geom of these groups (MJCF's `group`, 0 to 5).
     """
 
-    stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    impedance: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    width: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    margin: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    stiffness: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    impedance: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    width: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    margin: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
     geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
     bodies: tuple[str, ...] | None = eqx.field(static=True, default=None)
@@ -129,7 +119,7 @@ class Softness(eqx.Module):
             One `Softness` whose leaves share their leading axis.
         """
         static = {name: parts.pop(name) for name in _SUBSETS if name in parts}
-        arrays = {name: _as_float(value) for name, value in parts.items() if value is not None}
+        arrays = {name: as_float(value) for name, value in parts.items() if value is not None}
         lengths = {name: a.shape[0] for name, a in arrays.items() if a.ndim}
         length = max(lengths.values(), default=1)
         for name, a in arrays.items():
@@ -154,7 +144,7 @@ class Softness(eqx.Module):
         Raises:
             ValueError: if the two differ in the parts that they give or in their subset.
         """
-        share = jnp.clip(_as_float(progress), 0.0, 1.0)
+        share = jnp.clip(as_float(progress), 0.0, 1.0)
         parts = {}
         for name in _SUBSETS:
             if getattr(start, name) != getattr(end, name):

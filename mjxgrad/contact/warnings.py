@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
 

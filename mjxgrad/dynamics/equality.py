@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._math import safe_norm
+from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import impedance
 from mjxgrad.dynamics import spatial, tree

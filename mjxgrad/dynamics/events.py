@@ -61,7 +61,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly, constraint, implicit, linear

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._math import safe_norm
+from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
 from mjxgrad.dynamics import spatial, tree

@@ -33,7 +33,7 @@ slots have no rows.
 
 import dataclasses
 import functools
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -42,8 +42,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.dynamics.collision import CONVEX, are, is_blind
@@ -59,10 +59,6 @@ _SOFTEST = 1e-3
 # Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
 # derivative.
 _WEIGHTLESS = 1e30
-
-
-def _as_length(value: Any) -> Any:
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 class Smoothing(eqx.Module):
@@ -82,11 +78,11 @@ class Smoothing(eqx.Module):
         gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
     """
 
-    length: Float[Array, "..."] = eqx.field(converter=_as_length)
+    length: Float[Array, "..."] = eqx.field(converter=as_float)
     # Plain strings, so that a name that there is not meets the check below, which knows the choices.
     kernel: str = eqx.field(static=True, default="gaussian")
     mode: str = eqx.field(static=True, default="forward")
-    limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_length, default=None, kw_only=True)
+    limit_length: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None, kw_only=True)
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):

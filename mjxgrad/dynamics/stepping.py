@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known_to_be
 from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.collision import collide

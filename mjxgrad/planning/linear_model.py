@@ -31,7 +31,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad._static import is_known
+from mjxgrad._arrays import is_known
 from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.dynamics import Smoothing
