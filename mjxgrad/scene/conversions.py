@@ -20,15 +20,7 @@ _ENABLE = mujoco.mjtEnableBit
 _GEOM = mujoco.mjtGeom
 _SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
-_IMPEDANCES = (
-    "geom_solimp",
-    "pair_solimp",
-    "jnt_solimp",
-    "dof_solimp",
-    "tendon_solimp_lim",
-    "tendon_solimp_fri",
-    "eq_solimp",
-)
+_IMPEDANCES = "geom_solimp pair_solimp jnt_solimp dof_solimp tendon_solimp_lim tendon_solimp_fri eq_solimp".split()
 _ENDLESS = 1e12  # metres or radians
 
 

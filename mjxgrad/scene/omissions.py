@@ -92,45 +92,36 @@ def _has_needless_eulerdamp(model: mujoco.MjModel) -> bool:
     )
 
 
-def _num_visual_geoms(model: mujoco.MjModel) -> int:
-    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
-    return model.ngeom - len(touching)
+def _touching(model: mujoco.MjModel) -> set[int]:
+    return {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
 
 
 def _num_unused_sites(model: mujoco.MjModel) -> int:
     """Sites at which no tendon, actuator or equality constraint acts."""
-    wraps_site = np.isin(
-        model.wrap_type, [mujoco.mjtWrap.mjWRAP_SITE, mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER]
+    wrap = mujoco.mjtWrap
+    acts = (
+        np.isin(model.wrap_type, [wrap.mjWRAP_SITE, wrap.mjWRAP_SPHERE, wrap.mjWRAP_CYLINDER]).any()
+        or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any()
+        or (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any()
     )
-    if wraps_site.any() or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any():
-        return 0
-    if (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any():
-        return 0
-    return model.nsite
+    return 0 if acts else model.nsite
 
 
 def _num_render_meshes(model: mujoco.MjModel) -> int:
     """Meshes of which no instance collides."""
-    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
-    collided = {int(model.geom_dataid[g]) for g in touching if is_mesh[g]}
-    return model.nmesh - len(collided)
+    return model.nmesh - len({int(model.geom_dataid[g]) for g in _touching(model) if is_mesh[g]})
 
 
 _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("tendons", _absent("none in the scene", lambda m: m.ntendon > 0)),
     ("collision detection",
-     _absent("no two geoms can touch", lambda m: bool(contact_pairs(m)),
-             _DISABLE.mjDSBL_CONTACT)),
-    ("equality constraints",
-     _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
-    ("friction loss",
-     _absent("no joint or tendon has any", has_friction_loss,
-             _DISABLE.mjDSBL_FRICTIONLOSS)),
+     _absent("no two geoms can touch", lambda m: bool(contact_pairs(m)), _DISABLE.mjDSBL_CONTACT)),
+    ("equality constraints", _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
+    ("friction loss", _absent("no joint or tendon has any", has_friction_loss, _DISABLE.mjDSBL_FRICTIONLOSS)),
     ("limits", _absent("no joint or tendon is limited", has_limits, _DISABLE.mjDSBL_LIMIT)),
     ("actuation", _absent("no actuators", lambda m: m.nu > 0, _DISABLE.mjDSBL_ACTUATION)),
-    ("gravity compensation",
-     _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
+    ("gravity compensation", _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
     ("fluid forces", _absent("no medium: density = viscosity = 0", has_medium)),
     ("implicit damping",
      lambda m: "no joint is damped; keep_everything=True to differentiate by dof_damping"
@@ -138,7 +129,7 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("sensors",
      lambda m: _absent("none in the scene", lambda n: n.nsensor > 0, _DISABLE.mjDSBL_SENSOR)(m)
      or f"{m.nsensor}: not computed unless something reads them"),
-    ("contact of visual geoms", _counted(_num_visual_geoms, "they match no other geom")),
+    ("contact of visual geoms", _counted(lambda m: m.ngeom - len(_touching(m)), "they match no other geom")),
     ("sites", _counted(_num_unused_sites, "nothing acts at them; placed only if read")),
     ("cameras", _counted(lambda m: m.ncam, "placed only if read, and for rendering")),
     ("lights", _counted(lambda m: m.nlight, "rendering only")),
