@@ -123,9 +123,8 @@ class Scene(eqx.Module):
     def warnings(self) -> list[str]:
         """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
         leaves = (self.model.geom_solref, self.model.pair_solref, self.model.opt.timestep)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return []
-        if np.ndim(self.model.geom_solref) != 2 or np.ndim(self.model.opt.timestep) != 0:
+        is_batched = np.ndim(leaves[0]) != 2 or np.ndim(leaves[2]) != 0
+        if is_batched or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return []
         return contact_warnings(self.model, self.pairs)
 
@@ -155,15 +154,16 @@ class Scene(eqx.Module):
         solref = self.model.geom_solref
         if isinstance(solref, jax.core.Tracer) or np.ndim(solref) != 2:
             raise ValueError("summary needs one scene with known values, got a batched or traced one")
+        differs = " (moves differently from C MuJoCo)"
+        converted = [(c.what, f"{c.given} → {c.used}", c.reason + differs * (not c.exact)) for c in self.conversions]
         sections = [
             _heading(self),
             _contacts(self),
-            _table("Converted", [(c.what, f"{c.given} → {c.used}", c.reason + _note(c.exact))
-                                 for c in self.conversions]),
+            _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
             _bullets("Contacts unlike C MuJoCo", contact_differences(self.mj_model, self.pairs)),
             _bullets("Warnings", self.warnings()),
-        ]  # fmt: skip
+        ]
         return "\n\n".join(section for section in sections if section)
 
 
@@ -188,10 +188,6 @@ def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.nd
         setattr(target, name, float(value if changed else given))
     else:
         present[changed] = value[changed]
-
-
-def _note(exact: bool) -> str:
-    return "" if exact else " (moves differently from C MuJoCo)"
 
 
 def _heading(scene: Scene) -> str:
@@ -235,9 +231,8 @@ def _contacts(scene: Scene) -> str:
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-    legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
-        "; stable while h²k + 2hb < 4" if is_euler else ""
-    )
+    legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact"
+    legend += "; stable while h²k + 2hb < 4" if is_euler else ""
     if columns[-1][0] == "at rest":
         legend += "\n  at rest: distance under gravity, negative for a depth"
     if len(rows) < count:
