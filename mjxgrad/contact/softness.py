@@ -1,10 +1,7 @@
 r"""How soft contacts are, set alike on every pair of geoms that can touch.
 
-MuJoCo's contact is a spring and damper in units of the contact's own mass, scaled by an
-impedance $d \in (0, 1)$: $a_\text{ref} = -B v - K d(r) r$, $K = k / d_w^2$, $B = b / d_w$. The
-stiffness is $k = \omega_0^2$ and the damping $b = 2 \zeta \omega_0$. Raising $k$ makes contact
-stiffer; raising $d$ makes it yield less to a sustained force: at rest under the acceleration
-$a_0$ the depth is $(1 - d_w) a_0 / k$. With a margin the force begins at that distance from the surface.
+The numbers are those of `contact.parameters`, with $b = 2 \zeta \omega_0$. Raising $k$ makes contact stiffer; raising $d$ makes
+it yield less to a sustained force. With a margin the force begins at that distance from the surface.
 """
 
 import functools
@@ -192,7 +189,12 @@ class Softness(eqx.Module):
                 to be kept disagree; if a margin is asked of a mesh or height field, or a height to be kept of a contact
                 that has a margin already and no stiffness given.
         """
-        self._refuse_batch()
+        for name in _PARTS:
+            shape = np.shape(getattr(self, name))
+            if shape and not (name == "impedance" and shape == (2,)):
+                raise ValueError(
+                    f"{name} must be one value to be applied, got shape {shape}; apply a sweep under jax.vmap"
+                )
         selected = self.selected(model)
         before = contact_parameters(model, selected)
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
@@ -262,15 +264,6 @@ class Softness(eqx.Module):
         if self.width is not None:
             solimp = solimp.at[np.array(rows), 2].set(self.width)
         return solimp
-
-    def _refuse_batch(self) -> None:
-        for name in _PARTS:
-            value = getattr(self, name)
-            allowed = [(), (2,)] if name == "impedance" else [()]
-            if value is not None and value.shape not in allowed:
-                raise ValueError(
-                    f"{name} must be one value to be applied, got shape {value.shape}; apply a sweep under jax.vmap"
-                )
 
 
 def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:

@@ -49,10 +49,8 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     # Inside jit, operations on known values would be traced, too.
     with jax.ensure_compile_time_eval():
         parameters = contact_parameters(model, pairs)
-    solref, stiffness, damping, impedance, width = (
-        np.asarray(getattr(parameters, name), dtype=float)
-        for name in ("solref", "stiffness", "damping", "impedance", "width")
-    )
+    names = ("solref", "stiffness", "damping", "impedance", "width")
+    solref, stiffness, damping, impedance, width = (np.asarray(getattr(parameters, x), float) for x in names)
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
 
@@ -102,14 +100,8 @@ def steepest(
 ) -> tuple[float, float]:
     r"""Return stiffness and damping where the impedance is largest, which is at first touch if it falls with depth.
 
-    The force on a body is $d(r)$ of the acceleration $-B \dot r - K d(r) r$ that is asked for, so that stiffness goes as the
-    square of the impedance and damping as the impedance.
-
-    Args:
-        stiffness: at full depth, $k = K d_w^2$, in 1/s².
-        damping: at full depth, $b = B d_w$, in 1/s.
-        impedance: $d_0$ and $d_w$.
-        width: over which it changes; without one it is $d_w$ everywhere.
+    Both are given at full depth (1/s², 1/s). The force on a body is $d(r)$ of the acceleration that is asked for, so that
+    stiffness goes as the square of the impedance and damping as the impedance; without a width that is $d_w$ everywhere.
     """
     share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
     return float(share**2 * stiffness), float(share * damping)

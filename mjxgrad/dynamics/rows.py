@@ -247,7 +247,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     Raises:
         ValueError: if there is no such geom, or no contact between the two.
     """
-    wanted = [_geom(model, name) for name in (first, second)]
+    wanted = [index_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in (first, second)]
     contact, known = data._impl.contact, slot_geoms(model)
     slots = range(len(contact.dim)) if known is None else np.flatnonzero((np.sort(known) == sorted(wanted)).all(axis=1))
     if not len(slots):
@@ -266,15 +266,14 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     return total
 
 
-def _geom(model: mjx.Model, name: str) -> int:
-    names = {
-        model.names[address:].split(b"\0", 1)[0].decode(): number
-        for number, address in enumerate(np.asarray(model.name_geomadr))
-    }
+def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
+    """Return the number of a geom, sensor or site; refuse a name that there is not."""
+    word = kind.name.removeprefix("mjOBJ_").lower()
+    names = [mjx.id2name(model, kind, index) for index in range(getattr(model, f"n{word}"))]
     if name not in names:
-        known = ", ".join(repr(one) for one in names if one)
-        raise ValueError(f"there is no geom {name!r}; named geoms are {known or 'none'}")
-    return names[name]
+        listed = ", ".join(repr(one) for one in names if one) or "none"
+        raise ValueError(f"there is no {word} {name!r}; named {word}s are {listed}")
+    return names.index(name)
 
 
 def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:

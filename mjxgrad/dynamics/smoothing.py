@@ -147,16 +147,11 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
             f"smoothing gives no force at a distance to {shown}: MJX knows the distance of a box, mesh or height field from "
             "anything but a plane only where they overlap; build them of spheres and capsules"
         )
-    if smoothing.limit_length is not None and not has_limits(model):
+    is_off = int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    has_limits = not is_off and (np.any(model.jnt_limited) or np.any(model.tendon_limited))
+    if smoothing.limit_length is not None and not has_limits:
         messages.append("limit_length has no effect: no joint or tendon of the scene has a limit")
     return messages
-
-
-def has_limits(model: mjx.Model) -> bool:
-    """Return whether some joint or tendon has a limit that acts."""
-    if int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
-        return False
-    return bool(np.any(model.jnt_limited) or np.any(model.tendon_limited))
 
 
 def smoothed(
@@ -166,9 +161,8 @@ def smoothed(
 
     Noise has numbers without meaning for rows without, and is None, and nothing else changes, if there is nothing to be smoothed.
     """
-    has_distance, num_contacts = _has_distance(model, data), 0
+    has_distance, num_contacts, start = _has_distance(model, data), 0, 0
     rows, noises, first = [], [], None
-    start = 0
     for block in blocks:
         each, count = block.rows_each, len(block.residual)
         length = smoothing.length if block.is_contact else smoothing.limit_length

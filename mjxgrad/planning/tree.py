@@ -87,11 +87,9 @@ class Nodes(eqx.Module):
         return jnp.argmin(jnp.where(self.is_node, self.errors, jnp.inf))
 
     def add(self, new: "Nodes", is_valid: Bool[Array, "*many"]) -> "Nodes":
-        """Append nodes, in their order; those beyond the capacity are lost.
+        """Append new nodes, those that are valid, in their order; those beyond the capacity are lost.
 
-        Args:
-            new: with leading axes as `is_valid`; a parent p below −1 is the new node −2 − p, counted over all axes.
-            is_valid: which of them to keep. The parent of one that is kept must be kept.
+        A parent p below −1 is the new node −2 − p, counted over all axes; that of a valid one must be valid.
         """
         valid = is_valid.ravel()
         many = valid.size

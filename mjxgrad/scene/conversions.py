@@ -224,15 +224,13 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 def _distance_fields(model: mujoco.MjModel) -> Iterator[Conversion]:
     searched = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
-    round_ = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value, *searched}
+    smooth = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value, *searched}
     kinds = ((pair, set(model.geom_type[[pair.geom1, pair.geom2]].tolist())) for pair in contact_pairs(model))
-    found = [describe_pair(model, pair) for pair, both in kinds if both & searched and both <= round_]
+    found = [describe_pair(model, pair) for pair, both in kinds if both & searched and both <= smooth]
     if found:
-        what, reason = (
-            f"contact of {name_pairs(found)}",
-            "its normal may be off by 10 degrees; use capsules, spheres or boxes",
-        )
-        yield Conversion(what, "exact", "search on distance fields", reason, exact=False)
+        what, used = f"contact of {name_pairs(found)}", "search on distance fields"
+        reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
+        yield Conversion(what, "exact", used, reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:

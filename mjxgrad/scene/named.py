@@ -4,8 +4,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-
-_KINDS = {mujoco.mjtObj.mjOBJ_SENSOR: "nsensor", mujoco.mjtObj.mjOBJ_SITE: "nsite"}
+from mjxgrad.dynamics.rows import index_of
 
 
 def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
@@ -22,7 +21,7 @@ def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
     Raises:
         ValueError: if there is no such sensor, or MJX cannot compute it.
     """
-    index = _index(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    index = index_of(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if model.sensor_needstage[index] == mujoco.mjtStage.mjSTAGE_NONE:
         raise ValueError(f"sensor {name!r} would read 0: MJX cannot compute it, as the scene's summary says")
     start = int(model.sensor_adr[index])
@@ -40,13 +39,4 @@ def site_position(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, "
     Raises:
         ValueError: if there is no such site.
     """
-    return data.site_xpos[_index(model, mujoco.mjtObj.mjOBJ_SITE, name)]
-
-
-def _index(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
-    names = [mjx.id2name(model, kind, index) for index in range(getattr(model, _KINDS[kind]))]
-    if name not in names:
-        word = kind.name.removeprefix("mjOBJ_").lower()
-        listed = ", ".join(repr(one) for one in names if one) or "none"
-        raise ValueError(f"there is no {word} {name!r}; named {word}s are {listed}")
-    return names.index(name)
+    return data.site_xpos[index_of(model, mujoco.mjtObj.mjOBJ_SITE, name)]
