@@ -112,12 +112,14 @@ class ContactParameters(eqx.Module):
 
 def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
     """Return the name of a geom, or of its body with the geom's place in it."""
-    name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
-    if name:
-        return name
+    place = geom - int(model.body_geomadr[int(model.geom_bodyid[geom])])
+    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{body_name(model, geom)}[{place}]"
+
+
+def body_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
+    """Return the name of a geom's body, or its number."""
     body = int(model.geom_bodyid[geom])
-    body_name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
-    return f"{body_name}[{geom - int(model.body_geomadr[body])}]"
+    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
 
 
 def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:

@@ -19,6 +19,7 @@ from mjxgrad.contact.law import compensated_stiffness
 from mjxgrad.contact.parameters import (
     ContactPair,
     ContactParameters,
+    body_name,
     contact_pairs,
     contact_parameters,
     deciding_geoms,
@@ -79,12 +80,7 @@ class Softness(eqx.Module):
     groups: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse several subsets at once, and values without meaning if they are known.
-
-        Raises:
-            ValueError: if more than one of `geoms`, `pairs`, `bodies` and `groups` is given; if a part is out of its range;
-                if `rest_acceleration` comes without a margin.
-        """
+        """Refuse several subsets at once, a height without a margin, and values out of their range if they are known."""
         given = [name for name in _SUBSETS if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"Softness takes either geoms or pairs, bodies or groups, got {' and '.join(given)}")
@@ -170,7 +166,8 @@ class Softness(eqx.Module):
         if self.geoms is not None:
             return _with_any(everything, "geoms", self.geoms, [set(pair.names) for pair in everything])
         if self.bodies is not None:
-            return _with_any(everything, "bodies", self.bodies, [_body_names(model, pair) for pair in everything])
+            members = [{body_name(model, geom) for geom in (pair.geom1, pair.geom2)} for pair in everything]
+            return _with_any(everything, "bodies", self.bodies, members)
         if self.groups is not None:
             members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
             return _with_any(everything, "groups", self.groups, members)
@@ -352,15 +349,9 @@ def _with_any(everything: _Pairs, kind: str, wanted: tuple, members: list[set]) 
     return tuple(pair for pair, names in zip(everything, members, strict=True) if names & set(wanted))
 
 
-def _body_names(model: mjx.Model, pair: ContactPair) -> set[str]:
-    bodies = {int(model.geom_bodyid[geom]) for geom in (pair.geom1, pair.geom2)}
-    return {mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}" for body in bodies}
-
-
 def _shared(pair: ContactPair, other: ContactPair, geom: int) -> str:
     name = other.names[0] if geom == other.geom1 else other.names[1]
     return (
-        f"softness of the pair {pair} would also change the pair {other}, "
-        f"which shares the geom {name!r}; select that pair too, or list one of "
-        f"the two as <pair> in the MJCF's <contact> so that it has its own parameters"
+        f"softness of the pair {pair} would also change the pair {other}, which shares the geom {name!r}; select that pair too, "
+        "or list one of the two as <pair> in the MJCF's <contact> so that it has its own parameters"
     )

@@ -54,29 +54,23 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
 
-    def found() -> Iterator[tuple[ContactPair, str]]:
-        rows = zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True)
-        for pair, first, k, b, bounds, over in rows:
-            for message in (
-                altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
-                beyond_stability(*steepest(k, b, bounds, over), timestep, integrator),
-            ):
-                if message:
-                    yield pair, message
-
-    return _grouped(found())
+    found, remedy = [], "Softness, which writes the format that refsafe leaves alone"
+    for pair, first, k, b, bounds, over in zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True):
+        altered = altered_by_refsafe(first, b, timestep, remedy)
+        unstable = beyond_stability(*steepest(k, b, bounds, over), timestep, integrator)
+        found += [(pair, message) for message in (altered, unstable) if message]
+    return _grouped(found)
 
 
 def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
     """Say where MJX finds other contact points than C MuJoCo does, in one sentence per kind of difference."""
     geom = mujoco.mjtGeom
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
-    messages = []
-    if frozenset((geom.mjGEOM_PLANE, geom.mjGEOM_MESH)) in kinds:
-        messages.append("mesh on plane: MJX keeps only corners within 1 mm of the deepest one")
-    if frozenset((geom.mjGEOM_CAPSULE,)) in kinds:
-        messages.append("parallel capsules: MJX makes one contact, C MuJoCo two")
-    return messages
+    known = (
+        ({geom.mjGEOM_PLANE, geom.mjGEOM_MESH}, "mesh on plane: MJX keeps only corners within 1 mm of the deepest one"),
+        ({geom.mjGEOM_CAPSULE}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
+    )
+    return [message for kind, message in known if kind in kinds]
 
 
 def name_pairs(pairs: Sequence[object]) -> str:

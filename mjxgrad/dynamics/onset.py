@@ -98,21 +98,13 @@ class Onset(eqx.Module):
     width: Float[Array, "..."] = eqx.field(converter=as_float, default=0.1)
 
     def __check_init__(self):
-        """Refuse widths without meaning, if they are known.
-
-        Raises:
-            ValueError: if the width is negative or not finite.
-        """
+        """Refuse widths that are negative or not finite, if they are known."""
         if is_known(self.width) and not np.all((np.asarray(self.width) >= 0) & np.isfinite(self.width)):
             given = np.asarray(self.width)
             raise ValueError(f"width must be finite and not negative, got {given!s}: 0.1 is the default, 0 no floor")
 
     def check(self, gradient: str) -> None:
-        """Refuse what a single step cannot take.
-
-        Raises:
-            ValueError: if the width has a leading axis, or the event gradient is asked for, too.
-        """
+        """Refuse what a single step cannot take."""
         if self.width.ndim:
             raise ValueError(f"width must be one value for a step, got shape {self.width.shape}: sweep under jax.vmap")
         if gradient == "event":

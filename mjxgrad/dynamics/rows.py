@@ -6,7 +6,6 @@ of the row estimated at the reference pose.
 
 import dataclasses
 import functools
-import operator
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics import linear, spatial, tree
 from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, fold
 
@@ -204,10 +203,9 @@ def contact_jacobian(
     bodies: Array | np.ndarray,
     dim: int,
 ) -> Float[Array, "contacts dim nv"]:
-    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames.
+    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as `ContactRows` do.
 
-    A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
-    on a joint velocity at the rate (axis · wrench). The second body counts positive, the first negative.
+    The second body counts positive, the first negative.
     """
     moves = jnp.asarray(tree.moving_dofs(model), position.dtype)[bodies]  # contacts, 2, nv
     centre = data.subtree_com[jnp.asarray(model.body_rootid)[bodies]]
@@ -227,7 +225,7 @@ def contact_jacobian(
 
 def _dot_axes(wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]) -> Float[Array, "contacts k nv"]:
     # Written out: XLA's CPU backend crashed on the derivative of the reduction under two jax.vmap (jax 0.10.2).
-    return functools.reduce(operator.add, (wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1])))
+    return linear.add(wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1]))
 
 
 def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> Float[Array, "3"]:

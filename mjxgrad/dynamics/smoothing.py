@@ -86,19 +86,12 @@ class Smoothing(eqx.Module):
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
-        """Refuse names that there are not, and lengths without meaning if they are known.
-
-        Raises:
-            ValueError: if a length is not positive and finite, or there is no such kernel or mode.
-        """
+        """Refuse names that there are not, and lengths that are not positive and finite if they are known."""
         for name, choices in (("kernel", get_args(KernelName)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
-        remedies = {
-            "length": "for a step without smoothing give smoothing=None",
-            "limit_length": "None leaves limits alone",
-        }
-        for name, remedy in remedies.items():
+        without = "for a step without smoothing give smoothing=None"
+        for name, remedy in (("length", without), ("limit_length", "None leaves limits alone")):
             value = getattr(self, name)
             if is_known(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
                 raise ValueError(f"{name} must be positive and finite, got {np.asarray(value)!s}: {remedy}")
@@ -109,11 +102,7 @@ class Smoothing(eqx.Module):
         return KERNELS[self.kernel]
 
     def check(self, gradient: str) -> None:
-        """Refuse what a single step cannot take.
-
-        Raises:
-            ValueError: if a length has a leading axis, or the event correction is asked for, too.
-        """
+        """Refuse what a single step cannot take."""
         for name in ("length", "limit_length"):
             value = getattr(self, name)
             if value is not None and value.ndim:

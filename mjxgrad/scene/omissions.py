@@ -44,10 +44,6 @@ class LeaveOut:
     limits: tuple[str, ...] = ()
 
 
-class TooManyMasksError(ValueError):
-    """The pairs that remain cannot be told apart from the others by the bits that there are."""
-
-
 def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
     """Switch off what a scene does not need, and list all that a step of it leaves out.
 
@@ -156,17 +152,15 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
             raise ValueError(
                 f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
             )
+    omissions = []
     if omitted:
-        try:
-            keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
-        except TooManyMasksError as error:
-            raise ValueError(
-                f"leave_out must leave pairs that collision masks can express, got {len(omitted)} of {len(everything)} to "
-                f"leave out: {error}; name fewer pairs or all of a geom"
-            ) from error
-    without_limit = [_limited_joint(model, name) for name in wanted.limits]
-    model.jnt_limited[without_limit] = 0
-    omissions = _in_words(omitted, len(everything), wanted)
+        keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
+        more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
+        listed = ", ".join(str(pair) for pair in omitted[:4]) + more
+        omissions.append(Omission(f"contact of {len(omitted)} of {len(everything)} pairs", f"as asked: {listed}"))
+    model.jnt_limited[[_limited_joint(model, name) for name in wanted.limits]] = 0
+    if wanted.limits:
+        omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
     if omissions:
         omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
     return omitted, tuple(omissions)
@@ -178,7 +172,7 @@ def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
     Geoms that collide with the same others share a bit: theirs is the type, the others have the affinity. Bits are given
     out until every pair has one, first to those that settle most pairs. What MuJoCo filters by other rules (geoms of one
     rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs, which `kept` has none of, stay as they
-    are. Raises TooManyMasksError if 31 bits do not suffice.
+    are. Raises ValueError if 31 bits do not suffice.
     """
     neighbours: dict[int, set[int]] = {}
     for pair in kept:
@@ -192,7 +186,10 @@ def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
     bit = 0
     while unsettled:
         if bit == _NUM_MASK_BITS:
-            raise TooManyMasksError(f"MuJoCo has {_NUM_MASK_BITS} bits to tell colliding geoms apart")
+            raise ValueError(
+                f"leave_out must leave pairs that the {_NUM_MASK_BITS} bits of MuJoCo's collision masks can tell apart; "
+                "name fewer pairs or all of a geom"
+            )
         settled = {others: unsettled & _between(geoms, others) for others, geoms in alike.items()}
         others = max(settled, key=lambda one: len(settled[one]))
         contype[alike[others]] |= 1 << bit
@@ -215,14 +212,3 @@ def _limited_joint(model: mujoco.MjModel, name: str) -> int:
         f"leave_out.limits must name joints with limits, got {name!r}; "
         f"those that have: {', '.join(filter(None, known)) or 'none'}"
     )
-
-
-def _in_words(omitted: tuple[ContactPair, ...], total: int, wanted: LeaveOut) -> list[Omission]:
-    omissions = []
-    if omitted:
-        more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
-        listed = ", ".join(str(pair) for pair in omitted[:4]) + more
-        omissions.append(Omission(f"contact of {len(omitted)} of {total} pairs", f"as asked: {listed}"))
-    if wanted.limits:
-        omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
-    return omissions
