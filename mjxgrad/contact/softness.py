@@ -203,11 +203,10 @@ class Softness(eqx.Module):
         # For each place to be written, the pair that it belongs to.
         geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
 
-        if self.impedance is not None or self.width is not None:
-            model = model.replace(
-                geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
-                pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
-            )
+        model = model.replace(
+            geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
+            pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
+        )
         if any(part is not None for part in (self.stiffness, self.damping_ratio, self.rest_acceleration)):
             solref = self._solref(model, selected, before)
             model = model.replace(

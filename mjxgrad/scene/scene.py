@@ -1,4 +1,4 @@
-"""What `load_scene` returns, and how it describes itself."""
+"""What `load_scene` returns, how it describes itself, and what its sensors and sites are by name."""
 
 import copy
 import difflib
@@ -17,6 +17,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission
 
@@ -307,3 +308,38 @@ def _bullets(title: str, sentences: Sequence[str]) -> str:
         return ""
     wrapped = (textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ") for sentence in sentences)
     return "\n".join([title, *wrapped])
+
+
+def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
+    """Return what a sensor reads.
+
+    Args:
+        model: the scene's.
+        data: with its sensors computed, as `forward`, a step or a rollout leaves them.
+        name: of the sensor.
+
+    Returns:
+        Its numbers, in MuJoCo's units of that sensor; one for a touch sensor, three for a force.
+
+    Raises:
+        ValueError: if there is no such sensor, or MJX cannot compute it.
+    """
+    index = index_of(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if model.sensor_needstage[index] == mujoco.mjtStage.mjSTAGE_NONE:
+        raise ValueError(f"sensor {name!r} would read 0: MJX cannot compute it, as the scene's summary says")
+    start = int(model.sensor_adr[index])
+    return data.sensordata[start : start + int(model.sensor_dim[index])]
+
+
+def site_position(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, "3"]:
+    """Return where a site is, in world coordinates (m).
+
+    Args:
+        model: the scene's.
+        data: with its positions computed, as `forward`, a step or a rollout leaves them.
+        name: of the site.
+
+    Raises:
+        ValueError: if there is no such site.
+    """
+    return data.site_xpos[index_of(model, mujoco.mjtObj.mjOBJ_SITE, name)]
