@@ -352,9 +352,8 @@ def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
 
 def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
     if value.shape != shape:
-        raise ValueError(
-            f"{name} must have shape {shape}, one row per step and one column per actuator, got {value.shape}"
-        )
+        meaning = "one row per step and one column per actuator"
+        raise ValueError(f"{name} must have shape {shape}, {meaning}, got {value.shape}")
     numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
     if numbers is None or np.isfinite(numbers).all():
         return

@@ -184,11 +184,10 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
     pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)
     stiffness, damping = stiffness_damping(model, solref)
-    low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
     return ContactParameters(
         stiffness=stiffness,
         damping=damping,
-        impedance=jnp.clip(solimp[:, :2], low, high),
+        impedance=jnp.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP),
         width=jnp.maximum(solimp[:, 2], mujoco.mjMINVAL),
         friction=friction,
         margin=margin,

@@ -299,10 +299,8 @@ def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.n
 
     A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
     each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair. Pairs with parameters of
-    their own have no part in it.
-
-    Returns:
-        The geoms to write; the matrix from what each pair misses to their margins; the matrix P over all geoms.
+    their own have no part in it. Returned are the geoms to write, the matrix from what each pair misses to their margins, and P
+    over all geoms.
     """
     for pair in selected:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):

@@ -159,19 +159,15 @@ def has_pyramids(model: mjx.Model, dim: int) -> bool:
 
 def _bodies(model: mjx.Model, contact: Any, first: int) -> np.ndarray | Array:
     """Return the bodies of consecutive contacts, as constants where they are known."""
-    known = slot_bodies(model)
-    return jnp.asarray(model.geom_bodyid)[contact.geom] if known is None else known[first : first + len(contact.dist)]
+    slots = slot_geoms(model)
+    if slots is None:
+        return jnp.asarray(model.geom_bodyid)[contact.geom]
+    return np.asarray(model.geom_bodyid)[slots[first : first + len(contact.dist)]]
 
 
 def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:
     """Return friction as C MuJoCo clamps it for every contact: a cone without width has no inside."""
     return jnp.where(friction > mujoco.mjMINMU, friction, mujoco.mjMINMU)
-
-
-def slot_bodies(model: mjx.Model) -> np.ndarray | None:
-    """Return the two bodies of each contact slot, (contacts, 2); None where it is decided at run time who gets a slot."""
-    geoms = slot_geoms(model)
-    return None if geoms is None else np.asarray(model.geom_bodyid)[geoms]
 
 
 def contact_rows(
