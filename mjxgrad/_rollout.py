@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import known
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.scene import Scene, SceneWarning
@@ -111,16 +111,16 @@ def initial_state(
     Raises:
         ValueError: if a part does not have the shape that the scene gives it.
     """
-    data, model = scene.data, scene.model
-    if qpos is not None:
-        for message in _beyond_limits(model, qpos):
-            warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    parts = {
-        "qpos": _part("qpos", qpos, data.qpos, model.nq),
-        "qvel": _part("qvel", qvel, data.qvel, model.nv),
-        "act": _part("act", act, data.act, model.na),
-    }
-    return State(**parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+    data, parts = scene.data, []
+    for message in [] if qpos is None else _beyond_limits(scene.model, qpos):
+        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
+    for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
+        template = getattr(data, name)
+        part = template if given is None else jnp.asarray(given, template.dtype)
+        if part.shape != template.shape:
+            raise ValueError(f"{name} must have shape {template.shape} in this scene, got {part.shape}")
+        parts.append(part)
+    return State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
 
 
 def rollout(
@@ -179,13 +179,9 @@ def rollout(
             horizon is missing or contradicted, or controls or noise hold numbers that are not finite (checked where
             values are known, that is outside `jax.jit`; inside, the rollout is flagged as diverged at that step).
     """
-    check_gradient(gradient)
-    if smoothing is not None:
-        smoothing.check(gradient)
-        for message in smoothing_warnings(smoothing, scene.model):
-            warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    if onset is not None:
-        onset.check(gradient)
+    check_gradient(gradient, onset, smoothing)
+    for message in [] if smoothing is None else smoothing_warnings(smoothing, scene.model):
+        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
         raise ValueError(
             f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}, {observe=}'
@@ -196,7 +192,10 @@ def rollout(
     for name, value in (("controls", sequence), ("noise", noise)):
         if value is not None:
             _check_sequence(name, jnp.asarray(value), (horizon, nu))
-    _check_state(scene, state)
+    for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
+        if (shape := jnp.shape(getattr(state, name))) != (size,):
+            remedy = "map over batches with jax.vmap"
+            raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
     policy = controls if callable(controls) else None
     resting = jnp.broadcast_to(scene.data.ctrl, (horizon, nu))
     base = resting if sequence is None else sequence
@@ -302,12 +301,7 @@ def check_trajectory(trajectory: Trajectory) -> None:
 def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
     """Give data in a state, ready to be stepped."""
     return scene.data.replace(
-        qpos=state.qpos,
-        qvel=state.qvel,
-        act=state.act,
-        time=state.time,
-        qacc_warmstart=state.warmstart,
-        ctrl=ctrl,
+        qpos=state.qpos, qvel=state.qvel, act=state.act, time=state.time, qacc_warmstart=state.warmstart, ctrl=ctrl
     )
 
 
@@ -322,13 +316,6 @@ def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
     numbers = jnp.concatenate([state.qpos, state.act])
     # A comparison with NaN is false, so one test finds both.
     return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
-
-
-def _part(name: str, value: Any, template: Array, size: int) -> Array:
-    value = template if value is None else jnp.asarray(value, template.dtype)
-    if value.shape != (size,):
-        raise ValueError(f"{name} must have shape ({size},) in this scene, got {value.shape}")
-    return value
 
 
 def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
@@ -348,16 +335,6 @@ def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
             yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
 
 
-def _check_state(scene: Scene, state: State) -> None:
-    sizes = {"qpos": scene.model.nq, "qvel": scene.model.nv, "act": scene.model.na}
-    for name, size in sizes.items():
-        shape = jnp.shape(getattr(state, name))
-        if shape != (size,):
-            raise ValueError(
-                f"state.{name} must have shape ({size},) in this scene, got {shape}: map over batches with jax.vmap"
-            )
-
-
 def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
     lengths = {k: int(jnp.shape(v)[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
     if horizon is not None:
@@ -375,9 +352,8 @@ def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
 
 def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
     if value.shape != shape:
-        raise ValueError(
-            f"{name} must have shape {shape}, one row per step and one column per actuator, got {value.shape}"
-        )
+        meaning = "one row per step and one column per actuator"
+        raise ValueError(f"{name} must have shape {shape}, {meaning}, got {value.shape}")
     numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
     if numbers is None or np.isfinite(numbers).all():
         return

@@ -25,8 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from mjxgrad._arrays import known
 from mjxgrad._rollout import State, data_of
-from mjxgrad._static import known
 from mjxgrad.dynamics import forward
 from mjxgrad.dynamics.kinematics import integrate_position
 from mjxgrad.scene import Scene

@@ -10,7 +10,7 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # Each line may import those above it; parts of one line do not know each other.
 ORDER = (
-    ("_math", "_mjx", "_static"),
+    ("_arrays", "_mjx"),
     ("contact",),
     ("dynamics",),
     ("scene",),

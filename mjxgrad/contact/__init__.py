@@ -4,11 +4,4 @@ from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_p
 from mjxgrad.contact.softness import Softness
 from mjxgrad.contact.warnings import softness_warnings
 
-__all__ = [
-    "ContactPair",
-    "ContactParameters",
-    "Softness",
-    "contact_pairs",
-    "contact_parameters",
-    "softness_warnings",
-]
+__all__ = ["ContactPair", "ContactParameters", "Softness", "contact_pairs", "contact_parameters", "softness_warnings"]

@@ -17,9 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.integrate import solve_ivp
 
-
-def _as_float(value: ArrayLike) -> Array:
-    return jnp.asarray(value, float)
+from mjxgrad._arrays import as_float
 
 
 class Bounce(eqx.Module):
@@ -31,9 +29,9 @@ class Bounce(eqx.Module):
         speed: of approach, in m/s.
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=_as_float)
-    damping_ratio: Float[Array, "..."] = eqx.field(converter=_as_float)
-    speed: Float[Array, "..."] = eqx.field(converter=_as_float, default=1.0)
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_float)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_float)
+    speed: Float[Array, "..."] = eqx.field(converter=as_float, default=1.0)
 
     @property
     def frequency(self) -> Float[Array, "..."]:

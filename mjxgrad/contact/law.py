@@ -24,8 +24,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known_to_be
 
 # Halvings of the bracket; a Newton step ends the search.
 _HALVINGS = 50
@@ -51,12 +51,9 @@ def is_square(*solimps: Float[Array | np.ndarray, "_ 5"]) -> bool:
 
 
 def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is_square: bool = False) -> Impedance:
-    """Return d: from d0 at r = 0 to dw at the width, along two power laws that meet at the midpoint.
+    """Return d at the violation r (m or rad): from d0 at r = 0 to dw at the width, by two power laws that meet at the midpoint.
 
-    Args:
-        solimp: MuJoCo's five numbers.
-        violation: r (m or rad).
-        is_square: whether the power is known to be two, MuJoCo's default; a square takes a tenth of the time.
+    `is_square` says that the power is known to be two, MuJoCo's default; a square takes a tenth of the time.
     """
     smallest = jnp.clip(solimp[..., 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     largest = jnp.clip(solimp[..., 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
@@ -77,16 +74,11 @@ def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is
 def stiffness_damping(
     model: mjx.Model, solref: Float[Array, "*n 2"], full: Float[ArrayLike, "..."] = 1.0
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return K (1/s²) and B (1/s).
+    """Return K (1/s²) and B (1/s) from `full`, the impedance dw; 1 gives k = K dw² and b = B dw, which do not depend on it.
 
     Each format is evaluated on numbers that are its own, so that no infinity of the other enters the derivative. Under
     refsafe the time constant is clamped from below at two time steps; at the clamp itself the derivative is that of the
     unclamped side, since from there every larger value counts.
-
-    Args:
-        model: its time step and whether it clamps.
-        solref: of either format.
-        full: the impedance dw; 1 gives k = K dw² and b = B dw, which do not depend on it.
     """
     first, second = solref[..., 0], solref[..., 1]
     time_constant = jnp.where(first > 0, first, 1.0)

@@ -1,15 +1,10 @@
 r"""Which geoms can touch, and how soft their contact effectively is.
 
-MuJoCo derives the parameters of a contact from those of its two geoms (or of an explicit
-`<pair>`), clamps some of them and reads `solref` in either of two formats. What the dynamics
-sees is brought here to one form, in which pairs can be compared and swept.
-
-With impedance $d(r)$ rising from $d_0$ at the surface to $d_w$ at penetration `width`, the
-reference acceleration of a contact at distance $r < 0$, measured from its margin, is
-$a_\text{ref} = -B v - K d(r) r$ with $K = k / d_w^2$ and $B = b / d_w$. Here $k = \omega_0^2$ is
-the stiffness and $b$ the damping, both per unit of the contact's effective mass: at full
-impedance the contact is the oscillator $\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being
-the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$; `contact.law` has other profiles.
+MuJoCo derives the parameters of a contact from those of its two geoms (or of an explicit `<pair>`), clamps some of them and
+reads `solref` in either of two formats. What the dynamics sees is brought here to one form, in which pairs can be compared and
+swept: the law of `contact.law` with $K = k / d_w^2$ and $B = b / d_w$, $k = \omega_0^2$ the stiffness and $b$ the damping, both
+per unit of the contact's effective mass. At full impedance the contact is the oscillator
+$\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being the acceleration without contact, and rests at depth $(1 - d_w) a_0 / k$.
 
 References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
@@ -23,7 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import geom_pairs, mjx
 from mjxgrad.contact.law import rest_depth, stiffness_damping
 
@@ -117,12 +112,14 @@ class ContactParameters(eqx.Module):
 
 def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
     """Return the name of a geom, or of its body with the geom's place in it."""
-    name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
-    if name:
-        return name
+    place = geom - int(model.body_geomadr[int(model.geom_bodyid[geom])])
+    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{body_name(model, geom)}[{place}]"
+
+
+def body_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
+    """Return the name of a geom's body, or its number."""
     body = int(model.geom_bodyid[geom])
-    body_name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
-    return f"{body_name}[{geom - int(model.body_geomadr[body])}]"
+    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
 
 
 def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
@@ -164,12 +161,12 @@ def named_pairs(
 
 def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tuple[int, ...]:
     """Geoms whose parameters decide those of a pair: none if explicit, one if it has priority."""
-    if pair.explicit >= 0:
-        return ()
-    priority1, priority2 = model.geom_priority[[pair.geom1, pair.geom2]]
-    if priority1 == priority2:
-        return (pair.geom1, pair.geom2)
-    return (pair.geom1,) if priority1 > priority2 else (pair.geom2,)
+    return () if pair.explicit >= 0 else _of_most_priority(model, pair.geom1, pair.geom2)
+
+
+def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[int, ...]:
+    highest = max(model.geom_priority[list(geoms)])
+    return tuple(geom for geom in geoms if model.geom_priority[geom] == highest)
 
 
 def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
@@ -187,11 +184,10 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
     pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)
     stiffness, damping = stiffness_damping(model, solref)
-    low, high = mujoco.mjMINIMP, mujoco.mjMAXIMP
     return ContactParameters(
         stiffness=stiffness,
         damping=damping,
-        impedance=jnp.clip(solimp[:, :2], low, high),
+        impedance=jnp.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP),
         width=jnp.maximum(solimp[:, 2], mujoco.mjMINVAL),
         friction=friction,
         margin=margin,
@@ -205,11 +201,7 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
 def _condim(model, geom1, geom2, explicit) -> int:
     if explicit >= 0:
         return int(model.pair_dim[explicit])
-    priority1, priority2 = model.geom_priority[[geom1, geom2]]
-    condim1, condim2 = model.geom_condim[[geom1, geom2]]
-    if priority1 == priority2:
-        return int(max(condim1, condim2))
-    return int(condim1 if priority1 > priority2 else condim2)
+    return max(int(model.geom_condim[geom]) for geom in _of_most_priority(model, int(geom1), int(geom2)))
 
 
 def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: Array) -> Array:
@@ -222,19 +214,13 @@ def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: 
 
 def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
     """Combine the parameters of two geoms by MuJoCo's rules."""
-    geom1 = np.array([pair.geom1 for pair in pairs], dtype=int)
-    geom2 = np.array([pair.geom2 for pair in pairs], dtype=int)
-    explicit = np.array([pair.explicit for pair in pairs], dtype=int)
-
+    numbers = [(pair.geom1, pair.geom2, pair.explicit) for pair in pairs]
+    geom1, geom2, explicit = np.array(numbers, dtype=int).reshape(-1, 3).T
     weight = _mix_weight(model, geom1, geom2)[:, None]
     solref1, solref2 = model.geom_solref[geom1], model.geom_solref[geom2]
     both_standard = (solref1[:, :1] > 0) & (solref2[:, :1] > 0)
     # Numbers of the direct format are negative, so the smaller one is the stiffer one.
-    solref = jnp.where(
-        both_standard,
-        weight * solref1 + (1 - weight) * solref2,
-        jnp.minimum(solref1, solref2),
-    )
+    solref = jnp.where(both_standard, weight * solref1 + (1 - weight) * solref2, jnp.minimum(solref1, solref2))
     solimp = weight * model.geom_solimp[geom1] + (1 - weight) * model.geom_solimp[geom2]
     friction = jnp.maximum(model.geom_friction[geom1], model.geom_friction[geom2])
 

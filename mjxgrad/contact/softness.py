@@ -1,10 +1,7 @@
 r"""How soft contacts are, set alike on every pair of geoms that can touch.
 
-MuJoCo's contact is a spring and damper in units of the contact's own mass, scaled by an
-impedance $d \in (0, 1)$: $a_\text{ref} = -B v - K d(r) r$, $K = k / d_w^2$, $B = b / d_w$. The
-stiffness is $k = \omega_0^2$ and the damping $b = 2 \zeta \omega_0$. Raising $k$ makes contact
-stiffer; raising $d$ makes it yield less to a sustained force: at rest under the acceleration
-$a_0$ the depth is $(1 - d_w) a_0 / k$. With a margin the force begins at that distance from the surface.
+The numbers are those of `contact.parameters`, with $b = 2 \zeta \omega_0$. Raising $k$ makes contact stiffer; raising $d$ makes
+it yield less to a sustained force. With a margin the force begins at that distance from the surface.
 """
 
 import functools
@@ -16,13 +13,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import as_float, is_known, safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.law import compensated_stiffness
 from mjxgrad.contact.parameters import (
     ContactPair,
     ContactParameters,
+    body_name,
     contact_pairs,
     contact_parameters,
     deciding_geoms,
@@ -37,15 +34,6 @@ _Pairs = tuple[ContactPair, ...]
 # As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
 _ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
-
-
-def _as_float(value: Any) -> Array:
-    # Integers are converted too: 10000 is a natural way to write a stiffness.
-    return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
-def _as_optional_float(value: Any) -> Array | None:
-    return None if value is None else _as_float(value)
 
 
 class Softness(eqx.Module):
@@ -80,24 +68,19 @@ class Softness(eqx.Module):
         groups: change only pairs with at least one geom of these groups (MJCF's `group`, 0 to 5).
     """
 
-    stiffness: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    impedance: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    width: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    margin: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
-    rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=_as_optional_float, default=None)
+    stiffness: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    damping_ratio: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    impedance: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    width: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    margin: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
     geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
     bodies: tuple[str, ...] | None = eqx.field(static=True, default=None)
     groups: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse several subsets at once, and values without meaning if they are known.
-
-        Raises:
-            ValueError: if more than one of `geoms`, `pairs`, `bodies` and `groups` is given; if a part is out of its range;
-                if `rest_acceleration` comes without a margin.
-        """
+        """Refuse several subsets at once, a height without a margin, and values out of their range if they are known."""
         given = [name for name in _SUBSETS if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"Softness takes either geoms or pairs, bodies or groups, got {' and '.join(given)}")
@@ -129,7 +112,7 @@ class Softness(eqx.Module):
             One `Softness` whose leaves share their leading axis.
         """
         static = {name: parts.pop(name) for name in _SUBSETS if name in parts}
-        arrays = {name: _as_float(value) for name, value in parts.items() if value is not None}
+        arrays = {name: as_float(value) for name, value in parts.items() if value is not None}
         lengths = {name: a.shape[0] for name, a in arrays.items() if a.ndim}
         length = max(lengths.values(), default=1)
         for name, a in arrays.items():
@@ -154,7 +137,7 @@ class Softness(eqx.Module):
         Raises:
             ValueError: if the two differ in the parts that they give or in their subset.
         """
-        share = jnp.clip(_as_float(progress), 0.0, 1.0)
+        share = jnp.clip(as_float(progress), 0.0, 1.0)
         parts = {}
         for name in _SUBSETS:
             if getattr(start, name) != getattr(end, name):
@@ -183,7 +166,8 @@ class Softness(eqx.Module):
         if self.geoms is not None:
             return _with_any(everything, "geoms", self.geoms, [set(pair.names) for pair in everything])
         if self.bodies is not None:
-            return _with_any(everything, "bodies", self.bodies, [_body_names(model, pair) for pair in everything])
+            members = [{body_name(model, geom) for geom in (pair.geom1, pair.geom2)} for pair in everything]
+            return _with_any(everything, "bodies", self.bodies, members)
         if self.groups is not None:
             members = [{int(model.geom_group[g]) for g in (pair.geom1, pair.geom2)} for pair in everything]
             return _with_any(everything, "groups", self.groups, members)
@@ -202,7 +186,12 @@ class Softness(eqx.Module):
                 to be kept disagree; if a margin is asked of a mesh or height field, or a height to be kept of a contact
                 that has a margin already and no stiffness given.
         """
-        self._refuse_batch()
+        for name in _PARTS:
+            shape = np.shape(getattr(self, name))
+            if shape and not (name == "impedance" and shape == (2,)):
+                raise ValueError(
+                    f"{name} must be one value to be applied, got shape {shape}; apply a sweep under jax.vmap"
+                )
         selected = self.selected(model)
         before = contact_parameters(model, selected)
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
@@ -214,11 +203,10 @@ class Softness(eqx.Module):
         # For each place to be written, the pair that it belongs to.
         geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
 
-        if self.impedance is not None or self.width is not None:
-            model = model.replace(
-                geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
-                pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
-            )
+        model = model.replace(
+            geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
+            pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
+        )
         if any(part is not None for part in (self.stiffness, self.damping_ratio, self.rest_acceleration)):
             solref = self._solref(model, selected, before)
             model = model.replace(
@@ -273,15 +261,6 @@ class Softness(eqx.Module):
             solimp = solimp.at[np.array(rows), 2].set(self.width)
         return solimp
 
-    def _refuse_batch(self) -> None:
-        for name in _PARTS:
-            value = getattr(self, name)
-            allowed = [(), (2,)] if name == "impedance" else [()]
-            if value is not None and value.shape not in allowed:
-                raise ValueError(
-                    f"{name} must be one value to be applied, got shape {value.shape}; apply a sweep under jax.vmap"
-                )
-
 
 def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
     if not places:
@@ -320,10 +299,8 @@ def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.n
 
     A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
     each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair. Pairs with parameters of
-    their own have no part in it.
-
-    Returns:
-        The geoms to write; the matrix from what each pair misses to their margins; the matrix P over all geoms.
+    their own have no part in it. Returned are the geoms to write, the matrix from what each pair misses to their margins, and P
+    over all geoms.
     """
     for pair in selected:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
@@ -369,15 +346,9 @@ def _with_any(everything: _Pairs, kind: str, wanted: tuple, members: list[set]) 
     return tuple(pair for pair, names in zip(everything, members, strict=True) if names & set(wanted))
 
 
-def _body_names(model: mjx.Model, pair: ContactPair) -> set[str]:
-    bodies = {int(model.geom_bodyid[geom]) for geom in (pair.geom1, pair.geom2)}
-    return {mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}" for body in bodies}
-
-
 def _shared(pair: ContactPair, other: ContactPair, geom: int) -> str:
     name = other.names[0] if geom == other.geom1 else other.names[1]
     return (
-        f"softness of the pair {pair} would also change the pair {other}, "
-        f"which shares the geom {name!r}; select that pair too, or list one of "
-        f"the two as <pair> in the MJCF's <contact> so that it has its own parameters"
+        f"softness of the pair {pair} would also change the pair {other}, which shares the geom {name!r}; select that pair too, "
+        "or list one of the two as <pair> in the MJCF's <contact> so that it has its own parameters"
     )

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
 
@@ -49,36 +49,28 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     # Inside jit, operations on known values would be traced, too.
     with jax.ensure_compile_time_eval():
         parameters = contact_parameters(model, pairs)
-    solref, stiffness, damping, impedance, width = (
-        np.asarray(getattr(parameters, name), dtype=float)
-        for name in ("solref", "stiffness", "damping", "impedance", "width")
-    )
+    names = ("solref", "stiffness", "damping", "impedance", "width")
+    solref, stiffness, damping, impedance, width = (np.asarray(getattr(parameters, x), float) for x in names)
     timestep = float(model.opt.timestep)
     integrator = mujoco.mjtIntegrator(int(model.opt.integrator))
 
-    def found() -> Iterator[tuple[ContactPair, str]]:
-        rows = zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True)
-        for pair, first, k, b, bounds, over in rows:
-            for message in (
-                altered_by_refsafe(first, b, timestep, "Softness, which writes the format that refsafe leaves alone"),
-                beyond_stability(*steepest(k, b, bounds, over), timestep, integrator),
-            ):
-                if message:
-                    yield pair, message
-
-    return _grouped(found())
+    found, remedy = [], "Softness, which writes the format that refsafe leaves alone"
+    for pair, first, k, b, bounds, over in zip(pairs, solref[:, 0], stiffness, damping, impedance, width, strict=True):
+        altered = altered_by_refsafe(first, b, timestep, remedy)
+        unstable = beyond_stability(*steepest(k, b, bounds, over), timestep, integrator)
+        found += [(pair, message) for message in (altered, unstable) if message]
+    return _grouped(found)
 
 
 def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
     """Say where MJX finds other contact points than C MuJoCo does, in one sentence per kind of difference."""
     geom = mujoco.mjtGeom
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
-    messages = []
-    if frozenset((geom.mjGEOM_PLANE, geom.mjGEOM_MESH)) in kinds:
-        messages.append("mesh on plane: MJX keeps only corners within 1 mm of the deepest one")
-    if frozenset((geom.mjGEOM_CAPSULE,)) in kinds:
-        messages.append("parallel capsules: MJX makes one contact, C MuJoCo two")
-    return messages
+    known = (
+        ({geom.mjGEOM_PLANE, geom.mjGEOM_MESH}, "mesh on plane: MJX keeps only corners within 1 mm of the deepest one"),
+        ({geom.mjGEOM_CAPSULE}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
+    )
+    return [message for kind, message in known if kind in kinds]
 
 
 def name_pairs(pairs: Sequence[object]) -> str:
@@ -102,14 +94,8 @@ def steepest(
 ) -> tuple[float, float]:
     r"""Return stiffness and damping where the impedance is largest, which is at first touch if it falls with depth.
 
-    The force on a body is $d(r)$ of the acceleration $-B \dot r - K d(r) r$ that is asked for, so that stiffness goes as the
-    square of the impedance and damping as the impedance.
-
-    Args:
-        stiffness: at full depth, $k = K d_w^2$, in 1/s².
-        damping: at full depth, $b = B d_w$, in 1/s.
-        impedance: $d_0$ and $d_w$.
-        width: over which it changes; without one it is $d_w$ everywhere.
+    Both are given at full depth (1/s², 1/s). The force on a body is $d(r)$ of the acceleration that is asked for, so that
+    stiffness goes as the square of the impedance and damping as the impedance; without a width that is $d_w$ everywhere.
     """
     share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
     return float(share**2 * stiffness), float(share * damping)

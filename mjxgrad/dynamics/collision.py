@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mjxgrad._math import safe_norm
+from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
 from mjxgrad.dynamics.spatial import contract, dot, pick
 

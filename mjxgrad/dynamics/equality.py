@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._math import safe_norm
+from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import impedance
 from mjxgrad.dynamics import spatial, tree
@@ -150,8 +150,7 @@ def _coupling(
 
 def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    addresses = [model.jnt_qposadr[joint] for joint in objects]
-    dofs = [model.jnt_dofadr[joint] for joint in objects]
+    addresses, dofs = ([table[joint] for joint in objects] for table in (model.jnt_qposadr, model.jnt_dofadr))
     unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
     positions = [data.qpos[a] - model.qpos0[a] for a in addresses]
     weights = [model.dof_invweight0[dof] for dof in dofs]

@@ -1,9 +1,8 @@
 r"""What automatic differentiation misses when a contact or a limit begins or ends.
 
-MuJoCo's contact force jumps where contact begins (by default its impedance there is 0.9, not 0), and often where it
-ends. The simulated outcome is therefore a sawtooth in the state: smooth while the same steps are in contact, with a jump
-wherever a step joins or leaves them. Its derivative, the *discrete* one, is that of a tooth. The derivative of the motion
-is the slope across the teeth, and the jumps belong to it.
+MuJoCo's contact force jumps where contact begins (by default its impedance there is 0.9, not 0), and often where it ends, so
+that the simulated outcome is a sawtooth in the state, see `onset`. Its derivative, the *discrete* one, is that of a tooth; that
+of the motion is the slope across the teeth, and the jumps belong to it.
 
 **The term.** Let e be a contact or limit (all its rows together), r its distance less the margin, v = ṙ = J_n q̇. A jump
 lies where r = 0 in some step. Shift r at fixed velocities: the state passes such a place once for every h|v| of r, and the
@@ -61,7 +60,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics import assembly, constraint, implicit, linear

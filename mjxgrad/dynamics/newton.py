@@ -195,17 +195,14 @@ class _Iterate(eqx.Module):
 
 
 def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
-    """Return the acceleration of least cost and the number of iterations that it took.
+    """Return the acceleration of least cost, NaN where the problem is not finite, and the number of iterations that it took.
 
     It goes on until every member of the batch is done; those that are do not move any more. Once an eighth of them are left,
     they are taken out and finished among themselves. A start that is not finite is replaced by zero.
 
     The tolerance is on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
-    single body the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding.
-
-    Returns:
-        The acceleration, NaN where the problem is not finite, and the number of iterations: one more than
-        `max_iterations` where these, or the digits of this precision, were too few.
+    single body the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
+    number is one more than `max_iterations` where these, or the digits of this precision, were too few.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
     batch, problem = start.shape[1:], system.problem()

@@ -60,7 +60,6 @@ References:
 """
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -68,9 +67,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._math import safe_sqrt
+from mjxgrad._arrays import as_float, is_known, safe_sqrt
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
 from mjxgrad.dynamics.jacobian import RowMap
@@ -87,10 +85,6 @@ _SLIP = 3.0
 _GRAVITY = 9.81
 
 
-def _as_width(value: Any) -> Array:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
 class Onset(eqx.Module):
     """Contacts and limits that begin within the step; see `mjxgrad.dynamics.onset`.
 
@@ -101,24 +95,16 @@ class Onset(eqx.Module):
             MuJoCo's default is 0.1 mm). It bounds the derivative where contacts chatter; 0 is none.
     """
 
-    width: Float[Array, "..."] = eqx.field(converter=_as_width, default=0.1)
+    width: Float[Array, "..."] = eqx.field(converter=as_float, default=0.1)
 
     def __check_init__(self):
-        """Refuse widths without meaning, if they are known.
-
-        Raises:
-            ValueError: if the width is negative or not finite.
-        """
+        """Refuse widths that are negative or not finite, if they are known."""
         if is_known(self.width) and not np.all((np.asarray(self.width) >= 0) & np.isfinite(self.width)):
             given = np.asarray(self.width)
             raise ValueError(f"width must be finite and not negative, got {given!s}: 0.1 is the default, 0 no floor")
 
     def check(self, gradient: str) -> None:
-        """Refuse what a single step cannot take.
-
-        Raises:
-            ValueError: if the width has a leading axis, or the event gradient is asked for, too.
-        """
+        """Refuse what a single step cannot take."""
         if self.width.ndim:
             raise ValueError(f"width must be one value for a step, got shape {self.width.shape}: sweep under jax.vmap")
         if gradient == "event":

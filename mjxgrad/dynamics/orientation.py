@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
+from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import known
 from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.spatial import contract, pick
 

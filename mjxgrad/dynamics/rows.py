@@ -6,7 +6,6 @@ of the row estimated at the reference pose.
 
 import dataclasses
 import functools
-import operator
 from typing import Any
 
 import equinox as eqx
@@ -16,10 +15,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._math import safe_norm
+from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics import linear, spatial, tree
 from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, fold
 
@@ -160,19 +159,15 @@ def has_pyramids(model: mjx.Model, dim: int) -> bool:
 
 def _bodies(model: mjx.Model, contact: Any, first: int) -> np.ndarray | Array:
     """Return the bodies of consecutive contacts, as constants where they are known."""
-    known = slot_bodies(model)
-    return jnp.asarray(model.geom_bodyid)[contact.geom] if known is None else known[first : first + len(contact.dist)]
+    slots = slot_geoms(model)
+    if slots is None:
+        return jnp.asarray(model.geom_bodyid)[contact.geom]
+    return np.asarray(model.geom_bodyid)[slots[first : first + len(contact.dist)]]
 
 
 def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:
     """Return friction as C MuJoCo clamps it for every contact: a cone without width has no inside."""
     return jnp.where(friction > mujoco.mjMINMU, friction, mujoco.mjMINMU)
-
-
-def slot_bodies(model: mjx.Model) -> np.ndarray | None:
-    """Return the two bodies of each contact slot, (contacts, 2); None where it is decided at run time who gets a slot."""
-    geoms = slot_geoms(model)
-    return None if geoms is None else np.asarray(model.geom_bodyid)[geoms]
 
 
 def contact_rows(
@@ -204,10 +199,9 @@ def contact_jacobian(
     bodies: Array | np.ndarray,
     dim: int,
 ) -> Float[Array, "contacts dim nv"]:
-    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames.
+    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as `ContactRows` do.
 
-    A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
-    on a joint velocity at the rate (axis · wrench). The second body counts positive, the first negative.
+    The second body counts positive, the first negative.
     """
     moves = jnp.asarray(tree.moving_dofs(model), position.dtype)[bodies]  # contacts, 2, nv
     centre = data.subtree_com[jnp.asarray(model.body_rootid)[bodies]]
@@ -227,7 +221,7 @@ def contact_jacobian(
 
 def _dot_axes(wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]) -> Float[Array, "contacts k nv"]:
     # Written out: XLA's CPU backend crashed on the derivative of the reduction under two jax.vmap (jax 0.10.2).
-    return functools.reduce(operator.add, (wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1])))
+    return linear.add(wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1]))
 
 
 def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> Float[Array, "3"]:
@@ -247,7 +241,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     Raises:
         ValueError: if there is no such geom, or no contact between the two.
     """
-    wanted = [_geom(model, name) for name in (first, second)]
+    wanted = [index_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in (first, second)]
     contact, known = data._impl.contact, slot_geoms(model)
     slots = range(len(contact.dim)) if known is None else np.flatnonzero((np.sort(known) == sorted(wanted)).all(axis=1))
     if not len(slots):
@@ -266,15 +260,14 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     return total
 
 
-def _geom(model: mjx.Model, name: str) -> int:
-    names = {
-        model.names[address:].split(b"\0", 1)[0].decode(): number
-        for number, address in enumerate(np.asarray(model.name_geomadr))
-    }
+def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
+    """Return the number of a geom, sensor or site; refuse a name that there is not."""
+    word = kind.name.removeprefix("mjOBJ_").lower()
+    names = [mjx.id2name(model, kind, index) for index in range(getattr(model, f"n{word}"))]
     if name not in names:
-        known = ", ".join(repr(one) for one in names if one)
-        raise ValueError(f"there is no geom {name!r}; named geoms are {known or 'none'}")
-    return names[name]
+        listed = ", ".join(repr(one) for one in names if one) or "none"
+        raise ValueError(f"there is no {word} {name!r}; named {word}s are {listed}")
+    return names.index(name)
 
 
 def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:

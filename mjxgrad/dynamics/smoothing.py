@@ -33,7 +33,7 @@ slots have no rows.
 
 import dataclasses
 import functools
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -42,8 +42,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.dynamics.collision import CONVEX, are, is_blind
@@ -59,10 +59,6 @@ _SOFTEST = 1e-3
 # Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
 # derivative.
 _WEIGHTLESS = 1e30
-
-
-def _as_length(value: Any) -> Any:
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 class Smoothing(eqx.Module):
@@ -82,27 +78,20 @@ class Smoothing(eqx.Module):
         gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
     """
 
-    length: Float[Array, "..."] = eqx.field(converter=_as_length)
+    length: Float[Array, "..."] = eqx.field(converter=as_float)
     # Plain strings, so that a name that there is not meets the check below, which knows the choices.
     kernel: str = eqx.field(static=True, default="gaussian")
     mode: str = eqx.field(static=True, default="forward")
-    limit_length: Float[Array, "..."] | None = eqx.field(converter=_as_length, default=None, kw_only=True)
+    limit_length: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None, kw_only=True)
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
-        """Refuse names that there are not, and lengths without meaning if they are known.
-
-        Raises:
-            ValueError: if a length is not positive and finite, or there is no such kernel or mode.
-        """
+        """Refuse names that there are not, and lengths that are not positive and finite if they are known."""
         for name, choices in (("kernel", get_args(KernelName)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
-        remedies = {
-            "length": "for a step without smoothing give smoothing=None",
-            "limit_length": "None leaves limits alone",
-        }
-        for name, remedy in remedies.items():
+        without = "for a step without smoothing give smoothing=None"
+        for name, remedy in (("length", without), ("limit_length", "None leaves limits alone")):
             value = getattr(self, name)
             if is_known(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
                 raise ValueError(f"{name} must be positive and finite, got {np.asarray(value)!s}: {remedy}")
@@ -113,11 +102,7 @@ class Smoothing(eqx.Module):
         return KERNELS[self.kernel]
 
     def check(self, gradient: str) -> None:
-        """Refuse what a single step cannot take.
-
-        Raises:
-            ValueError: if a length has a leading axis, or the event correction is asked for, too.
-        """
+        """Refuse what a single step cannot take."""
         for name in ("length", "limit_length"):
             value = getattr(self, name)
             if value is not None and value.ndim:
@@ -151,16 +136,11 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
             f"smoothing gives no force at a distance to {shown}: MJX knows the distance of a box, mesh or height field from "
             "anything but a plane only where they overlap; build them of spheres and capsules"
         )
-    if smoothing.limit_length is not None and not has_limits(model):
+    is_off = int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    has_limits = not is_off and (np.any(model.jnt_limited) or np.any(model.tendon_limited))
+    if smoothing.limit_length is not None and not has_limits:
         messages.append("limit_length has no effect: no joint or tendon of the scene has a limit")
     return messages
-
-
-def has_limits(model: mjx.Model) -> bool:
-    """Return whether some joint or tendon has a limit that acts."""
-    if int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
-        return False
-    return bool(np.any(model.jnt_limited) or np.any(model.tendon_limited))
 
 
 def smoothed(
@@ -170,9 +150,8 @@ def smoothed(
 
     Noise has numbers without meaning for rows without, and is None, and nothing else changes, if there is nothing to be smoothed.
     """
-    has_distance, num_contacts = _has_distance(model, data), 0
+    has_distance, num_contacts, start = _has_distance(model, data), 0, 0
     rows, noises, first = [], [], None
-    start = 0
     for block in blocks:
         each, count = block.rows_each, len(block.residual)
         length = smoothing.length if block.is_contact else smoothing.limit_length

@@ -194,21 +194,17 @@ def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
     return Bilinear(np.eye(a.shape[1])[None])(a, b)[:, 0]
 
 
+@jax.custom_jvp
 def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Return items times a factor each."""
-    return _scale(factor, x)
-
-
-@jax.custom_jvp
-def _scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     return factor[:, None] * x
 
 
-@_scale.defjvp
+@scale.defjvp
 def _scale_jvp(primals, tangents):
     (factor, x), (change, dx) = primals, tangents
     scaled = Bilinear(np.eye(x.shape[1])[:, None])
-    return _scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
+    return scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
 
 
 def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
@@ -216,24 +212,20 @@ def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
     return contract("nij,nj->ni", matrix, x)
 
 
+@jax.custom_jvp
 def compose(p: _Matrices, q: _Matrices) -> _Matrices:
     """Return the matrix product of each item.
 
     Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices
     takes a tenth of a step longer (CPU); a product for the derivative, which written out is longer to compile.
     """
-    return _compose(p, q)
-
-
-@jax.custom_jvp
-def _compose(p: _Matrices, q: _Matrices) -> _Matrices:
     return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
 
-@_compose.defjvp
+@compose.defjvp
 def _compose_jvp(primals, tangents):
     (p, q), (dp, dq) = primals, tangents
-    return _compose(p, q), contract("nij,njk->nik", dp, q) + contract("nij,njk->nik", p, dq)
+    return compose(p, q), contract("nij,njk->nik", dp, q) + contract("nij,njk->nik", p, dq)
 
 
 def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:

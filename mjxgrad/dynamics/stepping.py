@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad._static import is_known_to_be
 from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.collision import collide
@@ -49,14 +49,17 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
         yield
 
 
-def check_gradient(gradient: str) -> None:
-    """Refuse the name of a gradient that there is not.
+def check_gradient(gradient: str, onset: Onset | None = None, smoothing: Smoothing | None = None) -> None:
+    """Refuse the name of a gradient that there is not, and what does not go with it.
 
     Raises:
-        ValueError: naming those that there are.
+        ValueError: naming those that there are, or saying what a single step cannot take.
     """
     if gradient not in get_args(Gradient):
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
+    for settings in (smoothing, onset):
+        if settings is not None:
+            settings.check(gradient)
 
 
 def step(
@@ -90,11 +93,7 @@ def step(
             smoothing have a leading axis or are to go with the gradient "event".
         NotImplementedError: if MJX lacks the integrator.
     """
-    check_gradient(gradient)
-    if smoothing is not None:
-        smoothing.check(gradient)
-    if onset is not None:
-        onset.check(gradient)
+    check_gradient(gradient, onset, smoothing)
     integrator = model.opt.integrator
     with _at_full_precision(model, data):
         if integrator == _Integrator.mjINT_RK4:
@@ -127,10 +126,7 @@ def forward(
         ValueError: if `model` or `data` belong to another implementation of MJX, or onset or smoothing
             have a leading axis.
     """
-    if smoothing is not None:
-        smoothing.check("discrete")
-    if onset is not None:
-        onset.check("discrete")
+    check_gradient("discrete", onset, smoothing)
     with _at_full_precision(model, data):
         return _forward(model, data, onset, smoothing)[0]
 

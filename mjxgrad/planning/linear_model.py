@@ -7,14 +7,13 @@ Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \oper
 Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
 Across a contact the mean is smooth even where f is not: before a touch, A and B already know what a push will do.
 
-Three ways to the same model: `first_order` averages Jacobians and misses what they do not see (a jump of f; under
-`gradient="discrete"` the moving time of an impact); `zeroth_order` fits a plane to samples of f and misses nothing, at the
-price of noise; `analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
+Three ways to the same model: `Sampled` in first order averages Jacobians and misses what they do not see (a jump of f; under
+`gradient="discrete"` the moving time of an impact); in zeroth order it fits a plane to samples of f and misses nothing, at the
+price of noise; `Analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
 distance of contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it
-agrees with the others as far as a contact's impedance is small against one. A `Smoother` is one of them, with its noise.
+agrees with the others as far as a contact's impedance is small against one.
 
-Standard deviations are a number or one per coordinate of a change or per control, at least 0; one that does not fit, or too few
-samples, are refused (ValueError). A key is consumed. With `wrt_state=False` A has no columns, and the state's noise still acts.
+A key is consumed. With `wrt_state=False` A has no columns where it is not a plane's, and the state's noise still acts.
 
 References:
     Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
@@ -23,7 +22,7 @@ References:
 """
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -32,7 +31,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad._static import is_known
+from mjxgrad._arrays import is_known
 from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.dynamics import Smoothing
@@ -100,7 +99,13 @@ class Analytic(Smoother):
         return system.with_smoothing(self.smoothing).step(state, control)
 
     def linear_model(self, system, state, control, key, *, wrt_state=True):
-        return analytic(system.with_smoothing(self.smoothing), state, control, wrt_state=wrt_state)
+        system = system.with_smoothing(self.smoothing)
+        noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
+        jacobian, ends = _linearised(system, state, control, noise, wrt_state)
+        change, jacobian = _changes(system, ends, ends[0], jacobian)
+        is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
+        exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
+        return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1)
 
     def scaled(self, factor: ArrayLike) -> "Analytic":
         # The lengths are its only leaves.
@@ -143,17 +148,91 @@ class Sampled(Smoother):
         if self.order not in ("first", "zeroth"):
             raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
 
-    def _noise(self) -> dict[str, Any]:
-        names = ("stddev_state", "stddev_control", "num_samples")
-        return {name: getattr(self, name) for name in names}
-
     def step(self, system, state, control, key):
-        return mean_step(system, state, control, key, **self._noise())
+        """Return the mean next state over the finite ones under noise. As a function of the state it is one map for each key.
+
+        Each sample is taken with its mirror image, so that a linear step is averaged without error.
+        """
+        stddev = self._stddev(system, state.dtype, least=1)
+        noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
+        is_finite = jnp.all(jnp.isfinite(value), axis=1)
+        mean, _ = _mean(jnp.where(is_finite[:, None], value, 0.0), is_finite)
+        return system.retract(nominal, mean)
 
     def linear_model(self, system, state, control, key, *, wrt_state=True):
         if self.order == "zeroth":
-            return zeroth_order(system, state, control, key, **self._noise())
-        return first_order(system, state, control, key, wrt_state=wrt_state, **self._noise())
+            return self._zeroth_order(system, state, control, key)
+        return self._first_order(system, state, control, key, wrt_state)
+
+    def _first_order(
+        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray, wrt_state: bool
+    ) -> LinearModel:
+        """Average Jacobians.
+
+        The mean next state is that of the samples less what their mean Jacobian explains of it (each sample's own left out),
+        so that noise adds nothing to a linear step: A, B and c are then exact.
+        """
+        stddev = self._stddev(system, state.dtype, least=2)
+        noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        # The step without noise runs in the same batch: a call of its own would be compiled a second time.
+        jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
+        value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
+        is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
+        jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
+        value = jnp.where(is_finite[:, None], value, 0.0)
+        count = is_finite.sum()
+        mean, error = _mean(jacobian, is_finite)
+        others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
+        seen = noise[:, -jacobian.shape[2] :]
+        rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
+        return _model(system, ends[0], mean, error, rest, rest_error, is_finite, least=2)
+
+    def _zeroth_order(
+        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
+    ) -> LinearModel:
+        """Fit a plane to samples of the step by least squares.
+
+        Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
+        Its errors do not assume that the samples scatter alike everywhere (White's, with leverage taken out, HC3), for across
+        a contact they do not. It takes at least two samples more than there are coordinates of state and control; where the
+        noise is 0 the step is not seen to vary, and that column is zero, with an infinite error.
+        """
+        least = system.num_changes + system.num_controls + 2
+        stddev = self._stddev(system, state.dtype, least)
+        unit = jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        nominal, value = _sampled(system, state, control, stddev * unit)
+        is_finite = jnp.all(jnp.isfinite(value), axis=1)
+        value = jnp.where(is_finite[:, None], value, 0.0)
+        # In units of the noise the normal equations are well conditioned whatever the units of the coordinates.
+        design = jnp.where(is_finite[:, None], jnp.concatenate([jnp.ones((self.num_samples, 1)), unit], axis=1), 0.0)
+        # Too few finite samples make the equations singular; then the ones on the diagonal keep them solvable, unseen.
+        enough = is_finite.sum() >= least
+        gram = design.T @ design + jnp.where(enough, 0.0, 1.0) * jnp.eye(least - 1)
+        influence = jnp.linalg.solve(gram, design.T)
+        slope = influence @ value
+        leverage = jnp.einsum("ip,pi->i", design, influence)
+        residual = (value - design @ slope) / (1 - jnp.minimum(leverage, 1 - 1e-6))[:, None]
+        error = jnp.sqrt(influence**2 @ residual**2)
+        is_seen = stddev[:, None] > 0
+        scale = jnp.where(is_seen, stddev[:, None], 1.0)
+        jacobian = jnp.where(is_seen, slope[1:] / scale, 0.0).T
+        jacobian_error = jnp.where(is_seen, error[1:] / scale, jnp.inf).T
+        return _model(system, nominal, jacobian, jacobian_error, slope[0], error[0], is_finite, least=least)
+
+    def _stddev(self, system: System, dtype: jnp.dtype, least: int) -> Float[Array, " both"]:
+        """Return the standard deviations of all coordinates of state and control."""
+        parts = []
+        for name, size in (("stddev_state", system.num_changes), ("stddev_control", system.num_controls)):
+            value = jnp.asarray(getattr(self, name), dtype)
+            if value.shape not in ((), (size,)):
+                raise ValueError(f"{name} must be a number or have shape ({size},), got shape {value.shape}")
+            if not isinstance(value, jax.core.Tracer) and not (np.asarray(value) >= 0).all():
+                raise ValueError(f"{name} must be at least 0 and finite, got {np.asarray(value)}")
+            parts.append(jnp.broadcast_to(value, (size,)))
+        if self.num_samples < least:
+            raise ValueError(f"num_samples must be at least {least} for this system, got {self.num_samples}")
+        return jnp.concatenate(parts)
 
     def scaled(self, factor: ArrayLike) -> "Sampled":
         return Sampled(factor * self.stddev_state, factor * self.stddev_control, self.num_samples, self.order)
@@ -175,115 +254,6 @@ def _resting(system: SceneSystem, start: np.ndarray) -> list[ContactPair]:
         for pair in scene.pairs
         if pair.condim > 1 and {pair.geom1, pair.geom2} in touching and is_fixed[[pair.geom1, pair.geom2]].any()
     ]
-
-
-def analytic(system: System, state: StateVector, control: ControlVector, *, wrt_state: bool = True) -> LinearModel:
-    """Linearise the step itself; with `SceneSystem.smoothing` that is the smoothed solver's, without it the plain one's."""
-    noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
-    jacobian, ends = _linearised(system, state, control, noise, wrt_state)
-    change, jacobian = _changes(system, ends, ends[0], jacobian)
-    is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
-    exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
-    return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1, num_controls=control.size)
-
-
-def first_order(
-    system: System,
-    state: StateVector,
-    control: ControlVector,
-    key: PRNGKeyArray,
-    *,
-    stddev_state: ArrayLike = 0.0,
-    stddev_control: ArrayLike = 0.0,
-    num_samples: int,
-    wrt_state: bool = True,
-) -> LinearModel:
-    """Average Jacobians over at least 2 samples of the noise.
-
-    The mean next state is that of the samples less what their mean Jacobian explains of it (each sample's own left out), so
-    that noise adds nothing to a linear step: A, B and c are then exact.
-    """
-    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
-    _check_count(num_samples, 2)
-    noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    # The step without noise runs in the same batch: a call of its own would be compiled a second time.
-    jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
-    value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
-    is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
-    jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
-    value = jnp.where(is_finite[:, None], value, 0.0)
-    count = is_finite.sum()
-    mean, error = _mean(jacobian, is_finite)
-    others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
-    seen = noise[:, -jacobian.shape[2] :]
-    rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
-    return _model(system, ends[0], mean, error, rest, rest_error, is_finite, least=2, num_controls=control.size)
-
-
-def zeroth_order(
-    system: System,
-    state: StateVector,
-    control: ControlVector,
-    key: PRNGKeyArray,
-    *,
-    stddev_state: ArrayLike,
-    stddev_control: ArrayLike,
-    num_samples: int,
-) -> LinearModel:
-    r"""Fit a plane to samples of the step by least squares; nothing is differentiated.
-
-    Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
-    Its errors do not assume that the samples scatter alike everywhere (White's, with leverage taken out, HC3), for across a
-    contact they do not. It takes at least two samples more than there are coordinates of state and control; where the noise
-    is 0 the step is not seen to vary, and that column is zero, with an infinite error.
-    """
-    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
-    least = stddev.size + 2
-    _check_count(num_samples, least)
-    unit = jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    nominal, value = _sampled(system, state, control, stddev * unit)
-    is_finite = jnp.all(jnp.isfinite(value), axis=1)
-    value = jnp.where(is_finite[:, None], value, 0.0)
-    # In units of the noise the normal equations are well conditioned whatever the units of the coordinates.
-    design = jnp.where(is_finite[:, None], jnp.concatenate([jnp.ones((num_samples, 1)), unit], axis=1), 0.0)
-    # Too few finite samples make the equations singular; then the ones on the diagonal keep them solvable, and no one sees it.
-    enough = is_finite.sum() >= least
-    gram = design.T @ design + jnp.where(enough, 0.0, 1.0) * jnp.eye(least - 1)
-    influence = jnp.linalg.solve(gram, design.T)
-    slope = influence @ value
-    leverage = jnp.einsum("ip,pi->i", design, influence)
-    residual = (value - design @ slope) / (1 - jnp.minimum(leverage, 1 - 1e-6))[:, None]
-    error = jnp.sqrt(influence**2 @ residual**2)
-    is_seen = stddev[:, None] > 0
-    scale = jnp.where(is_seen, stddev[:, None], 1.0)
-    jacobian = jnp.where(is_seen, slope[1:] / scale, 0.0).T
-    jacobian_error = jnp.where(is_seen, error[1:] / scale, jnp.inf).T
-    return _model(
-        system, nominal, jacobian, jacobian_error, slope[0], error[0], is_finite, least=least, num_controls=control.size
-    )
-
-
-def mean_step(
-    system: System,
-    state: StateVector,
-    control: ControlVector,
-    key: PRNGKeyArray,
-    *,
-    stddev_state: ArrayLike = 0.0,
-    stddev_control: ArrayLike = 0.0,
-    num_samples: int,
-) -> StateVector:
-    """Return the mean next state over the finite ones under noise. As a function of the state it is one map for each key.
-
-    Each of at least 1 sample is taken with its mirror image, so that a linear step is averaged without error.
-    """
-    stddev = _stddev(system, stddev_state, stddev_control, state.dtype)
-    _check_count(num_samples, 1)
-    noise = stddev * jax.random.normal(key, (num_samples, stddev.size), state.dtype)
-    nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
-    is_finite = jnp.all(jnp.isfinite(value), axis=1)
-    mean, _ = _mean(jnp.where(is_finite[:, None], value, 0.0), is_finite)
-    return system.retract(nominal, mean)
 
 
 def _perturbed(system: System, state: StateVector, control: ControlVector, noise: Float[Array, " both"]) -> StateVector:
@@ -348,32 +318,13 @@ def _model(
     is_finite: Bool[Array, " N"],
     *,
     least: int,
-    num_controls: int,
 ) -> LinearModel:
     """Split the Jacobian, and refuse to give numbers where too few samples were finite."""
     exists = is_finite.sum() >= least
     jacobian, jacobian_error, change, change_error = (
         jnp.where(exists, x, jnp.nan) for x in (jacobian, jacobian_error, change, change_error)
     )
-    columns = jacobian.shape[1] - num_controls
+    columns = jacobian.shape[1] - system.num_controls
     (A, B), (A_error, B_error) = (jnp.split(x, [columns], axis=1) for x in (jacobian, jacobian_error))
     fraction = is_finite.mean(dtype=jacobian.dtype)
     return LinearModel(A, B, system.retract(nominal, change), A_error, B_error, change_error, fraction)
-
-
-def _stddev(system: System, state: ArrayLike, control: ArrayLike, dtype: jnp.dtype) -> Float[Array, " both"]:
-    """Return the standard deviations of all coordinates of state and control."""
-    parts = []
-    for name, value, size in (("state", state, system.num_changes), ("control", control, system.num_controls)):
-        value = jnp.asarray(value, dtype)
-        if value.shape not in ((), (size,)):
-            raise ValueError(f"stddev_{name} must be a number or have shape ({size},), got shape {value.shape}")
-        if not isinstance(value, jax.core.Tracer) and not (np.asarray(value) >= 0).all():
-            raise ValueError(f"stddev_{name} must be at least 0 and finite, got {np.asarray(value)}")
-        parts.append(jnp.broadcast_to(value, (size,)))
-    return jnp.concatenate(parts)
-
-
-def _check_count(num_samples: int, least: int) -> None:
-    if num_samples < least:
-        raise ValueError(f"num_samples must be at least {least} for this system, got {num_samples}")

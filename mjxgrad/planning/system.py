@@ -80,8 +80,7 @@ class System(eqx.Module):
         if smoothing is None:
             return self
         raise ValueError(
-            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: "
-            "take samples, by first_order or zeroth_order"
+            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: take samples, by Sampled"
         )
 
 
@@ -142,10 +141,8 @@ class SceneSystem(System):
     @property
     def control_limits(self) -> tuple[ControlVector, ControlVector]:
         """The actuators' `ctrlrange`, infinite where they have none."""
-        is_limited, ranges = (
-            np.asarray(self.scene.model.actuator_ctrllimited, bool),
-            self.scene.model.actuator_ctrlrange,
-        )
+        model = self.scene.model
+        is_limited, ranges = np.asarray(model.actuator_ctrllimited, bool), model.actuator_ctrlrange
         return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
 
     def flatten(self, state: State) -> StateVector:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
+from mjxgrad._arrays import known
 from mjxgrad.planning.cost import Cost, Quadratic, stage_model, terminal_model
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, System
@@ -285,12 +286,12 @@ def _check(
         )
     if factors.ndim != 1 or not factors.size:
         raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
-    if not isinstance(factors, jax.core.Tracer) and not (np.asarray(factors) > 0).all():
-        raise ValueError(f"schedule must be positive, got {np.asarray(factors).min():g}: for no smoothing take Exact()")
-    if any(isinstance(x, jax.core.Tracer) for x in (lower, upper)):
-        return
-    if not (np.asarray(lower) <= np.asarray(upper)).all():
-        raise ValueError(f"lower must be at most upper, got {np.asarray(lower)} and {np.asarray(upper)}")
+    given = known(factors)
+    if given is not None and not (given > 0).all():
+        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
+    low, high = known(lower), known(upper)
+    if low is not None and high is not None and not (low <= high).all():
+        raise ValueError(f"lower must be at most upper, got {low} and {high}")
 
 
 def backward_pass(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
+from mjxgrad._arrays import known
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, StateVector, System
 from mjxgrad.task import optional_pytree
@@ -22,14 +23,12 @@ _PROGRESS = 0.02
 
 
 class Reach(eqx.Module):
-    r"""What one step can reach around a state: an ellipsoid around c with the axes of B diag(r), r the reach of the controls.
+    r"""What one step can reach around a state: an ellipsoid around c, the mean next state, with the axes of B.
 
-    The distance of a change $e$ from its centre is $e^\top (B r r B^\top + \Gamma)^{-1} e$, with $\Gamma$ = diag(resolution²). A
-    coordinate that does not count has infinite resolution, so that its inverse, the weight, is zero; and by Woodbury's identity
-    only an m by m inverse is needed, one per set of weights.
-
-    Here c is the mean next state, B that of positions times the reach of each control, and `inverse` (I + Bᵀ W B)⁻¹ for each
-    set W of weights.
+    B is that of positions times the reach of each control. The distance of a change $e$ from the centre is
+    $e^\top (B B^\top + \Gamma)^{-1} e$, with $\Gamma$ = diag(resolution²). A coordinate that does not count has infinite
+    resolution, so that its weight in W = Γ⁻¹ is zero; and by Woodbury's identity only (I + Bᵀ W B)⁻¹ is needed, the `inverse`
+    for each W.
     """
 
     c: StateVector
@@ -87,11 +86,9 @@ class Nodes(eqx.Module):
         return jnp.argmin(jnp.where(self.is_node, self.errors, jnp.inf))
 
     def add(self, new: "Nodes", is_valid: Bool[Array, "*many"]) -> "Nodes":
-        """Append nodes, in their order; those beyond the capacity are lost.
+        """Append new nodes, those that are valid, in their order; those beyond the capacity are lost.
 
-        Args:
-            new: with leading axes as `is_valid`; a parent p below −1 is the new node −2 − p, counted over all axes.
-            is_valid: which of them to keep. The parent of one that is kept must be kept.
+        A parent p below −1 is the new node −2 − p, counted over all axes; that of a valid one must be valid.
         """
         valid = is_valid.ravel()
         many = valid.size
@@ -375,8 +372,8 @@ def _check(
     least = 1 + sampling.batch * sampling.max_extension
     if capacity < least:
         raise ValueError(f"capacity must be at least {least}, the root and one batch of extensions, got {capacity}")
-    if any(isinstance(x, jax.core.Tracer) for x in (lower, upper)):
+    low, high = known(lower), known(upper)
+    if low is None or high is None:
         return
-    low, high = np.asarray(lower), np.asarray(upper)
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ValueError(f"limits of the controls must be finite, lower below upper, got {low} and {high}")

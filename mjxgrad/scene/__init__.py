@@ -2,9 +2,8 @@
 
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.load import SceneError, load_scene
-from mjxgrad.scene.named import sensor, site_position
 from mjxgrad.scene.omissions import LeaveOut, Omission
-from mjxgrad.scene.scene import Scene, SceneWarning
+from mjxgrad.scene.scene import Scene, SceneWarning, sensor, site_position
 
 __all__ = [
     "Conversion",

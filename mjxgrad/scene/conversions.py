@@ -55,23 +55,21 @@ def _has(model: mujoco.MjModel, flag: int) -> bool:
     return bool(model.opt.disableflags & flag)
 
 
-def _enable_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
-    for flag, reason, exact in (
-        (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
-        (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing", True),
-        (_ENABLE.mjENBL_SLEEP, "bodies at rest are stepped too, not frozen below "
-                               "sleep_tolerance as in C MuJoCo", False),
-    ):  # fmt: skip
-        if model.opt.enableflags & flag.value:
-            model.opt.enableflags &= ~flag.value
-            name = flag.name.removeprefix("mjENBL_").lower()
-            yield Conversion(f"flag {name}", "enable", "disable", reason, exact)
+def _disabled(
+    model: mujoco.MjModel, flag: mujoco.mjtEnableBit, reason: str, exact: bool = True
+) -> Iterator[Conversion]:
+    if model.opt.enableflags & flag.value:
+        model.opt.enableflags &= ~flag.value
+        yield Conversion(f"flag {flag.name.removeprefix('mjENBL_').lower()}", "enable", "disable", reason, exact)
 
 
-def _c_only_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
+def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
+    yield from _disabled(model, _ENABLE.mjENBL_ENERGY, "energy is computed for reading only")
+    yield from _disabled(model, _ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing")
+    asleep = "bodies at rest are stepped too, not frozen below sleep_tolerance as in C MuJoCo"
+    yield from _disabled(model, _ENABLE.mjENBL_SLEEP, asleep, exact=False)
     for flag in ("ISLAND", "MIDPHASE", "NATIVECCD", "MULTICCD", "AUTORESET"):
-        bit = getattr(_DISABLE, f"mjDSBL_{flag}").value
-        if _has(model, bit):
+        if _has(model, getattr(_DISABLE, f"mjDSBL_{flag}").value):
             reason = "chooses between algorithms of C MuJoCo; MJX has its own"
             yield Conversion(f"flag {flag.lower()}", "disable", "ignored", reason)
 
@@ -92,18 +90,12 @@ def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion("solver", name, "Newton", "the same convex problem, the same optimum")
 
 
-def _noslip(model: mujoco.MjModel) -> Iterator[Conversion]:
-    # Refused before, if there is friction for it to act on.
+def _idle(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """Both are refused before, if there is friction, or a constraint, for them to act on."""
     if model.opt.noslip_iterations > 0:
         given, model.opt.noslip_iterations = model.opt.noslip_iterations, 0
         yield Conversion("noslip_iterations", str(given), "0", "the scene has no friction")
-
-
-def _exact_diagonal(model: mujoco.MjModel) -> Iterator[Conversion]:
-    # Refused before, if there is a constraint for it to act on.
-    if model.opt.enableflags & _ENABLE.mjENBL_DIAGEXACT.value:
-        model.opt.enableflags &= ~_ENABLE.mjENBL_DIAGEXACT.value
-        yield Conversion("flag diagexact", "enable", "disable", "the scene has no constraints")
+    yield from _disabled(model, _ENABLE.mjENBL_DIAGEXACT, "the scene has no constraints")
 
 
 def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -118,15 +110,13 @@ def _passive_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
     spring, damper = _has(model, _SPRING), _has(model, _DAMPER)
     if spring and not damper:
         model.opt.disableflags &= ~_SPRING
-        for field in ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness"):
+        for field in ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"):
             getattr(model, field)[:] = 0.0
-        model.tendon_stiffnesspoly[:] = 0.0
         yield Conversion("flag spring", "disable", "stiffness 0", "MJX would drop damping as well")
     if damper and not spring:
         model.opt.disableflags &= ~_DAMPER
-        for field in ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly",
-                      "actuator_damping", "actuator_dampingpoly"):  # fmt: skip
-            getattr(model, field)[:] = 0.0
+        for of in ("dof", "tendon", "actuator"):
+            getattr(model, f"{of}_damping")[:] = getattr(model, f"{of}_dampingpoly")[:] = 0.0
         yield Conversion("flag damper", "disable", "damping 0", "MJX would drop springs as well")
     if spring and damper and not _has(model, _EULERDAMP):
         model.opt.disableflags |= _EULERDAMP
@@ -138,11 +128,11 @@ def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
     """Armature and damping of an actuator, seen through its gear, belong to its target."""
     if not (model.actuator_armature.any() or model.actuator_damping.any()):
         return
+    tendons = np.arange(model.ntendon)
     targets = (
         ("joint", model.jnt_actuatorid, model.jnt_dofadr, model.dof_armature, model.dof_damping),
-        ("tendon", model.tendon_actuatorid, np.arange(model.ntendon), model.tendon_armature,
-         model.tendon_damping),
-    )  # fmt: skip
+        ("tendon", model.tendon_actuatorid, tendons, model.tendon_armature, model.tendon_damping),
+    )
     for word, actuators, addresses, armature, damping in targets:
         for target, actuator in enumerate(actuators.tolist()):
             if actuator < 0:
@@ -153,17 +143,14 @@ def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
             damping[address] += gear**2 * model.actuator_damping[actuator]
             actuators[target] = -1
             name = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
-            used = f"of its {word}, times gear²"
-            reason = "a constant gear makes the two the same"
+            used, reason = f"of its {word}, times gear²", "a constant gear makes the two the same"
             yield Conversion(f"{name} armature, damping", "of the actuator", used, reason)
-    model.actuator_armature[:] = 0.0
-    model.actuator_damping[:] = 0.0
+    model.actuator_armature[:] = model.actuator_damping[:] = 0.0
 
 
 def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
     """C clips every coefficient from below, MJX does not and divides by it."""
-    used = {1: [], 3: [0], 4: [0, 1], 6: [0, 1, 2]}
-    raised = []
+    used, raised = {1: [], 3: [0], 4: [0, 1], 6: [0, 1, 2]}, []
     for pair in contact_pairs(model):
         if pair.explicit >= 0:
             rows, needed = model.pair_friction[[pair.explicit]], list(range(pair.condim - 1))
@@ -174,9 +161,8 @@ def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
     if raised:
         for field in ("geom_friction", "pair_friction"):
             np.maximum(getattr(model, field), mujoco.mjMINMU, out=getattr(model, field))
-        yield Conversion(
-            f"friction of {name_pairs(raised)}", "0", f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it"
-        )
+        least, reason = f"{mujoco.mjMINMU:g}", "what C MuJoCo itself makes of it"
+        yield Conversion(f"friction of {name_pairs(raised)}", "0", least, reason)
 
 
 def _no_width(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -219,9 +205,10 @@ def _mixed_with_a_width(model: mujoco.MjModel) -> np.ndarray:
 def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return
+    both = ("implicitfast", "MJX's implicitfast")
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
         reason = "MJX leaves out the gyroscopic derivative of free bodies; same order of accuracy"
-        yield Conversion("integrator", "implicitfast", "MJX's implicitfast", reason, exact=False)
+        yield Conversion("integrator", *both, reason, exact=False)
     affine_gain = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (model.actuator_gainprm[:, 2] != 0)
     affine_bias = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 2] != 0)
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
@@ -232,37 +219,18 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if differs.any():
         names = [element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in np.flatnonzero(differs).tolist()]
         reason = "its velocity derivative ignores force and control limits and muscles"
-        yield Conversion(
-            f"integrator at {name_pairs(names)}",
-            "implicitfast",
-            "MJX's implicitfast",
-            reason,
-            exact=False,
-        )
+        yield Conversion(f"integrator at {name_pairs(names)}", *both, reason, exact=False)
 
 
-def _distance_field_pairs(model: mujoco.MjModel) -> Iterator[Conversion]:
-    searched = {
-        frozenset(pair)
-        for pair in (
-            (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
-            (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
-            (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
-            (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID),
-            (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
-            (_GEOM.mjGEOM_ELLIPSOID,),
-            (_GEOM.mjGEOM_CYLINDER,),
-        )
-    }
-    found = [
-        describe_pair(model, pair)
-        for pair in contact_pairs(model)
-        if frozenset(_GEOM(t) for t in model.geom_type[[pair.geom1, pair.geom2]]) in searched
-    ]
+def _distance_fields(model: mujoco.MjModel) -> Iterator[Conversion]:
+    searched = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
+    smooth = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value, *searched}
+    kinds = ((pair, set(model.geom_type[[pair.geom1, pair.geom2]].tolist())) for pair in contact_pairs(model))
+    found = [describe_pair(model, pair) for pair, both in kinds if both & searched and both <= smooth]
     if found:
+        what, used = f"contact of {name_pairs(found)}", "search on distance fields"
         reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
-        what = f"contact of {name_pairs(found)}"
-        yield Conversion(what, "exact", "search on distance fields", reason, exact=False)
+        yield Conversion(what, "exact", used, reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -292,20 +260,15 @@ def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
     return bool(objects & by_body) or by_site or net_force
 
 
+_Rules = tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...]
 # Those that make a refusal needless come before the refusals, the others after them.
-BEFORE_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
-    _enable_flags,
-    _c_only_flags,
-    _wind,
-    _passive_flags,
-)
-AFTER_REFUSALS: tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...] = (
+BEFORE_REFUSALS: _Rules = (_flags, _wind, _passive_flags)
+AFTER_REFUSALS: _Rules = (
     _solver,
-    _noslip,
-    _exact_diagonal,
+    _idle,
     _actuator_inertia,
     _least_friction,
     _no_width,
     _implicitfast,
-    _distance_field_pairs,
+    _distance_fields,
 )

@@ -70,12 +70,9 @@ def load_scene(
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
         mj_model.opt.timestep = timestep
     if mj_model.nv == 0:
-        raise SceneError(
-            f"{name} must have at least one degree of freedom, got none (nv = 0), so that nothing "
-            f"can move; give a body a joint"
-        )
+        reason = "so that nothing can move; give a body a joint"
+        raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
     conversions = _make_simulable(mj_model, name)
-
     stepped = copy.deepcopy(mj_model)
     conversions += list(drop_sensors(stepped))
     omitted, omissions = omit(stepped, leave_out) if leave_out is not None else ((), ())
@@ -84,10 +81,8 @@ def load_scene(
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped)
     model, data = _put(stepped, name)
-
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
-    inexact = [c for c in conversions if not c.exact]
-    messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in inexact]
+    messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
         messages += softness_warnings(softness, scene.model, mj_model)
@@ -109,10 +104,8 @@ def _compile(source: str | os.PathLike[str] | mujoco.MjModel) -> tuple[mujoco.Mj
     if path.is_dir():
         raise IsADirectoryError(f"source must be {accepted}, got the folder {str(path)!r}")
     if not path.is_file():
-        raise FileNotFoundError(
-            f"source must be {accepted}, got {str(path)!r}, which does not exist; relative paths "
-            f"start at the current folder"
-        )
+        reason = "which does not exist; relative paths start at the current folder"
+        raise FileNotFoundError(f"source must be {accepted}, got {str(path)!r}, {reason}")
     return _parse(mujoco.MjModel.from_xml_path, str(path), path.name)
 
 
@@ -144,12 +137,9 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
             reason = f"faster below {_SPARSE_FROM} degrees of freedom, the same numbers"
             conversions.append(Conversion("jacobian", "sparse", "dense", reason))
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    is_single = jnp.result_type(float) == jnp.float32
-    if is_single and model.opt.tolerance < _FLOAT32_TOLERANCE:
-        given, model.opt.tolerance = model.opt.tolerance, _FLOAT32_TOLERANCE
-        used = f"{_FLOAT32_TOLERANCE:g}"
-        reason = "float32 resolves no more"
-        conversions.append(Conversion("tolerance", f"{given:g}", used, reason))
+    if jnp.result_type(float) == jnp.float32 and model.opt.tolerance < _FLOAT32_TOLERANCE:
+        given, model.opt.tolerance = f"{model.opt.tolerance:g}", _FLOAT32_TOLERANCE
+        conversions.append(Conversion("tolerance", given, f"{_FLOAT32_TOLERANCE:g}", "float32 resolves no more"))
     return conversions
 
 
@@ -175,8 +165,8 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
         return data
     condim = data._impl.contact.dim
     efc_type = make_efc_type(mjx_model, condim)
-    num_equality, num_friction, num_limit, num_contact = counts(efc_type)
-    num_rows = num_equality + num_friction + num_limit + num_contact
+    num_equality, num_friction, num_limit, _ = found = counts(efc_type)
+    num_rows = sum(found)
     rows = {
         f"_impl.{field.name}": jnp.zeros((num_rows, *value.shape[1:]), value.dtype)
         for field in data._impl.fields()

@@ -44,10 +44,6 @@ class LeaveOut:
     limits: tuple[str, ...] = ()
 
 
-class TooManyMasksError(ValueError):
-    """The pairs that remain cannot be told apart from the others by the bits that there are."""
-
-
 def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
     """Switch off what a scene does not need, and list all that a step of it leaves out.
 
@@ -92,46 +88,36 @@ def _has_needless_eulerdamp(model: mujoco.MjModel) -> bool:
     )
 
 
-def _num_visual_geoms(model: mujoco.MjModel) -> int:
-    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
-    return model.ngeom - len(touching)
+def _touching(model: mujoco.MjModel) -> set[int]:
+    return {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
 
 
 def _num_unused_sites(model: mujoco.MjModel) -> int:
     """Sites at which no tendon, actuator or equality constraint acts."""
-    wraps_site = np.isin(
-        model.wrap_type,
-        [mujoco.mjtWrap.mjWRAP_SITE, mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER],
+    wrap = mujoco.mjtWrap
+    acts = (
+        np.isin(model.wrap_type, [wrap.mjWRAP_SITE, wrap.mjWRAP_SPHERE, wrap.mjWRAP_CYLINDER]).any()
+        or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any()
+        or (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any()
     )
-    if wraps_site.any() or (model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE).any():
-        return 0
-    if (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE).any():
-        return 0
-    return model.nsite
+    return 0 if acts else model.nsite
 
 
 def _num_render_meshes(model: mujoco.MjModel) -> int:
     """Meshes of which no instance collides."""
-    touching = {geom for pair in contact_pairs(model) for geom in (pair.geom1, pair.geom2)}
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
-    collided = {int(model.geom_dataid[g]) for g in touching if is_mesh[g]}
-    return model.nmesh - len(collided)
+    return model.nmesh - len({int(model.geom_dataid[g]) for g in _touching(model) if is_mesh[g]})
 
 
 _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("tendons", _absent("none in the scene", lambda m: m.ntendon > 0)),
     ("collision detection",
-     _absent("no two geoms can touch", lambda m: bool(contact_pairs(m)),
-             _DISABLE.mjDSBL_CONTACT)),
-    ("equality constraints",
-     _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
-    ("friction loss",
-     _absent("no joint or tendon has any", has_friction_loss,
-             _DISABLE.mjDSBL_FRICTIONLOSS)),
+     _absent("no two geoms can touch", lambda m: bool(contact_pairs(m)), _DISABLE.mjDSBL_CONTACT)),
+    ("equality constraints", _absent("none in the scene", lambda m: m.neq > 0, _DISABLE.mjDSBL_EQUALITY)),
+    ("friction loss", _absent("no joint or tendon has any", has_friction_loss, _DISABLE.mjDSBL_FRICTIONLOSS)),
     ("limits", _absent("no joint or tendon is limited", has_limits, _DISABLE.mjDSBL_LIMIT)),
     ("actuation", _absent("no actuators", lambda m: m.nu > 0, _DISABLE.mjDSBL_ACTUATION)),
-    ("gravity compensation",
-     _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
+    ("gravity compensation", _absent("no body has gravcomp", lambda m: m.ngravcomp > 0, _DISABLE.mjDSBL_GRAVITY)),
     ("fluid forces", _absent("no medium: density = viscosity = 0", has_medium)),
     ("implicit damping",
      lambda m: "no joint is damped; keep_everything=True to differentiate by dof_damping"
@@ -139,7 +125,7 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("sensors",
      lambda m: _absent("none in the scene", lambda n: n.nsensor > 0, _DISABLE.mjDSBL_SENSOR)(m)
      or f"{m.nsensor}: not computed unless something reads them"),
-    ("contact of visual geoms", _counted(_num_visual_geoms, "they match no other geom")),
+    ("contact of visual geoms", _counted(lambda m: m.ngeom - len(_touching(m)), "they match no other geom")),
     ("sites", _counted(_num_unused_sites, "nothing acts at them; placed only if read")),
     ("cameras", _counted(lambda m: m.ncam, "placed only if read, and for rendering")),
     ("lights", _counted(lambda m: m.nlight, "rendering only")),
@@ -166,17 +152,15 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
             raise ValueError(
                 f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
             )
+    omissions = []
     if omitted:
-        try:
-            keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
-        except TooManyMasksError as error:
-            raise ValueError(
-                f"leave_out must leave pairs that collision masks can express, got {len(omitted)} of {len(everything)} to "
-                f"leave out: {error}; name fewer pairs or all of a geom"
-            ) from error
-    without_limit = [_limited_joint(model, name) for name in wanted.limits]
-    model.jnt_limited[without_limit] = 0
-    omissions = _in_words(omitted, len(everything), wanted)
+        keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
+        more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
+        listed = ", ".join(str(pair) for pair in omitted[:4]) + more
+        omissions.append(Omission(f"contact of {len(omitted)} of {len(everything)} pairs", f"as asked: {listed}"))
+    model.jnt_limited[[_limited_joint(model, name) for name in wanted.limits]] = 0
+    if wanted.limits:
+        omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
     if omissions:
         omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
     return omitted, tuple(omissions)
@@ -188,7 +172,7 @@ def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
     Geoms that collide with the same others share a bit: theirs is the type, the others have the affinity. Bits are given
     out until every pair has one, first to those that settle most pairs. What MuJoCo filters by other rules (geoms of one
     rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs, which `kept` has none of, stay as they
-    are. Raises TooManyMasksError if 31 bits do not suffice.
+    are. Raises ValueError if 31 bits do not suffice.
     """
     neighbours: dict[int, set[int]] = {}
     for pair in kept:
@@ -202,7 +186,10 @@ def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
     bit = 0
     while unsettled:
         if bit == _NUM_MASK_BITS:
-            raise TooManyMasksError(f"MuJoCo has {_NUM_MASK_BITS} bits to tell colliding geoms apart")
+            raise ValueError(
+                f"leave_out must leave pairs that the {_NUM_MASK_BITS} bits of MuJoCo's collision masks can tell apart; "
+                "name fewer pairs or all of a geom"
+            )
         settled = {others: unsettled & _between(geoms, others) for others, geoms in alike.items()}
         others = max(settled, key=lambda one: len(settled[one]))
         contype[alike[others]] |= 1 << bit
@@ -225,14 +212,3 @@ def _limited_joint(model: mujoco.MjModel, name: str) -> int:
         f"leave_out.limits must name joints with limits, got {name!r}; "
         f"those that have: {', '.join(filter(None, known)) or 'none'}"
     )
-
-
-def _in_words(omitted: tuple[ContactPair, ...], total: int, wanted: LeaveOut) -> list[Omission]:
-    omissions = []
-    if omitted:
-        more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
-        listed = ", ".join(str(pair) for pair in omitted[:4]) + more
-        omissions.append(Omission(f"contact of {len(omitted)} of {total} pairs", f"as asked: {listed}"))
-    if wanted.limits:
-        omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
-    return omissions

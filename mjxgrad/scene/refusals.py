@@ -5,7 +5,6 @@ comparing: some features raise in MJX, without naming the element, and many more
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 
 import mujoco
@@ -16,29 +15,6 @@ from mjxgrad.contact.parameters import contact_pairs
 
 _OBJECT = mujoco.mjtObj
 _ENABLE = mujoco.mjtEnableBit
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A feature that MJX lacks.
-
-    Attributes:
-        feature: what MJX has none of.
-        find: names the places where a model uses it; nothing if it does not.
-        remedy: what to do instead.
-    """
-
-    feature: str
-    find: Callable[[mujoco.MjModel], Iterable[str]]
-    remedy: str
-
-    def message(self, model: mujoco.MjModel) -> str | None:
-        """One sentence if a model uses the feature, else None."""
-        found = list(self.find(model))
-        if not found:
-            return None
-        more = f" and {len(found) - 4} more" if len(found) > 4 else ""
-        return f"MJX has no {self.feature}, got {', '.join(found[:4])}{more}; {self.remedy}"
 
 
 def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
@@ -77,9 +53,7 @@ def _when(condition: Callable[[mujoco.MjModel], bool], given: str | Callable):
     """What is given, if a condition on the whole model holds."""
 
     def find(model: mujoco.MjModel) -> list[str]:
-        if not condition(model):
-            return []
-        return [given(model) if callable(given) else given]
+        return [given(model) if callable(given) else given] if condition(model) else []
 
     return find
 
@@ -116,33 +90,26 @@ def has_constraints(model: mujoco.MjModel) -> bool:
     )
 
 
-def _geom_type(model: mujoco.MjModel, geom: int) -> str:
-    return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-
-
 def describe_pair(model: mujoco.MjModel, pair) -> str:
     """Two geoms by name and type."""
+    kinds = (mujoco.mjtGeom(kind).name for kind in model.geom_type[[pair.geom1, pair.geom2]])
     return " with ".join(
-        f"{name!r} ({_geom_type(model, geom)})" for name, geom in zip(pair.names, (pair.geom1, pair.geom2), strict=True)
+        f"{name!r} ({kind.removeprefix('mjGEOM_').lower()})" for name, kind in zip(pair.names, kinds, strict=True)
     )
 
 
 def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
     for pair in contact_pairs(model):
-        types = model.geom_type[[pair.geom1, pair.geom2]]
-        if not has_collision_fn(*types):
+        if not has_collision_fn(*model.geom_type[[pair.geom1, pair.geom2]]):
             yield describe_pair(model, pair)
 
 
 def _margins_of_meshes(model: mujoco.MjModel) -> Iterator[str]:
     without = {mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value}
     for pair in contact_pairs(model):
-        margin = (
-            model.pair_margin[pair.explicit]
-            if pair.explicit >= 0
-            else model.geom_margin[[pair.geom1, pair.geom2]].sum()
-        )
-        if margin and without & set(model.geom_type[[pair.geom1, pair.geom2]].tolist()):
+        geoms = [pair.geom1, pair.geom2]
+        margin = model.pair_margin[pair.explicit] if pair.explicit >= 0 else model.geom_margin[geoms].sum()
+        if margin and without & set(model.geom_type[geoms].tolist()):
             yield describe_pair(model, pair)
 
 
@@ -177,107 +144,83 @@ def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
 
 
 _DIRECTLY = "remove it from the MJCF"
+_LINEAR = "keep the linear coefficient only"
 
-REFUSALS: tuple[Refusal, ...] = (
-    Refusal("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
-            "build them of rigid bodies and joints"),
-    Refusal("plugins", _where(_OBJECT.mjOBJ_PLUGIN, lambda m: np.ones(m.nplugin, bool)),
-            "remove them, or replace signed distance fields by meshes or primitive geoms"),
-    Refusal("collision between some types of geom", _pairs_without_function,
-            "exclude the pair by contype and conaffinity or <contact><exclude>, or use "
-            "capsules, spheres or boxes"),
-    Refusal("margin in contacts of meshes and height fields", _margins_of_meshes,
-            "set margin='0' on both geoms"),
-    Refusal("integrator 'implicit'", _integrator(mujoco.mjtIntegrator.mjINT_IMPLICIT),
-            "use 'implicitfast', 'Euler' or 'RK4'"),
-    Refusal("integrator 'discrete'", _integrator(mujoco.mjtIntegrator.mjINT_DISCRETE),
-            "use 'implicitfast', 'Euler' or 'RK4'"),
-    Refusal("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
-            "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
-    Refusal("exact constraint diagonal",
-            lambda m: _flag(_ENABLE.mjENBL_DIAGEXACT)(m) if has_constraints(m) else [], _DIRECTLY),
-    Refusal("IPC contact", _flag(_ENABLE.mjENBL_IPC), _DIRECTLY),
-    Refusal("noslip solver",
-            _when(lambda m: m.opt.noslip_iterations > 0 and _has_frictional_rows(m),
-                  lambda m: f"noslip_iterations={m.opt.noslip_iterations}"),
-            "set noslip_iterations='0', and against slip use cone='elliptic' with a larger "
-            "impratio"),
-    Refusal("polynomial joint stiffness",
-            _where(_OBJECT.mjOBJ_JOINT, lambda m: m.jnt_stiffnesspoly != 0),
-            "keep the linear coefficient only"),
-    Refusal("polynomial joint damping",
-            _where(_OBJECT.mjOBJ_JOINT,
-                   lambda m: (m.dof_dampingpoly != 0)[m.jnt_dofadr]),
-            "keep the linear coefficient only"),
-    Refusal("polynomial tendon stiffness or damping",
-            _where(_OBJECT.mjOBJ_TENDON,
-                   lambda m: np.hstack([m.tendon_stiffnesspoly, m.tendon_dampingpoly]) != 0),
-            "keep the linear coefficients only"),
-    Refusal("polynomial actuator damping",
-            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_dampingpoly != 0),
-            "keep the linear coefficient only"),
-    Refusal("surface velocity", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_surfacevel != 0),
-            "drive the body that carries the geom by a joint"),
-    Refusal("contact adhesion", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_adhesion != 0),
-            _DIRECTLY),
-    Refusal("contact adhesion", _where(_OBJECT.mjOBJ_PAIR, lambda m: m.pair_adhesion != 0),
-            _DIRECTLY),
-    Refusal("ellipsoid fluid model",
-            _where(_OBJECT.mjOBJ_GEOM, lambda m: (m.geom_fluid[:, 0] > 0) & has_medium(m)),
-            "use fluidshape='none' for the box model, or set density and viscosity to zero"),
-    Refusal("fluid forces with integrator 'implicitfast'",
-            _when(lambda m: has_medium(m)
-                  and m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-                  lambda m: f"density={m.opt.density:g}, viscosity={m.opt.viscosity:g}"),
-            "use 'Euler' or 'RK4'"),
-    Refusal("such actuator transmission",
-            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_trntype", mjx.TrnType,
-                          mujoco.mjtTrn, "mjTRN_"),
-            "drive a joint, tendon or site instead"),
-    Refusal("such actuator dynamics",
-            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_dyntype", mjx.DynType,
-                          mujoco.mjtDyn, "mjDYN_"),
-            "use none, integrator, filter, filterexact or muscle"),
-    Refusal("such actuator gain",
-            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_gaintype", mjx.GainType,
-                          mujoco.mjtGain, "mjGAIN_"),
-            "use fixed, affine or muscle"),
-    Refusal("such actuator bias",
-            _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_biastype", mjx.BiasType,
-                          mujoco.mjtBias, "mjBIAS_"),
-            "use none, affine or muscle"),
-    Refusal("actuators with several controls",
-            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_ctrlnum != 1),
-            "use one actuator per control"),
-    Refusal("disabled actuator groups", _where(_OBJECT.mjOBJ_ACTUATOR, _disabled_actuators),
-            "remove those actuators, or actuatorgroupdisable from <option>"),
-    Refusal("early activation",
-            _where(_OBJECT.mjOBJ_ACTUATOR,
-                   lambda m: m.actuator_actearly & (m.actuator_actadr >= 0)),
-            "set actearly='false'"),
-    Refusal("actuator delay",
-            _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_history[:, 0] > 0),
-            "remove delay and nsample, and delay the controls before the rollout"),
-    Refusal("such equality constraint",
-            _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
-            "use connect, weld, joint or tendon"),
-    Refusal("solref of mixed signs", _mixed_solrefs,
-            "give two positive numbers (time constant, damping ratio) or two that are not "
-            "(−stiffness, −damping)"),
-    Refusal("joint limit that acts on both ends at once",
-            _where(_OBJECT.mjOBJ_JOINT,
-                   lambda m: m.jnt_limited & _is_scalar_joint(m)
-                   & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1))),
-            "make the joint's margin smaller than half its range"),
-    Refusal("tendon limit that acts on both ends at once",
-            _where(_OBJECT.mjOBJ_TENDON,
-                   lambda m: m.tendon_limited
-                   & (2 * m.tendon_margin > np.ptp(m.tendon_range, axis=1))),
-            "make the tendon's margin smaller than half its range"),
+# What MJX has none of; what names the places where a model uses it, nothing if it does not; what to do instead.
+REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...] = (
+    ("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
+     "build them of rigid bodies and joints"),
+    ("plugins", _where(_OBJECT.mjOBJ_PLUGIN, lambda m: np.ones(m.nplugin, bool)),
+     "remove them, or replace signed distance fields by meshes or primitive geoms"),
+    ("collision between some types of geom", _pairs_without_function,
+     "exclude the pair by contype and conaffinity or <contact><exclude>, or use capsules, spheres or boxes"),
+    ("margin in contacts of meshes and height fields", _margins_of_meshes, "set margin='0' on both geoms"),
+    ("integrator 'implicit'", _integrator(mujoco.mjtIntegrator.mjINT_IMPLICIT), "use 'implicitfast', 'Euler' or 'RK4'"),
+    ("integrator 'discrete'", _integrator(mujoco.mjtIntegrator.mjINT_DISCRETE), "use 'implicitfast', 'Euler' or 'RK4'"),
+    ("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
+     "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
+    ("exact constraint diagonal", lambda m: _flag(_ENABLE.mjENBL_DIAGEXACT)(m) if has_constraints(m) else [], _DIRECTLY),
+    ("IPC contact", _flag(_ENABLE.mjENBL_IPC), _DIRECTLY),
+    ("noslip solver",
+     _when(lambda m: m.opt.noslip_iterations > 0 and _has_frictional_rows(m),
+           lambda m: f"noslip_iterations={m.opt.noslip_iterations}"),
+     "set noslip_iterations='0', and against slip use cone='elliptic' with a larger impratio"),
+    ("polynomial joint stiffness", _where(_OBJECT.mjOBJ_JOINT, lambda m: m.jnt_stiffnesspoly != 0), _LINEAR),
+    ("polynomial joint damping", _where(_OBJECT.mjOBJ_JOINT, lambda m: (m.dof_dampingpoly != 0)[m.jnt_dofadr]), _LINEAR),
+    ("polynomial tendon stiffness or damping",
+     _where(_OBJECT.mjOBJ_TENDON, lambda m: np.hstack([m.tendon_stiffnesspoly, m.tendon_dampingpoly]) != 0),
+     "keep the linear coefficients only"),
+    ("polynomial actuator damping", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_dampingpoly != 0), _LINEAR),
+    ("surface velocity", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_surfacevel != 0),
+     "drive the body that carries the geom by a joint"),
+    ("contact adhesion", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_adhesion != 0), _DIRECTLY),
+    ("contact adhesion", _where(_OBJECT.mjOBJ_PAIR, lambda m: m.pair_adhesion != 0), _DIRECTLY),
+    ("ellipsoid fluid model", _where(_OBJECT.mjOBJ_GEOM, lambda m: (m.geom_fluid[:, 0] > 0) & has_medium(m)),
+     "use fluidshape='none' for the box model, or set density and viscosity to zero"),
+    ("fluid forces with integrator 'implicitfast'",
+     _when(lambda m: has_medium(m) and m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+           lambda m: f"density={m.opt.density:g}, viscosity={m.opt.viscosity:g}"),
+     "use 'Euler' or 'RK4'"),
+    ("such actuator transmission",
+     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_trntype", mjx.TrnType, mujoco.mjtTrn, "mjTRN_"),
+     "drive a joint, tendon or site instead"),
+    ("such actuator dynamics",
+     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_dyntype", mjx.DynType, mujoco.mjtDyn, "mjDYN_"),
+     "use none, integrator, filter, filterexact or muscle"),
+    ("such actuator gain",
+     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_gaintype", mjx.GainType, mujoco.mjtGain, "mjGAIN_"),
+     "use fixed, affine or muscle"),
+    ("such actuator bias",
+     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_biastype", mjx.BiasType, mujoco.mjtBias, "mjBIAS_"),
+     "use none, affine or muscle"),
+    ("actuators with several controls", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_ctrlnum != 1),
+     "use one actuator per control"),
+    ("disabled actuator groups", _where(_OBJECT.mjOBJ_ACTUATOR, _disabled_actuators),
+     "remove those actuators, or actuatorgroupdisable from <option>"),
+    ("early activation",
+     _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_actearly & (m.actuator_actadr >= 0)), "set actearly='false'"),
+    ("actuator delay", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_history[:, 0] > 0),
+     "remove delay and nsample, and delay the controls before the rollout"),
+    ("such equality constraint",
+     _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
+     "use connect, weld, joint or tendon"),
+    ("solref of mixed signs", _mixed_solrefs,
+     "give two positive numbers (time constant, damping ratio) or two that are not (−stiffness, −damping)"),
+    ("joint limit that acts on both ends at once",
+     _where(_OBJECT.mjOBJ_JOINT,
+            lambda m: m.jnt_limited & _is_scalar_joint(m) & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1))),
+     "make the joint's margin smaller than half its range"),
+    ("tendon limit that acts on both ends at once",
+     _where(_OBJECT.mjOBJ_TENDON, lambda m: m.tendon_limited & (2 * m.tendon_margin > np.ptp(m.tendon_range, axis=1))),
+     "make the tendon's margin smaller than half its range"),
 )  # fmt: skip
 
 
 def refusal_messages(model: mujoco.MjModel) -> list[str]:
     """One sentence for each feature of a model that MJX cannot simulate."""
-    messages = (refusal.message(model) for refusal in REFUSALS)
-    return [message for message in messages if message]
+    messages = []
+    for feature, find, remedy in REFUSALS:
+        if found := list(find(model)):
+            more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+            messages.append(f"MJX has no {feature}, got {', '.join(found[:4])}{more}; {remedy}")
+    return messages

@@ -1,4 +1,4 @@
-"""What `load_scene` returns, and how it describes itself."""
+"""What `load_scene` returns, how it describes itself, and what its sensors and sites are by name."""
 
 import copy
 import difflib
@@ -17,6 +17,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission
 
@@ -123,9 +124,8 @@ class Scene(eqx.Module):
     def warnings(self) -> list[str]:
         """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
         leaves = (self.model.geom_solref, self.model.pair_solref, self.model.opt.timestep)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return []
-        if np.ndim(self.model.geom_solref) != 2 or np.ndim(self.model.opt.timestep) != 0:
+        is_batched = np.ndim(leaves[0]) != 2 or np.ndim(leaves[2]) != 0
+        if is_batched or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return []
         return contact_warnings(self.model, self.pairs)
 
@@ -155,15 +155,16 @@ class Scene(eqx.Module):
         solref = self.model.geom_solref
         if isinstance(solref, jax.core.Tracer) or np.ndim(solref) != 2:
             raise ValueError("summary needs one scene with known values, got a batched or traced one")
+        differs = " (moves differently from C MuJoCo)"
+        converted = [(c.what, f"{c.given} → {c.used}", c.reason + differs * (not c.exact)) for c in self.conversions]
         sections = [
             _heading(self),
             _contacts(self),
-            _table("Converted", [(c.what, f"{c.given} → {c.used}", c.reason + _note(c.exact))
-                                 for c in self.conversions]),
+            _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
             _bullets("Contacts unlike C MuJoCo", contact_differences(self.mj_model, self.pairs)),
             _bullets("Warnings", self.warnings()),
-        ]  # fmt: skip
+        ]
         return "\n\n".join(section for section in sections if section)
 
 
@@ -188,10 +189,6 @@ def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.nd
         setattr(target, name, float(value if changed else given))
     else:
         present[changed] = value[changed]
-
-
-def _note(exact: bool) -> str:
-    return "" if exact else " (moves differently from C MuJoCo)"
 
 
 def _heading(scene: Scene) -> str:
@@ -235,9 +232,8 @@ def _contacts(scene: Scene) -> str:
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-    legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact" + (
-        "; stable while h²k + 2hb < 4" if is_euler else ""
-    )
+    legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact"
+    legend += "; stable while h²k + 2hb < 4" if is_euler else ""
     if columns[-1][0] == "at rest":
         legend += "\n  at rest: distance under gravity, negative for a depth"
     if len(rows) < count:
@@ -312,3 +308,38 @@ def _bullets(title: str, sentences: Sequence[str]) -> str:
         return ""
     wrapped = (textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ") for sentence in sentences)
     return "\n".join([title, *wrapped])
+
+
+def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
+    """Return what a sensor reads.
+
+    Args:
+        model: the scene's.
+        data: with its sensors computed, as `forward`, a step or a rollout leaves them.
+        name: of the sensor.
+
+    Returns:
+        Its numbers, in MuJoCo's units of that sensor; one for a touch sensor, three for a force.
+
+    Raises:
+        ValueError: if there is no such sensor, or MJX cannot compute it.
+    """
+    index = index_of(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if model.sensor_needstage[index] == mujoco.mjtStage.mjSTAGE_NONE:
+        raise ValueError(f"sensor {name!r} would read 0: MJX cannot compute it, as the scene's summary says")
+    start = int(model.sensor_adr[index])
+    return data.sensordata[start : start + int(model.sensor_dim[index])]
+
+
+def site_position(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, "3"]:
+    """Return where a site is, in world coordinates (m).
+
+    Args:
+        model: the scene's.
+        data: with its positions computed, as `forward`, a step or a rollout leaves them.
+        name: of the site.
+
+    Raises:
+        ValueError: if there is no such site.
+    """
+    return data.site_xpos[index_of(model, mujoco.mjtObj.mjOBJ_SITE, name)]

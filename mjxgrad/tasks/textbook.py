@@ -22,7 +22,7 @@ from jax.scipy.stats import norm
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mjxgrad._static import known
+from mjxgrad._arrays import known
 from mjxgrad.contact.bounce import Bounce, integrated_restitution  # noqa: F401  # what a bounce should give
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import Scene, load_scene
