@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, Int
 from experiments.bounce.settings import ImpedanceSettings, Settings
 from experiments.motion import ARMS, DISCRETE, at_time_step, motion
 from experiments.workspace import Workspace
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.scene import Scene
-from mjxgrad.tasks.textbook import Bounce, bounce_scene, integrated_restitution
+from mjxgrad.tasks.textbook import bounce_scene
 
 SPEED = 1.0  # of the ball towards the floor, in m/s
 TOLERANCE = 0.05  # error that a derivative may have, as a share of the larger of the slope and the discrete gradient's own error

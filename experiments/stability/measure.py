@@ -26,8 +26,8 @@ from experiments.stability.reference import WIDTHS, Course, Reference, direction
 from experiments.stability.scenes import GRAVITY, Points, StabilityScene, catalogue, effective, points
 from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import soundness
-from mjxgrad.tasks.textbook import Bounce, integrated_restitution
 
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1

@@ -18,8 +18,8 @@ from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.measure import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import AXES, RADIUS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
+from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.warnings import largest_stable_step, steepest
-from mjxgrad.tasks.textbook import Bounce
 
 UNEXPLAINED = "unexplained"
 _SAME_MOTION = 1e-3

@@ -288,7 +288,7 @@ def motion(course: Course, outcome: Outcome):
     tight = [one for one in course.in_batch() if _is_tight(one)]
     others = [one for one in course.points if one not in tight and one.variant.batch == tight[0].variant.batch]
     others = [one for one in others if one.variant.cone == course.cone or one.variant.integrator == "Euler"]
-    _front(axes[0, 0], [(one.cost, max(one.error, _SMALLEST)) for one in tight])
+    _frontier(axes[0, 0], [(one.cost, max(one.error, _SMALLEST)) for one in tight])
     on_jax = _front([(one.cost, max(one.error, _SMALLEST)) for one in tight if one.library != C])
     axes[0, 0].plot(*on_jax.T, "o", mfc="none", mec=REFERENCE, ms=9, mew=0.9, zorder=3)
     is_empty = not any(one.error <= _LARGEST for one in course.points)
@@ -331,7 +331,7 @@ def gradient(course: Course, outcome: Outcome):
     reference = course.gradient_reference
     known = np.hypot(reference.standard_error, reference.step_error)
     for axis, cost in zip(axes[0], ("cost", "num_samples"), strict=True):
-        _front(axis, [(getattr(one, cost), one.error) for one in estimates])
+        _frontier(axis, [(getattr(one, cost), one.error) for one in estimates])
         for line in lines(estimates).values():
             _gradient_line(axis, line, [getattr(one, cost) for one in line], _other(line[0], course))
         axis.axhline(max(known, 1e-6), color=REFERENCE, zorder=0, **_KNOWN)
@@ -410,7 +410,7 @@ def _motion_line(axis: Axes, line: Sequence[Point], mark: str) -> None:
     )  # fmt: skip
 
 
-def _front(axis: Axes, places: list[tuple[float, float]]) -> None:
+def _frontier(axis: Axes, places: list[tuple[float, float]]) -> None:
     axis.step(*_front(places).T, where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
 
 

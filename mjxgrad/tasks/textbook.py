@@ -23,7 +23,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mjxgrad._arrays import known
-from mjxgrad.contact.bounce import Bounce, integrated_restitution  # noqa: F401  # what a bounce should give
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import Scene, load_scene
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.tasks.textbook import Bounce, bounce_scene, integrated_restitution
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
+from mjxgrad.tasks.textbook import bounce_scene
 
 DURATION = 0.1
 TIMESTEP = 5e-4
