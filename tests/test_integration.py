@@ -52,7 +52,7 @@ def thrown(scene, height):
 
 def closed_form(height):
     """Height at 0.2 s: contact takes 2 t_c = 40 ms at critical damping and constant impedance (facts of contact.bounce)."""
-    bounce = mg.tasks.textbook.Bounce(time_constant=0.02, damping_ratio=1.0)
+    bounce = mg.contact.bounce.Bounce(time_constant=0.02, damping_ratio=1.0)
     return bounce.height(height, HORIZON * STEP)
 
 

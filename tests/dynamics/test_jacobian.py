@@ -12,11 +12,11 @@ import pytest
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import assembly, constraint, kinematics, linear
-from mjxgrad.dynamics.collision import collide
+from mjxgrad.dynamics.collision import collide, slot_geoms
 from mjxgrad.dynamics.constraint import Bend
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows
 from mjxgrad.dynamics.kinematics import inertia_of
-from mjxgrad.dynamics.rows import joined, slot_bodies
+from mjxgrad.dynamics.rows import joined
 from mjxgrad.dynamics.sparse import SparseRows
 
 # Two free balls on a plane and on each other, one of them heavy and rolling; an arm that bends back on itself, touches
@@ -70,15 +70,15 @@ def random():
     return np.random.default_rng(1)
 
 
-def test_the_bodies_of_a_slot_are_those_of_its_geoms(rows):
+def test_the_geoms_of_a_slot_are_those_of_its_contact(rows):
     model, data, *_ = rows
-    np.testing.assert_array_equal(slot_bodies(model), model.geom_bodyid[np.asarray(data._impl.contact.geom)])
+    np.testing.assert_array_equal(slot_geoms(model), data._impl.contact.geom)
 
 
-def test_bodies_are_not_known_where_slots_are_given_at_run_time():
+def test_geoms_are_not_known_where_slots_are_given_at_run_time():
     numbers = '<mujoco><custom><numeric name="max_contact_points" data="2"/></custom>'
     assert (
-        slot_bodies(mjx.put_model(mujoco.MjModel.from_xml_string(numbers + SCENE[9:].format(cone="elliptic")))) is None
+        slot_geoms(mjx.put_model(mujoco.MjModel.from_xml_string(numbers + SCENE[9:].format(cone="elliptic")))) is None
     )
 
 

@@ -16,7 +16,7 @@ import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
-from experiments.work_precision import figures, report
+from experiments.work_precision import report
 from experiments.work_precision.cases import case
 from experiments.work_precision.measure import Recorded, Truth, differences, quasi_random, smoothed_gradient, variants
 from experiments.work_precision.outcome import (
@@ -94,7 +94,7 @@ def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendatio
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
     course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known)
     outcome = Outcome(load_runs("work_precision", [])[0].settings, (course,))
-    for draw in (figures.motion, figures.gradient):
+    for draw in (report.motion, report.gradient):
         figure, _, _ = draw(course, outcome)
         figure.canvas.draw()
         plt.close(figure)
