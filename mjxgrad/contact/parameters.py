@@ -169,6 +169,8 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
     return tuple(geom for geom in geoms if model.geom_priority[geom] == highest)
 
 
+# One program: operation by operation, each compiled on its own, it takes seconds for the first scene of a kind.
+@eqx.filter_jit
 def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
     """Compute what the dynamics makes of the contact parameters in a model.
 

@@ -1,6 +1,7 @@
 """Bias and variance of both kinds of gradient, against contact softness."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
 import equinox as eqx
@@ -16,6 +17,9 @@ from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zero
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
 from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
 from mjxgrad.objective.base import unchanged
+
+# XLA keeps 1.3 of two cores busy with one such program.
+_WORKERS = 2
 
 
 class BiasVariance(eqx.Module):
@@ -128,13 +132,20 @@ def bias_variance(
         reference = find(objective, params, reference_key, num_reference, max(2, chunk_size or DEFAULT_CHUNK_SIZE))
         return {"first": first, "zeroth": zeroth, **reference}, samples
 
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
+    # Compiled here, for a thread does not see what a `with` has set, such as the precision.
+    compiled = measure.lower(each[0], params, key).compile()
+
+    def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
+        measured, samples = jax.block_until_ready(compiled(one, params, key))
+        return measured, _variance_intervals(samples, baseline, confidence, num_resamples)
+
     rows = []
-    for i in range(count):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
-        measured, samples = jax.block_until_ready(measure(one, params, key))
-        rows.append((measured, _variance_intervals(samples, baseline, confidence, num_resamples)))
-        if progress is not None:
-            progress(i + 1, count)
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        for done in pool.map(row, each):
+            rows.append(done)
+            if progress is not None:
+                progress(len(rows), count)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     variances = np.stack([row[1] for row in rows], axis=2)
     first, zeroth, reference, error = (found[name] for name in ("first", "zeroth", "reference", "reference_error"))
