@@ -1,5 +1,6 @@
 """Double precision for all tests: tolerances are then about formulas, not about rounding."""
 
+import gc
 import os
 
 import jax
@@ -9,9 +10,16 @@ jax.config.update("jax_enable_x64", True)
 
 # Compilation is most of the time of the tests. XLA's quick code takes a third of it (two bodies' gradient, jax 0.10.2: 10 s of
 # processor time in place of 28) and runs at half the speed; the operations are the same. The slow tests compile as users do.
-_QUICK_CODE = "--xla_backend_optimization_level=0"
+_QUICK_CODE = (
+    "--xla_backend_optimization_level=0 --xla_disable_hlo_passes="
+    "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking,hlo-verifier"
+)
 if jax.__version_info__ < (0, 11):  # XLA ends the process at a flag that it no longer knows
     _QUICK_CODE += " --xla_cpu_use_fusion_emitters=false"
+
+
+# Traces are large, long-lived graphs of Python objects: to search all of them for garbage each time is a tenth of the time.
+gc.set_threshold(200_000, 50, 1000)
 
 
 def pytest_configure(config: pytest.Config) -> None:

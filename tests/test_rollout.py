@@ -64,9 +64,14 @@ def test_a_policy_sees_the_present_state(scene):
 
 def test_observations_belong_to_their_state(scene, controls):
     """The body's world position, which MuJoCo computes from qpos, is that of the state before each step."""
-    trajectory = mg.rollout(
-        scene, mg.initial_state(scene), controls, observe=lambda model, data: (data.xpos[1], data.qpos, data.time)
-    )
+
+    @jax.jit
+    def observed(controls):
+        return mg.rollout(
+            scene, mg.initial_state(scene), controls, observe=lambda model, data: (data.xpos[1], data.qpos, data.time)
+        )
+
+    trajectory = observed(controls)
     position, qpos, time = trajectory.observations
     np.testing.assert_allclose(position[:, 0], trajectory.qpos[:, 0], atol=1e-14)
     np.testing.assert_allclose(qpos, trajectory.qpos)

@@ -21,10 +21,19 @@ from experiments.stability.classes import (
     classify_derivative,
     classify_motion,
 )
-from experiments.stability.program import Program, Run, along, errors_of_solves
-from experiments.stability.reference import WIDTHS, Course, Reference, direction, simulate
 from experiments.stability.scenes import GRAVITY, Points, StabilityScene, catalogue, effective, points
 from experiments.stability.settings import Settings
+from experiments.stability.simulators import (
+    WIDTHS,
+    Course,
+    Program,
+    Reference,
+    Run,
+    along,
+    direction,
+    errors_of_solves,
+    simulate,
+)
 from experiments.workspace import Workspace
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import soundness

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from experiments.sawtooth.cases import ball
-from experiments.sawtooth.cases import case as landing_case
+from experiments.sawtooth import ball
+from experiments.sawtooth import case as landing_case
 from experiments.work_precision.outcome import Cone
 from mjxgrad.tasks import scene_path
 

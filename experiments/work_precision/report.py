@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import LogFormatterSciNotation
 
 from experiments.parallel import num_compilers, num_cores
 from experiments.report import Table
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
 from experiments.words import joined, percent, quantity
 from experiments.work_precision.outcome import (
     MG,
@@ -289,8 +289,6 @@ def motion(course: Course, outcome: Outcome):
     others = [one for one in course.points if one not in tight and one.variant.batch == tight[0].variant.batch]
     others = [one for one in others if one.variant.cone == course.cone or one.variant.integrator == "Euler"]
     _frontier(axes[0, 0], [(one.cost, max(one.error, _SMALLEST)) for one in tight])
-    on_jax = _front([(one.cost, max(one.error, _SMALLEST)) for one in tight if one.library != C])
-    axes[0, 0].plot(*on_jax.T, "o", mfc="none", mec=REFERENCE, ms=9, mew=0.9, zorder=3)
     is_empty = not any(one.error <= _LARGEST for one in course.points)
     for axis, shown in zip(axes[0], (tight, others), strict=True):
         for line in lines(shown).values():
@@ -311,13 +309,12 @@ def motion(course: Course, outcome: Outcome):
         for name, look in _MARKS.items()
         if name in marks
     ]
-    handles.append(Line2D([], [], mec=REFERENCE, mfc="none", marker="o", ls="", ms=9, label="none on JAX is better"))
     caption = (
         f"Error of the final state, root mean square over {outcome.settings.sizes.batch} starts in one batch, against wall "
         "time: the larger of the distance of positions (m and rad, Euclidean) over the way gone and that of velocities over "
         "the speed. Along a line the time step gets smaller to the right; bars are the range over repetitions. Left: the "
         f"solver run to {TIGHT_TOLERANCE:g} (float32: {SINGLE_TOLERANCE:g}), the scene's own cone; no other beats the broad "
-        "grey line, none on JAX the rings. Right: loose tolerances at the two coarsest steps, few iterations, and the other "
+        "grey line. Right: loose tolerances at the two coarsest steps, few iterations, and the other "
         "cone beside its own reference. Dotted: how far the reference moved when its step was last halved; grey: errors that "
         "settings are recommended for."
     )
@@ -368,8 +365,7 @@ def _finished(
     for axis in axes:
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-    # No numbers between powers of ten but at 2 and 5, which leaves room for them.
-    axes[0].xaxis.set_minor_formatter(FuncFormatter(_at_2_and_5))
+    axes[0].xaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.5)))
     handles += [
         Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="none is better"),
         Line2D([], [], color=MUTED, label="known of the reference", **_KNOWN),
@@ -411,13 +407,10 @@ def _motion_line(axis: Axes, line: Sequence[Point], mark: str) -> None:
 
 
 def _frontier(axis: Axes, places: list[tuple[float, float]]) -> None:
-    axis.step(*_front(places).T, where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
-
-
-def _front(places: list[tuple[float, float]]) -> np.ndarray:
-    """Give the points on the front in order of cost; none if all has diverged."""
+    """Draw the points on the front in order of cost; none if all has diverged."""
     points = np.array(places).reshape(-1, 2)
-    return np.array(sorted(map(tuple, points[pareto_front(*points.T)]))).reshape(-1, 2)
+    front = np.array(sorted(map(tuple, points[pareto_front(*points.T)]))).reshape(-1, 2)
+    axis.step(*front.T, where="post", color=REFERENCE, lw=4.5, alpha=0.13, zorder=0)
 
 
 def _other(one: Estimate, course: Course) -> str | None:
@@ -437,9 +430,3 @@ def _gradient_line(axis: Axes, line: Sequence[Estimate], places: list[float], ot
     axis.plot(places, errors, color=colour, lw=1.6, marker="o", ms=5)
     low, high = np.array([one.spread for one in line]).T
     axis.vlines(places, low, high, color=colour, lw=3.5, alpha=0.25)
-
-
-def _at_2_and_5(value: float, _: int | None) -> str:
-    exponent = int(np.floor(np.log10(value) + 1e-9))
-    digit = round(value / 10.0**exponent)
-    return power(digit * 10.0**exponent) if digit in (2, 5) else ""

@@ -79,6 +79,7 @@ def test_the_chance_that_samples_all_miss_is_the_frequency_with_which_they_do(fo
         assert found.miss_probability(count) == pytest.approx(frequency, abs=0.1)
 
 
+@pytest.mark.slow
 def test_intervals_of_the_triple_cover_as_often_as_they_say():
     rng = np.random.default_rng(5)
     hits = np.zeros(3)

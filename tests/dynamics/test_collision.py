@@ -89,8 +89,8 @@ def test_slots_are_given_as_in_mjx(limits):
     numbers = "".join(f'<numeric name="{name}" data="{limit}"/>' for name, limit in limits.items())
     mj_model = mujoco.MjModel.from_xml_string(BALLS.format(numbers=numbers))
     model = mjx.put_model(mj_model)
-    data = mjx.kinematics(model, mjx.make_data(mj_model))
-    ours, theirs = collide(model, data)._impl.contact, mjx.collision(model, data)._impl.contact
+    data = jax.jit(mjx.kinematics)(model, mjx.make_data(mj_model))
+    ours, theirs = (jax.jit(find)(model, data)._impl.contact for find in (collide, mjx.collision))
     assert len(theirs.dist) == len(theirs.dim)
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
     assert (slot_geoms(model) is None) == bool(limits)

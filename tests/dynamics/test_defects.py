@@ -52,7 +52,7 @@ def _settled(text, steps=1500):
 @both
 def test_reverse_mode_passes_through_a_solve_of_many_iterations(step):
     model, data = put(BALL.format(option="", geom=""))
-    slope = jax.grad(lambda v: step(model, data.replace(qvel=v)).qvel[0])(jnp.zeros(1))
+    slope = jax.jit(jax.grad(lambda v: step(model, data.replace(qvel=v)).qvel[0]))(jnp.zeros(1))
     assert jnp.isfinite(slope).all()
 
 
@@ -81,7 +81,7 @@ def test_elliptic_contact_without_sliding_has_a_jacobian(step):
 def test_elliptic_cone_without_any_contact_pair_runs(step):
     model, data = put("""<mujoco><option cone="elliptic"/><worldbody><body>
         <joint type="slide" range="-1 1" limited="true"/><geom size=".1"/></body></worldbody></mujoco>""")
-    assert jnp.isfinite(step(model, data).qpos).all()
+    assert jnp.isfinite(jax.jit(step)(model, data).qpos).all()
 
 
 CARTPOLE = """<mujoco><option timestep=".01" iterations="1" ls_iterations="50"/><worldbody>
@@ -111,7 +111,8 @@ def test_a_body_at_rest_feels_its_angular_velocity(step):
     """A quaternion moves by h/2 times the angular velocity, at zero velocity too."""
     model, data = put("""<mujoco><option gravity="0 0 0" timestep=".004"/><worldbody>
         <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
-    slope = jax.jacfwd(lambda w: step(model, data.replace(qvel=jnp.zeros(6).at[3:].set(w))).qpos[4:])(jnp.zeros(3))
+    turned = jax.jacfwd(lambda w: step(model, data.replace(qvel=jnp.zeros(6).at[3:].set(w))).qpos[4:])
+    slope = jax.jit(turned)(jnp.zeros(3))
     np.testing.assert_allclose(slope, 0.5 * 0.004 * jnp.eye(3), rtol=1e-12, atol=1e-15)
 
 
@@ -135,6 +136,7 @@ def test_a_direct_solref_without_damping_can_be_differentiated(step):
     model, data = put(BALL.format(option="", geom=""))
     data = data.replace(qpos=jnp.array([-0.001]))
 
+    @jax.jit
     def outcome(stiffness):
         solref = jnp.stack([-stiffness, jnp.zeros_like(stiffness)])
         moved = step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data)
@@ -152,6 +154,7 @@ def test_at_the_clamp_of_refsafe_the_time_constant_counts(step):
     model, data = put(BALL.format(option='timestep=".002"', geom=""))
     data = data.replace(qpos=jnp.array([-0.001]))
 
+    @jax.jit
     def outcome(time_constant):
         solref = jnp.stack([time_constant, jnp.ones_like(time_constant)])
         return step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data).qvel[0]
@@ -175,7 +178,7 @@ WELD = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50" 
 @pytest.mark.parametrize(
     "text",
     [
-        pytest.param(CYLINDER, id="standing cylinder"),
+        pytest.param(CYLINDER, id="standing cylinder", marks=pytest.mark.slow),
         pytest.param(WELD, id="weld at zero error", marks=pytest.mark.slow),
     ],
 )

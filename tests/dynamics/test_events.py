@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss.measure import cube_toss
+from experiments.cube_toss import cube_toss
 from mjxgrad.dynamics import check_gradient, step
 
 # Impacts of everything that can begin, each on a body of its own and without gravity. All move at 1 m/s or 1 rad/s towards a stop
@@ -146,6 +146,7 @@ def test_the_mean_is_the_slope_for_every_row_that_begins(integrator, cone):
     _check_means(tuple(_KINDS), integrator, cone)
 
 
+@pytest.mark.slow
 def test_the_motion_is_the_same():
     """To the last bit; beside a derivative but for rounding, which differs between two programs and 320 steps amplify."""
     outcome, offsets = _impacts(_SMALL)
@@ -155,6 +156,7 @@ def test_the_motion_is_the_same():
     np.testing.assert_allclose(results["event"][0], results["discrete"][0], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_both_modes_agree():
     """Reverse mode is the transpose of the same rule: rounding alone, here amplified by 320 steps."""
     outcome, offsets = _impacts(_SMALL)

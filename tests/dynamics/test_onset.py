@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.sawtooth.cases import case
+from experiments.sawtooth import case
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.tasks import wall_softness
@@ -103,7 +103,9 @@ def _jumps(name, kind):
 _ROUNDING = 1e-7
 
 
-@pytest.mark.parametrize("name", ["ball", "ball_elliptic", pytest.param("hopper", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["ball", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball_elliptic", "hopper"))]
+)
 def test_outcomes_of_neighbouring_starts_and_parameters_are_neighbours(name):
     assert _jumps(name, "continuous") < _ROUNDING
     assert _jumps(name, "mujoco") > 1e-5
@@ -203,7 +205,14 @@ _BALL = """
 """
 
 
-@pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 3), ("elliptic", 3), ("pyramidal", 1), ("elliptic", 6)])
+_CONTACTS = [
+    ("pyramidal", 3),
+    ("elliptic", 6),
+    *(pytest.param(*contact, marks=pytest.mark.slow) for contact in (("elliptic", 3), ("pyramidal", 1))),
+]
+
+
+@pytest.mark.parametrize(("cone", "condim"), _CONTACTS)
 def test_the_impulse_of_a_contact_grows_in_proportion_to_the_time_that_is_left(cone, condim):
     """With next to no stiffness what a damper does in full contact does not depend on the depth: the rest is φ."""
     scene = _scene(_BALL.format(cone=cone, condim=condim))
@@ -285,8 +294,8 @@ _CORNER = {"half": 0.03, "half_height": 0.02, "start": "-.05 0 .005"}
     ("cone", "condim", "wall", "num_pushed"),
     [
         pytest.param("pyramidal", 1, _THIN, 1, marks=pytest.mark.slow),
-        ("pyramidal", 3, _THIN, 3),
-        ("elliptic", 3, _THIN, 3),
+        pytest.param("pyramidal", 3, _THIN, 3, marks=pytest.mark.slow),
+        pytest.param("elliptic", 3, _THIN, 3, marks=pytest.mark.slow),
         ("pyramidal", 1, _CORNER, 2),
         pytest.param("elliptic", 3, _CORNER, 3, marks=pytest.mark.slow),
     ],
@@ -317,6 +326,7 @@ def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim, wall,
     assert (np.abs(smooth.mean(axis=0) - teeth.mean(axis=0)) < 0.1 * size)[has_teeth].all()
 
 
+@pytest.mark.slow
 def test_a_throw_through_the_softened_wall_has_no_teeth():
     task = mg.tasks.ball_wall().with_softness(wall_softness(300.0))
 
@@ -345,11 +355,9 @@ _PUSHED = """
 """
 
 
-@pytest.mark.parametrize(
-    ("kind", "turning"),
-    [("sphere", ""), pytest.param("box", '<joint type="hinge" axis="0 1 0"/>', marks=pytest.mark.slow)],
-)
-@pytest.mark.parametrize("timestep", [1e-3, pytest.param(4e-3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "turning"), [("sphere", ""), ("box", '<joint type="hinge" axis="0 1 0"/>')])
+@pytest.mark.parametrize("timestep", [1e-3, 4e-3])
 def test_a_thing_pushed_along_the_floor_keeps_a_derivative_of_a_size_to_be_believed(kind, turning, timestep):
     """Contacts that chatter multiply the tangent at every switch: without a floor of the width by 10² to 10⁹."""
     scene = mg.load_scene(_PUSHED.format(timestep=timestep, kind=kind, turning=turning))
@@ -385,6 +393,7 @@ def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
     assert not mg.rollout(free, mg.initial_state(free), horizon=20).explodes
 
 
+@pytest.mark.slow
 def test_the_width_can_be_swept_and_differentiated():
     scene = _scene(_BALL.format(cone="pyramidal", condim=3))
     start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5.00001), qvel=jnp.array([0.0, 0, -1e-3, 0, 0, 0]))
@@ -414,6 +423,7 @@ def test_the_event_gradient_is_refused_beside_an_onset():
         mg.step(scene.model, scene.data, onset=mg.Onset(jnp.ones(3)))
 
 
+@pytest.mark.slow
 def test_smoothing_of_contacts_leaves_the_onset_to_the_limits():
     """Noise on the distance already makes contact continuous; a joint limit has none."""
     both = """

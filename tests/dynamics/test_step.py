@@ -70,6 +70,7 @@ def test_rows_are_those_of_mjx(cone):
         np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-13, atol=1e-12, err_msg=name)
 
 
+@_SLOW
 def test_solve_replaces_the_one_of_mjx():
     """On data that MJX has prepared, with connect, weld and elliptic contact."""
     model, data = zoo("elliptic", welded=True)
@@ -132,7 +133,8 @@ def _check_directional(model, data, steps):
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
-@names
+@_SLOW
+@pytest.mark.parametrize("name", _NAMES)
 def test_directional_derivative_of_50_steps_is_the_central_difference(name):
     _check_directional(*published(name), steps=50)
 
@@ -211,6 +213,7 @@ def test_second_derivatives_nest():
     np.testing.assert_allclose(hessian, truth, rtol=1e-5, atol=1e-8)
 
 
+@_SLOW
 def test_a_batch_is_its_members():
     """The solver works on batches in another layout: the same numbers to rounding."""
     model, data = zoo("elliptic")
@@ -225,6 +228,7 @@ def test_a_batch_is_its_members():
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
 
 
+@_SLOW
 def test_a_batch_whose_members_choose_whether_to_step():
     """`jax.lax.cond` on a condition that differs, as of environments of which some are done, is a choice of either."""
     model, data = _sliding()

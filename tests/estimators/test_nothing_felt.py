@@ -54,8 +54,7 @@ def test_a_dead_zone_is_named_and_its_edge_is_not(name):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_an_optimum_is_felt(name):
     """Costs differ under noise, be it small, and so do derivatives; also where all costs round to the same number."""
-    for stddev in (0.1, 1e-6):
-        assert not feels_nothing(ESTIMATORS[name], lambda x: (x**2).sum(), jnp.zeros((1, 2)), stddev)[0].any()
+    assert not feels_nothing(ESTIMATORS[name], lambda x: (x**2).sum(), jnp.zeros((1, 2)), 1e-6)[0].any()
     if name in ("first_order", "alpha_order", "per_step", "control_variate"):
         assert not feels_nothing(ESTIMATORS[name], lambda x: 1e9 + (x**2).sum(), jnp.zeros((1, 2)), 1e-5)[0].any()
 

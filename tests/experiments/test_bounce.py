@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.bounce.measure import Outcome, grid_of
-from experiments.bounce.report import drawings, findings, tables, verdict
-from experiments.bounce.settings import Settings
+from experiments.bounce import Outcome, Settings, drawings, findings, grid_of, tables, verdict
 from experiments.config import load_runs
 from experiments.failure import ConfigurationError
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss.measure import Course, Outcome, Point, cube_toss, substepped_step
-from experiments.cube_toss.report import fastest, verdict
+from experiments.cube_toss import Course, Outcome, Point, cube_toss, fastest, substepped_step, verdict
 from mjxgrad._rollout import data_of
 from tests.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
 

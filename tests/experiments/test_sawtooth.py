@@ -7,8 +7,7 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.motion import CONTINUOUS, DISCRETE, EVENT
-from experiments.sawtooth.measure import Outcome, course
-from experiments.sawtooth.report import drawings, verdict
+from experiments.sawtooth import Outcome, course, drawings, verdict
 from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases
 

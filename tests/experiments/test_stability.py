@@ -10,10 +10,9 @@ import xarray as xr
 from experiments.config import load_runs
 from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.measure import C_MUJOCO, Outcome, SceneOutcome
-from experiments.stability.program import Steps, errors_of_solves
-from experiments.stability.reference import simulate, unbalanced
 from experiments.stability.report import UNEXPLAINED, findings, load, reasons
 from experiments.stability.scenes import DEFAULTS, FIELDS, PLANES, Points, catalogue, configure, points
+from experiments.stability.simulators import Steps, errors_of_solves, simulate, unbalanced
 
 SCENES = {scene.name: scene for scene in catalogue()}
 

@@ -120,7 +120,12 @@ def test_a_conversion_is_reported_and_moves_the_same(case):
     np.testing.assert_allclose(_velocities(scene.mj_model), given, atol=tolerance)
 
 
-@pytest.mark.parametrize("case", ["no springs", "no dampers", "neither", "actuator inertia", "limit without width"])
+_OTHERS = ("no springs", "no dampers", "neither", "limit without width")
+
+
+@pytest.mark.parametrize(
+    "case", ["actuator inertia", *(pytest.param(case, marks=pytest.mark.slow) for case in _OTHERS)]
+)
 def test_mjx_moves_the_converted_scene_as_c_mujoco_does_and_only_that(case):
     source, _ = EXACT[case]
     model = mujoco.MjModel.from_xml_string(source)

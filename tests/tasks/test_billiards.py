@@ -45,6 +45,7 @@ def test_the_simulated_stroke_costs_what_hard_balls_say(task, differentiated):
         assert float(simulated) == pytest.approx(hard_cost(forces), abs=0.03)
 
 
+@pytest.mark.slow
 def test_as_long_as_the_balls_do_not_touch_the_derivative_is_that_of_the_effort(task, differentiated):
     start = task.start(1.3)
     cost, gradient = differentiated(start)

@@ -1,0 +1,435 @@
+"""The sawtooth: outcomes of impacts and their derivatives over where within a time step the impact falls."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import equinox as eqx
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from pydantic import Field
+
+import mjxgrad as mg
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT, Read, at_time_step, motion
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings
+from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
+from experiments.words import joined
+from experiments.workspace import Workspace
+from mjxgrad._mjx import mjx
+from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
+from mjxgrad.tasks import scene_path
+
+RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
+BallName = Literal["ball_frictionless", "ball", "ball_elliptic", "ball_torsion", "ball_rolling"]
+OtherName = Literal["ball_inclined", "ball_inclined_rolling", "two_balls", "two_balls_elliptic", "arm"]
+
+
+class Settings(RunSettings):
+    """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
+
+    cases: Annotated[tuple[Literal[RobotName, BallName, OtherName], ...], Field(min_length=1)]
+    """Which motions, each with its own contact, limits and integrator."""
+    timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)
+    """In s, besides the motion's own."""
+    num_phases: Annotated[int, Field(ge=64)] = 192
+    """Starts over the interval."""
+    reference: Annotated[int, Field(ge=0, le=64)] = 0
+    """By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out."""
+
+
+_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+# From positions and velocities to what is read of a motion.
+_READ: dict[str, Read] = {
+    "planar": lambda qpos, qvel: qpos[:3],
+    "free": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], 2 * (qpos[3] * qpos[5] - qpos[6] * qpos[4])]),
+    "ball": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], qvel[4]]),
+    "two_balls": lambda qpos, qvel: jnp.array([qpos[0], qpos[1], qpos[7], qpos[8]]),
+    "arm": lambda qpos, qvel: qpos[:2],
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A motion with impacts."""
+
+    title: str
+    model: mujoco.MjModel  # with its own contact, limits, integrator and time step
+    moved: int  # index in `qpos` of the coordinate to which the parameter is added
+    interval: tuple[float, float]  # of the parameter (m or rad); it moves the first impact through several time steps
+    labels: tuple[str, ...]  # of what is read, with units
+    read: Read
+    duration: float  # in s
+    qpos: Mapping[int, float] = field(default_factory=dict)  # start positions that differ from the model's, by index
+    qvel: Mapping[int, float] = field(default_factory=dict)  # start velocities that differ from zero, by index
+
+
+def case(name: str) -> Case:
+    """Build a motion by one of the names in `experiments.sawtooth.CaseName`."""
+    return _BUILDERS[name]()
+
+
+def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **other: Any) -> Case:
+    """One of gymnasium's robots, dropped while it moves forwards."""
+    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": _READ["planar"]}
+    model = mujoco.MjModel.from_xml_path(str(_ASSETS / file))
+    return Case(title, model, interval=(0.0, 0.03), duration=0.5, qpos=qpos, qvel={0: speed}, **planar | other)
+
+
+_BALL = """<mujoco model="ball">
+  <option timestep="0.002" cone="{cone}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1" euler="0 {slope} 0" condim="{condim}" friction="{friction}"/>
+    <body name="ball" pos="0 0 {height}">
+      <freejoint/>
+      <geom name="ball" type="sphere" size="0.05" condim="{condim}" friction="{friction}"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def ball(
+    cone: str = "pyramidal", condim: int = 3, slope: float = 0.0, friction: float = 1.0, height: float = 0.1
+) -> mujoco.MjModel:
+    """Build a ball of 5 cm at a height (m) over a plane that is inclined by some degrees."""
+    xml = _BALL.format(cone=cone, condim=condim, slope=slope, friction=friction, height=height)
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
+    """A ball thrown down with spin; gravity brings it back for smaller bounces."""
+    place = f"plane inclined by {slope:g}°" if slope else "level plane"
+    return Case(
+        f"Ball, {place}, {cone}, condim {condim}",
+        ball(cone, condim, slope),
+        moved=2,
+        interval=(0.0, 0.03),
+        labels=("x", "height", "spin (1/s per m)"),
+        read=_READ["ball"],
+        duration=0.24,
+        qvel={0: 1.0, 2: -1.5, 3: 2.0, 4: -10.0, 5: 5.0},
+    )
+
+
+def _two_balls_case(cone: str) -> Case:
+    """An oblique hit, with its impact parameter moved."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("two_balls")))
+    model.opt.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}")
+    return Case(
+        f"Two balls, oblique, {cone}",
+        model,
+        moved=1,
+        interval=(0.03, 0.06),
+        labels=("first, along", "first, across", "second, along", "second, across"),
+        read=_READ["two_balls"],
+        duration=0.24,
+        qvel={0: 1.5, 5: 3.0},
+    )
+
+
+_BUILDERS = {
+    "hopper": lambda: _robot("Hopper", "hopper.xml", {1: 1.22, 3: -0.4, 4: -0.5, 5: 0.3}),
+    "walker2d": lambda: _robot(
+        "Walker2d", "walker2d.xml", {1: 1.24, 3: -0.3, 4: -0.4, 5: 0.3, 6: -0.1, 7: -0.7, 8: 0.2}
+    ),
+    "half_cheetah": lambda: _robot("Half cheetah", "half_cheetah.xml", {1: 0.05, 2: 0.1, 3: 0.3, 4: -0.3, 6: 0.2}),
+    # Legs half bent and the trunk tilted, so that the feet land one after the other.
+    "ant": lambda: _robot(
+        "Ant",
+        "ant.xml",
+        {2: 0.72, 3: 0.9962, 4: 0.05, 5: 0.07, 7: 0.2, 8: 0.9, 10: -0.9, 12: -0.8, 14: 0.8},
+        speed=0.3,
+        moved=2,
+        labels=("x", "z", "pitch (sine)"),
+        read=_READ["free"],
+    ),
+    "ball_frictionless": lambda: _ball_case("pyramidal", 1),
+    "ball": lambda: _ball_case("pyramidal", 3),
+    "ball_elliptic": lambda: _ball_case("elliptic", 3),
+    "ball_torsion": lambda: _ball_case("elliptic", 4),
+    "ball_rolling": lambda: _ball_case("pyramidal", 6),
+    "ball_inclined": lambda: _ball_case("pyramidal", 3, 20.0),
+    "ball_inclined_rolling": lambda: _ball_case("elliptic", 6, 20.0),
+    "two_balls": lambda: _two_balls_case("pyramidal"),
+    "two_balls_elliptic": lambda: _two_balls_case("elliptic"),
+    "arm": lambda: Case(
+        "Two-link arm",
+        mujoco.MjModel.from_xml_path(str(scene_path("falling_arm"))),
+        moved=0,
+        interval=(0.0, 0.06),
+        labels=("shoulder (rad)", "elbow (rad)"),
+        read=_READ["arm"],
+        duration=0.4,
+        qpos={0: 0.3, 1: 0.4},
+    ),
+}
+
+
+# The trend that an outcome may have over the interval; what it leaves is the sawtooth.
+_DEGREE = 9
+_READING, _SAMPLE = ("arm", "time", "coordinate"), ("arm", "start", "time", "coordinate")
+_NUM_TIMES = 5  # at which outcomes are read, evenly over the motion
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Each motion at each time step, as `course` gives it."""
+
+    courses: list[xr.Dataset]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give one row per arm and reading, for metrics.csv."""
+        frames = [one.drop_dims("start").to_dataframe().reset_index() for one in self.courses]
+        return [row for frame in frames for row in frame.to_dict("records")]
+
+
+def course(
+    name: str,
+    title: str,
+    labels: Sequence[str],
+    timestep: float,
+    times: Float[np.ndarray, " times"],
+    arms: Mapping[str, SlopeComparison],
+    reference: Float[np.ndarray, "starts times coordinates"] | None = None,
+) -> xr.Dataset:
+    """Put together what was found of one motion at one time step, by `arm`, `start`, `time` and `coordinate`.
+
+    Of each arm: `residual`, the outcome less its trend over the starts, and its standard deviation, the `sawtooth`; the
+    `derivative` at each start and their `spread` about the trend, over the slope; `slope`, `mean` and `mean_error`; the
+    `error` of the mean over the slope, what of it is in `excess` of two standard errors, and whether it is `within` these;
+    the mean distance `far` from the reference, MuJoCo's motion at a much shorter step, NaN without one. Of all: where
+    MuJoCo's outcome has teeth (`has_impact`), how many times `smaller` they are with an onset, the `shift` of the mean
+    outcome by it, over MuJoCo's teeth, and `closer`, its distance from the reference over MuJoCo's.
+    """
+    found = [arms[arm] for arm in ARMS]
+    start, shape = found[0].parameters, found[0].slope.shape
+    names = ("slope", "mean", "mean_error", "standard_error", "resolution")
+    data = xr.Dataset(
+        {name: (_READING, np.stack([getattr(one, name).reshape(shape) for one in found])) for name in names},
+        coords={"arm": list(ARMS), "start": start, "time": times, "coordinate": list(labels)},
+    ).assign_coords(case=name, title=title, timestep=timestep)
+    data["outcome"] = _SAMPLE, np.stack([one.outcomes for one in found])
+    data["derivative"] = _SAMPLE, np.stack([one.derivatives[0] for one in found])
+    data["residual"] = _SAMPLE, np.stack([_without_trend(start, one.outcomes) for one in found])
+    data["sawtooth"] = data.residual.std("start")
+    off, slope = abs(data["mean"] - data.slope), np.maximum(abs(data.slope), data.resolution)
+    data["error"], data["excess"] = off / slope, np.maximum(off - 2 * data.standard_error, 0) / slope
+    data["within"] = off <= 2 * np.maximum(data.standard_error, data.resolution)
+    missing = np.full_like(found[0].outcomes, np.nan) if reference is None else reference
+    data["far"] = abs(data.outcome - xr.DataArray(missing, dims=_SAMPLE[1:])).mean("start")
+    spread = np.stack([_without_trend(start, one.derivatives[0]).std(axis=0) for one in found])
+    theirs, own = (data.sel(arm=arm, drop=True) for arm in (DISCRETE, CONTINUOUS))
+    tiny = np.finfo(float).tiny
+    return data.assign(
+        spread=xr.DataArray(spread, dims=_READING) / abs(own.slope),
+        has_impact=theirs.sawtooth > 1e-6 * (abs(theirs.outcome).max("start") + tiny),
+        smaller=theirs.sawtooth / np.maximum(own.sawtooth, tiny),
+        shift=abs((own.outcome - theirs.outcome).mean("start")) / theirs.sawtooth,
+        closer=own.far / theirs.far,
+    )
+
+
+def _without_trend(
+    start: Float[np.ndarray, " starts"], values: Float[np.ndarray, "starts *rest"]
+) -> Float[np.ndarray, "starts *rest"]:
+    place = (2 * start - start[0] - start[-1]) / (start[-1] - start[0])
+    basis = np.polynomial.legendre.legvander(place, _DEGREE)
+    flat = values.reshape(len(place), -1)
+    return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(values.shape)
+
+
+@eqx.filter_jit
+def _sample(
+    model: mjx.Model, start: mjx.Data, parameters: Array, steps_between: Array, read: Read, moved: int, arm: str
+) -> tuple[Array, Array]:
+    """Give readings and derivatives; time steps differ in arrays alone, so one compilation serves them all."""
+    gradient, onset = ARMS[arm]
+    how = {"num_times": _NUM_TIMES, "steps_between": steps_between, "gradient": gradient, "onset": onset}
+
+    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+        return motion(model, start.replace(qpos=start.qpos.at[moved].add(parameter)), read, **how)
+
+    return jax.vmap(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)))(parameters)
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Sample outcomes and derivatives of every motion at every time step."""
+    courses = []
+    with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
+        for number, name in enumerate(settings.cases):
+            own = float(case(name).model.opt.timestep)
+            courses += [_course(name, h, settings) for h in sorted({own, *settings.timesteps}, reverse=True)]
+            advance_to(number + 1)
+    return Outcome(courses)
+
+
+def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
+    one = case(name)
+    scene = mg.load_scene(one.model)
+    qpos, qvel = np.array(scene.data.qpos), np.array(scene.data.qvel)
+    qpos[list(one.qpos)], qvel[list(one.qvel)] = list(one.qpos.values()), list(one.qvel.values())
+    start = scene.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+    # Neither evenly spaced nor of one length: teeth must not fall in step with the starts.
+    parameters = phases(one.interval, settings.num_phases)
+    steps = max(1, round(one.duration / timestep / _NUM_TIMES))
+
+    def sampled(arm: str, refinement: int = 1) -> list[np.ndarray]:
+        model, count = at_time_step(scene.model, timestep / refinement), jnp.int32(steps * refinement)
+        both = _sample(model, start, jnp.asarray(parameters), count, one.read, one.moved, arm)
+        return [np.asarray(each) for each in both]
+
+    arms = {}
+    for arm in ARMS:
+        outcomes, derivatives = sampled(arm)
+        arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
+    reference = sampled(DISCRETE, settings.reference)[0] if settings.reference else None
+    times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
+    return course(name, one.title, one.labels, timestep, times, arms, reference)
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say whether teeth are gone, and whose mean derivative is the slope."""
+    smaller, spread = _pooled(outcome, "smaller"), _pooled(outcome, "spread", CONTINUOUS)
+    if not smaller.size:
+        return "Nothing touches in these motions: there are no teeth."
+    within = {arm: _pooled(outcome, "within", arm).mean() for arm in ARMS}
+    return (
+        f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
+        f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
+        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings ({within[DISCRETE]:.0%} without, "
+        f"{within[EVENT]:.0%} for the event gradient), and single derivatives scatter by {np.median(spread):.2f} of it."
+    )
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say what the table's medians do not show: where a mean derivative is off, and how often the motion is worse."""
+    sentences = []
+    off = [c for c in outcome.courses if (c.excess.sel(arm=CONTINUOUS).where(c.has_impact) > 0.05).any()]
+    if off:
+        sentences.append(f"Some mean derivative is more than 5% beyond its error in {joined(map(_name, off))}.")
+    closer = _pooled(outcome, "closer")
+    if closer.size and np.isfinite(closer).all():
+        sentences.append(
+            f"Beside MuJoCo's motion at a step many times shorter its error is {np.median(closer):.2f} of MuJoCo's own in the "
+            f"median, and larger at {np.mean(closer > 1):.0%} of the readings."
+        )
+    return sentences
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all motions."""
+    rows = []
+    for c in outcome.courses:
+        if not c.has_impact.any():
+            continue
+        picked = c.where(c.has_impact)
+        middle = picked.median(("time", "coordinate"))
+        within = (c.within & c.has_impact).sum(("time", "coordinate"))
+        row = [str(c.title.values), f"{1e3 * float(c.timestep):g}"]
+        row.append(f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})")
+        row += [f"{value:.2g}" for value in middle.spread.values] + [f"{value:.1%}" for value in middle.error.values]
+        row += [f"{value} of {int(c.has_impact.sum())}" for value in within.values]
+        row.append(f"{float(middle['shift']):.2f}")
+        rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
+    columns = ["motion", "time step, ms", "sawtooth smaller, times"]
+    columns += [f"{what}, {arm}" for what in ("spread", "error", "within 2 errors") for arm in ARMS]
+    columns += ["shift of the mean", "off the converged motion"]
+    caption = (
+        "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
+        "single derivatives about their trend, over the slope. Error: of the mean derivative, over the slope of its own outcome, "
+        "sampling errors included; within 2 errors: readings where it is no more than these. Shift of the mean outcome over "
+        "MuJoCo's sawtooth. Distance of the outcome from the converged motion over MuJoCo's own."
+    )
+    return [Table(columns, rows, caption)]
+
+
+def _pooled(outcome: Outcome, name: str, arm: str | None = None) -> np.ndarray:
+    """Give a number at every reading with an impact before it, of all motions."""
+    picked = [(c[name] if arm is None else c[name].sel(arm=arm), c.has_impact) for c in outcome.courses]
+    return np.concatenate([values.values[has_impact.values] for values, has_impact in picked])
+
+
+def _name(course: xr.Dataset) -> str:
+    return f"{course.title.values}, {1e3 * float(course.timestep):g} ms"
+
+
+_COLOURS = {DISCRETE: FIRST, EVENT: ZEROTH, CONTINUOUS: ONSET}
+_NAMES = {
+    DISCRETE: "MuJoCo's step; its derivative",
+    EVENT: "event gradient",
+    CONTINUOUS: "contact begins within the step",
+}
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name a figure per motion, at its longest time step."""
+    longest: dict[str, xr.Dataset] = {}
+    for course in outcome.courses:
+        longest.setdefault(str(course.case.values), course)
+    named = enumerate(longest.items())
+    return {f"teeth_{name}": functools.partial(_teeth, course, k == 0) for k, (name, course) in named}
+
+
+def _teeth(course: xr.Dataset, is_first: bool, _: Outcome):
+    """Draw the outcome less its trend and single derivatives over the start, and their mean over time."""
+    figure, axes = subplots(3, course.coordinate.size, height=7.4)
+    for column, label in zip(axes.T, course.coordinate.values, strict=True):
+        one = course.sel(coordinate=label)
+        _draw_starts(column[0], column[1], one.isel(time=-1))
+        _draw_times(column[2], one)
+        column[0].set_title(label)
+    for row, label in enumerate(("outcome less its trend", "derivative, each start", "derivative, mean")):
+        axes[row, 0].set_ylabel(label)
+    handles = [Line2D([], [], color=_COLOURS[arm], marker=".", label=_NAMES[arm]) for arm in ARMS]
+    handles.append(Line2D([], [], color=REFERENCE, label="slope of the simulated outcome"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
+    title, duration, h = str(course.title.values), float(course.time[-1]), 1e3 * float(course.timestep)
+    figure.suptitle(f"{title}, {duration:.2f} s, time step {h:g} ms", fontsize=10)
+    caption = (
+        "Above, where the motion ends up, less a smooth trend, against where it starts. In the middle, the derivative of each "
+        "single rollout; the line is the slope of the outcome. Below, their mean against time. Derivatives far off are cut."
+    )
+    return figure, title, caption if is_first else "As the figure before."
+
+
+def _draw_starts(upper: Axes, lower: Axes, one: xr.Dataset) -> None:
+    """Draw one coordinate of the last reading over the start."""
+    for arm in (DISCRETE, CONTINUOUS):
+        upper.plot(one.start, one.residual.sel(arm=arm), color=_COLOURS[arm], lw=1.3)
+    for arm in ARMS:
+        lower.plot(one.start, one.derivative.sel(arm=arm), ".", color=_COLOURS[arm], ms=4)
+    slope = float(one.slope.sel(arm=CONTINUOUS))
+    lower.axhline(slope, color=REFERENCE, lw=1.2)
+    _show(lower, np.append(np.quantile(one.derivative, [0.02, 0.98]), slope))
+    upper.axhline(0, color=MUTED, lw=0.6)
+    upper.tick_params(labelbottom=False)
+    lower.set_xlabel("start, m or rad")
+
+
+def _draw_times(axis: Axes, one: xr.Dataset) -> None:
+    """Draw the slope of one coordinate and the mean of each derivative over time."""
+    slope = one.slope.sel(arm=CONTINUOUS)
+    axis.plot(one.time, slope, color=REFERENCE, lw=2.6)
+    for arm in ARMS:
+        mean, wide = one["mean"].sel(arm=arm), 2 * one.mean_error.sel(arm=arm)
+        axis.plot(one.time, mean, color=_COLOURS[arm], lw=1.3)
+        axis.fill_between(one.time, mean - wide, mean + wide, color=_COLOURS[arm], alpha=0.15, lw=0)
+    near = np.concatenate([slope, one["mean"].sel(arm=CONTINUOUS), [0.0]])
+    reach = max(float(np.ptp(near)), 1e-9)
+    _show(axis, np.append(near, np.clip(one["mean"], near.min() - reach, near.max() + reach)))
+    axis.set_xlabel("time, s")
+
+
+def _show(axis: Axes, values: np.ndarray) -> None:
+    pad = 0.15 * max(float(np.ptp(values)), np.abs(values).max(), 1e-9)
+    axis.set_ylim(values.min() - pad, values.max() + pad)
