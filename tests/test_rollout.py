@@ -89,6 +89,7 @@ def test_gradient_of_the_end_is_the_closed_form(scene, controls, checkpoint):
     np.testing.assert_allclose(jax.jit(jax.grad(end))(controls)[:, 0], expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_checkpointing_keeps_a_fraction_of_the_memory():
     """A hundred contact steps: without it every intermediate number of every step is kept."""
     scene = mg.load_scene(PUSHED.replace('gravity="0 0 0"', ""))

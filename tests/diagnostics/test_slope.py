@@ -69,6 +69,7 @@ def test_the_error_bar_covers_the_slope_of_the_trend():
     assert (found.slope_error**2).mean() <= 9 * (found.slope**2).mean()
 
 
+@pytest.mark.slow
 def test_neighbours_that_err_together_do_not_count_as_many():
     """Fewest points, errors that four neighbours share: the bar is that of repetition, a tenth short of it at the most."""
     x = phases(INTERVAL, 32)

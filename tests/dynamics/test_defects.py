@@ -67,6 +67,7 @@ def test_jacobian_at_rest_does_not_depend_on_the_warm_start(step):
 
 
 @both
+@pytest.mark.slow
 def test_elliptic_contact_without_sliding_has_a_jacobian(step):
     text = BALL.format(option='cone="elliptic"', geom='condim="4"')
     model, data = _settled(text.replace('<joint type="slide" axis="0 0 1" damping=".1"/>', "<freejoint/>"))

@@ -227,6 +227,7 @@ def test_nothing_changes_where_force_begins_at_zero():
     np.testing.assert_allclose(event, discrete, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_grazing_contact_leaves_the_discrete_derivative():
     """At a thousandth of 5 cm/s the term must be about a thousandth of its size at that speed, not a thousand times as large."""
     scene = mg.load_scene(_STILL.format(height=0.1, solimp=""))

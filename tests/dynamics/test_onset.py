@@ -176,6 +176,7 @@ def test_the_mean_of_the_derivative_is_the_difference_of_the_outcome():
     assert missing("mujoco") > 0.1
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_mode_agree():
     one = case("ball")
     scene = _scene(one.model)
@@ -244,6 +245,7 @@ def test_free_flight_and_deep_contact_are_mujocos():
         np.testing.assert_allclose(*both, rtol=0, atol=1e-15)  # two programs, whose sums XLA may order otherwise
 
 
+@pytest.mark.slow
 def test_several_contacts_share_the_step_and_none_jumps():
     """A beam that lands on both ends and two balls beside it, each at another time of the same step."""
     beam = """
@@ -290,14 +292,15 @@ _THIN = {"half": 0.01, "half_height": 0.2, "start": "-.03 0 0"}
 _CORNER = {"half": 0.03, "half_height": 0.02, "start": "-.05 0 .005"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cone", "condim", "wall", "num_pushed"),
     [
-        pytest.param("pyramidal", 1, _THIN, 1, marks=pytest.mark.slow),
-        pytest.param("pyramidal", 3, _THIN, 3, marks=pytest.mark.slow),
-        pytest.param("elliptic", 3, _THIN, 3, marks=pytest.mark.slow),
+        ("pyramidal", 1, _THIN, 1),
+        ("pyramidal", 3, _THIN, 3),
+        ("elliptic", 3, _THIN, 3),
         ("pyramidal", 1, _CORNER, 2),
-        pytest.param("elliptic", 3, _CORNER, 3, marks=pytest.mark.slow),
+        ("elliptic", 3, _CORNER, 3),
     ],
 )
 def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim, wall, num_pushed):
@@ -373,6 +376,7 @@ def test_a_thing_pushed_along_the_floor_keeps_a_derivative_of_a_size_to_be_belie
     assert derivatives.std() < 30
 
 
+@pytest.mark.slow
 def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
     """The same push at 4 ms with the event gradient, which chatter multiplies; a free flight grows by its duration at most."""
     scene = mg.load_scene(_PUSHED.format(timestep=1e-3, kind="sphere", turning=""))

@@ -117,7 +117,7 @@ def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("num_hard", [0, 20, 160], ids=["none", "some", "most"])
+@pytest.mark.parametrize("num_hard", [20, *(pytest.param(num, marks=pytest.mark.slow) for num in (0, 160))])
 def test_the_last_of_a_large_batch_are_finished_as_in_a_small_one(num_hard: int):
     """In flight there is nothing to iterate; those that slide take up to ten turns, what is not finite has no answer.
 

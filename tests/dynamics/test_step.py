@@ -32,7 +32,7 @@ def _largest_difference(model, data, steps):
 
 
 @names
-@pytest.mark.parametrize("settle", [0, 300], ids=["moving", "settled"])
+@pytest.mark.parametrize("settle", [pytest.param(0, marks=_SLOW), 300], ids=["moving", "settled"])
 def test_published_scenes_move_as_in_c(name, settle):
     """50 steps at tolerance 1e-12: 1e-9 leaves room for the growth of rounding in contact.
 
@@ -58,7 +58,8 @@ def test_all_kinds_of_rows_move_as_in_c(cone, integrator):
     assert _largest_difference(*zoo(cone, integrator), steps=30) < 1e-6
 
 
-@pytest.mark.parametrize("cone", ["pyramidal", pytest.param("elliptic", marks=_SLOW)])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@_SLOW
 def test_rows_are_those_of_mjx(cone):
     """Every field of every row; a few units of rounding of numbers up to 1e4."""
     model, data = zoo(cone, welded=True)

@@ -46,6 +46,7 @@ def test_without_control_variate_the_unbiased_part_is_zeroth_order(parts):
     np.testing.assert_allclose(estimate.standard_error, zeroth.standard_error, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_error_bar_of_a_mixture_knows_that_its_parts_share_rollouts():
     times = 20_000
     rule = rules.FixedAlpha(0.5)

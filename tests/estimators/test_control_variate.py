@@ -45,7 +45,7 @@ def assert_unbiased_with_right_errors(estimates, truth, num_samples):
     np.testing.assert_allclose(ratio, 1, atol=0.05 + 2 / num_samples**2)
 
 
-@pytest.mark.parametrize("num_samples", [4, 12])
+@pytest.mark.parametrize("num_samples", [4, pytest.param(12, marks=pytest.mark.slow)])
 def test_it_is_unbiased_at_a_jump_from_few_samples_on(num_samples):
     objective = parameter_noise(jumpy, STDDEVS)
     estimates = repeat(estimators.control_variate, objective, POINT, 40_000, num_samples=num_samples)
@@ -85,6 +85,7 @@ def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_f
     assert np.all(np.asarray(estimates.num_rollouts) == num_rollouts)
 
 
+@pytest.mark.slow
 def test_baselines_from_the_same_start_take_away_what_starts_do():
     """Starts a hundred times as far apart as the noise: the mean of other starts would be no baseline at all."""
 
@@ -136,6 +137,7 @@ def test_derivatives_that_lie_do_no_harm(key):
     np.testing.assert_array_less(estimate.standard_error, 1.1 * np.asarray(zeroth.standard_error))
 
 
+@pytest.mark.slow
 def test_chunks_are_averaged_and_a_short_last_one_counts_by_its_samples(key):
     objective = parameter_noise(jumpy, STDDEVS)
     estimate = control_variate(objective, POINT, key, num_samples=20_001, chunk_size=100)

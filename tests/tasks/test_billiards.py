@@ -38,6 +38,7 @@ def test_the_best_force_played_on_hard_balls_costs_the_optimum():
     assert hard_cost(best_forces(1000)) == pytest.approx(hard_optimum()[0], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_simulated_stroke_costs_what_hard_balls_say(task, differentiated):
     for forces in (best_forces(10), np.tile([3.2, 2.9], (10, 1))):
         simulated, _ = differentiated(jnp.asarray(forces.ravel()))
