@@ -21,7 +21,7 @@ from mjxgrad.dynamics.linear import batch_last
 _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
 # Larger factorisations are left to LAPACK or cuSOLVER: written out they would take longer to compile than they save.
-_LARGEST = 16
+LARGEST = 16
 # Threads of one block of the kernel: a warp.
 _BLOCK = 32
 
@@ -30,18 +30,18 @@ def cholesky_solve(matrix: _Matrix, vector: _Vector) -> _Vector:
     """Return matrix⁻¹ vector by Cholesky; non-finite where the matrix is not positive definite."""
     if matrix.ndim == 2:
         return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), vector)
-    if len(vector) > _LARGEST:
+    if len(vector) > LARGEST:
         leading = jnp.moveaxis(matrix, (0, 1), (-2, -1)), jnp.moveaxis(vector, 0, -1)[..., None]
         factor = jnp.linalg.cholesky(leading[0])
         return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
-    if _has_kernels():
+    if has_kernels():
         # The program may yet be compiled for the CPU beside the GPU.
         return jax.lax.platform_dependent(matrix, vector, cuda=in_one_kernel, default=written_out)
     return written_out(matrix, vector)
 
 
 @functools.cache
-def _has_kernels() -> bool:
+def has_kernels() -> bool:
     """Return whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
     if jax.default_backend() != "gpu":
         return False

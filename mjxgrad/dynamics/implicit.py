@@ -25,7 +25,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import cholesky, constraint, linear, newton
+from mjxgrad.dynamics import constraint, hessian, linear, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.newton import System, Variant
 
@@ -124,7 +124,7 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
 
     def run(system, bend, force):
         problem = system.problem()
-        return cholesky.cholesky_solve(problem.jacobian.gram(problem.mass, layout, bend), force)
+        return hessian.solve(problem.mass, problem.jacobian, layout, bend, force)[0]
 
     def run_where(system, bend, force, is_needed):
         return linear.on_few(run, is_needed, jnp.zeros_like(force), system, bend, force)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import cholesky, constraint, linear
+from mjxgrad.dynamics import constraint, hessian, linear
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 from mjxgrad.dynamics.kinematics import Inertia
@@ -267,10 +267,11 @@ class _Solver(eqx.Module):
         """Take one step of Newton's method, those that are done excepted."""
         layout, problem = self.layout, self.problem
         point, stays = state.point, self.is_done(state)
-        hessian = problem.jacobian.gram(problem.mass, layout, constraint.bend(layout, problem.rows, point.x))
-        newton = -cholesky.cholesky_solve(hessian, point.gradient)
+        bend = constraint.bend(layout, problem.rows, point.x)
+        solution, diagonal = hessian.solve(problem.mass, problem.jacobian, layout, bend, point.gradient)
+        newton = -solution
         # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
-        scaled = -point.gradient / linear.diagonal(hessian)
+        scaled = -point.gradient / diagonal
         direction = jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, scaled)
         decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
         noise = jnp.sqrt(jnp.maximum(decrement, 0.0) * floor)

@@ -84,6 +84,25 @@ class SparseRows(eqx.Module):
             total = linear.add_to_block(total, group.dofs, square)
         return total
 
+    def curvatures(self, layout: RowLayout, bend: Bend) -> list[Float[Array, "num _ *batch"]]:
+        """Return s'' item by item, one array per group: of elliptic contacts the whole matrix, of others its diagonal.
+
+        Of pyramids, by their directions, the arrow: that of the normal, those that couple it with each tangent, those of the
+        tangents.
+        """
+        found, start = [], 0
+        for group, tilt in zip(self.groups, self.tilts, strict=True):
+            rows, batch = slice(start, start + group.num_rows), bend.simple.shape[1:]
+            start = rows.stop
+            if rows.start >= layout.simple_stop:
+                found.append(_cone_matrices(layout, bend, rows, group.num).reshape(group.num, -1, *batch))
+            elif tilt is None:
+                found.append(bend.simple[rows].reshape(group.num, group.dim, *batch))
+            else:
+                both, difference = _both_edges(bend.simple[rows].reshape(*tilt.shape[:2], 2, *batch), tilt)
+                found.append(jnp.concatenate([linear.sum_of_few(both), difference, tilt**2 * both], axis=1))
+        return found
+
 
 def _gram(left: _Entries, right: _Entries) -> _Square:
     """Return leftᵀ right."""
@@ -115,17 +134,27 @@ def _pyramid_square(
     bend: Float[Array, "num tangents 2 *batch"], tilt: Float[Array, "num tangents *batch"], entries: _Entries
 ) -> _Square:
     """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
-    both, difference = bend[:, :, 0] + bend[:, :, 1], (tilt * (bend[:, :, 0] - bend[:, :, 1]))[:, :, None]
-    normal, tangents = entries[:, 0], entries[:, 1:]
+    both, difference = _both_edges(bend, tilt)
+    difference, (normal, tangents) = difference[:, :, None], (entries[:, 0], entries[:, 1:])
     of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
     of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
     return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
 
 
+def _both_edges(bend: Float[Array, "num tangents 2 *batch"], tilt: Float[Array, "num tangents *batch"]):
+    """Return s'' of both edges of each tangent: the sum, and μ times the difference."""
+    return bend[:, :, 0] + bend[:, :, 1], tilt * (bend[:, :, 0] - bend[:, :, 1])
+
+
 def _cone_product(layout: RowLayout, bend: Bend, rows: slice, entries: _Entries) -> _Entries:
     """Return s'' of neighbouring elliptic contacts times their rows."""
+    matrix = _cone_matrices(layout, bend, rows, len(entries))
+    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(entries.shape[1]))
+
+
+def _cone_matrices(layout: RowLayout, bend: Bend, rows: slice, num: int) -> Float[Array, "num dim dim *batch"]:
+    """Return s'' of neighbouring elliptic contacts."""
     which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
     cone = layout.cones[which]
     first = (rows.start - cone.start) // cone.dim
-    matrix = bend.cones[which][first : first + len(entries)]
-    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(cone.dim))
+    return bend.cones[which][first : first + num]

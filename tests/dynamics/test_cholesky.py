@@ -46,7 +46,7 @@ def test_an_indefinite_member_is_not_finite_and_its_neighbour_is_right(way):
     reason="from 0.11 on JAX lowers GPU kernels only where there is a GPU",
 )
 def test_a_gpu_is_given_one_kernel_and_the_cpu_beside_it_none(monkeypatch):
-    monkeypatch.setattr(cholesky, "_has_kernels", lambda: True)
+    monkeypatch.setattr(cholesky, "has_kernels", lambda: True)
     matrices, vectors = _systems(5, 4)
     traced = jax.jit(cholesky.cholesky_solve).trace(jnp.moveaxis(matrices, 0, -1), vectors.T)
     count = {name: traced.lower(lowering_platforms=(name,)).as_text().count("gpu.triton") for name in ("cuda", "cpu")}
