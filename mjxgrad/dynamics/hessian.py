@@ -127,7 +127,7 @@ def _with_group(matrix: Array, group: Group, entries, curvature, down: Array, ac
         left = [jnp.where(down >= 0, entries[item, d, below, state], 0.0) for d in range(group.dim)]
         rows = [jnp.where(across >= 0, entries[item, d, right, state], 0.0) for d in range(group.dim)]
         bent = _bent(group, [curvature[item, d, state] for d in range(curvature.shape[1])], rows)
-        return matrix + sum(one * other for one, other in zip(left, bent, strict=True))
+        return matrix + linear.add(one * other for one, other in zip(left, bent, strict=True))
 
     return jax.lax.fori_loop(0, group.num, add_item, matrix)
 
@@ -137,8 +137,8 @@ def _bent(group: Group, bends: list[Array], rows: list[Array]) -> list[Array]:
     dim = group.dim
     if group.is_pyramid:
         tangents = list(zip(bends[1:dim], bends[dim:], rows[1:], strict=True))
-        normal = bends[0] * rows[0] + sum(coupling * row for coupling, _, row in tangents)
+        normal = bends[0] * rows[0] + linear.add(coupling * row for coupling, _, row in tangents)
         return [normal, *(coupling * rows[0] + own * row for coupling, own, row in tangents)]
     if len(bends) == dim:
         return [bend * row for bend, row in zip(bends, rows, strict=True)]
-    return [sum(bends[d * dim + e] * rows[e] for e in range(dim)) for d in range(dim)]
+    return [linear.add(bends[d * dim + e] * rows[e] for e in range(dim)) for d in range(dim)]
