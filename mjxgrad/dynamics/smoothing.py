@@ -51,7 +51,6 @@ from mjxgrad.dynamics.constraint import Noise, RowLayout
 from mjxgrad.dynamics.kernels import KERNELS, Kernel
 from mjxgrad.dynamics.rows import Block, per_row
 
-KernelName = Literal["gaussian", "logistic", "log_barrier"]
 Mode = Literal["forward", "backward"]
 
 # Far below the stiffness of any contact (1/s²). Without stiffness noise on the distance does nothing, and c divides.
@@ -87,7 +86,7 @@ class Smoothing(eqx.Module):
 
     def __check_init__(self):
         """Refuse names that there are not, and lengths that are not positive and finite if they are known."""
-        for name, choices in (("kernel", get_args(KernelName)), ("mode", get_args(Mode))):
+        for name, choices in (("kernel", tuple(KERNELS)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
         without = "for a step without smoothing give smoothing=None"
