@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatterSciNotation
+from matplotlib.ticker import NullFormatter
 
 from experiments.parallel import num_compilers, num_cores
 from experiments.report import Table
@@ -365,7 +365,7 @@ def _finished(
     for axis in axes:
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-    axes[0].xaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2, 0.5)))
+    axes[0].xaxis.set_minor_formatter(NullFormatter())
     handles += [
         Line2D([], [], color=REFERENCE, lw=4.5, alpha=0.13, label="none is better"),
         Line2D([], [], color=MUTED, label="known of the reference", **_KNOWN),
