@@ -6,8 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from experiments.config import FOLDER, read_header
-from experiments.failure import ExperimentError
+from experiments.config import FOLDER, ExperimentError, read_header
 from experiments.runner import run_file
 
 

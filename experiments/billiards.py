@@ -18,7 +18,7 @@ import mjxgrad as mg
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
-from experiments.video import film
+from experiments.video import film, shown_speed
 from experiments.words import capitalised, joined
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
@@ -61,6 +61,8 @@ class Settings(RunSettings):
     """In the order of the legend."""
     num_steps: Annotated[int, Field(ge=10)] = 80
     """Of each descent."""
+    video: VideoSettings | None = VideoSettings(speed=0.5, width=400, height=400)
+    """Of the worst stroke and the best."""
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
@@ -309,7 +311,7 @@ def cost(outcome: Outcome):
     return figure, "Cost against steps", caption
 
 
-def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:
     """Draw a stroke that stands still and the best one, and give the file and its caption."""
     mj_model = load_scene(scene_path("billiards")).mj_model
     # Without a GPU fine shadows double the time of a frame, and coarse ones speckle the table.
@@ -319,9 +321,9 @@ def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
     return film(
         workspace,
         [(mj_model, run.qpos) for run in chosen],
-        VideoSettings(speed=0.5, width=400, height=400),
+        wanted,
         camera="above",
-        caption="The strokes that two descents end with, at 0.5 of real speed; the dark disc is the target.",
+        caption=f"The strokes that two descents end with, {shown_speed(wanted.speed)}; the dark disc is the target.",
         titles=[f"{run.method.label}: {run.final_cost:.3f}" for run in chosen],
         columns=2,
     )

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.failure import ExperimentError
+from experiments.config import ExperimentError
 from experiments.motion import advance, at_time_step
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.failure import ExperimentError
+from experiments.config import ExperimentError
 
 
 @contextlib.contextmanager

@@ -301,11 +301,8 @@ def descent(outcome: Outcome):
     return figure, "True cost of each descent", caption
 
 
-def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
-    """Draw the motion of the best controls, and give the file and its caption; nothing if none was asked for."""
-    wanted = outcome.settings.video
-    if wanted is None:
-        return None, ""
+def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:
+    """Draw the motion of the best controls, and give the file and its caption."""
     best = min(outcome.descents, key=lambda one: one.costs[-1])
     qpos = np.asarray(positions(outcome.task, jnp.asarray(best.params)))
     caption = (

@@ -102,7 +102,8 @@ def _call(run: Run, workspace: Workspace) -> Report:
         outcome = measure.measure(run.settings, workspace)
         # A kind of one file may have imported a module of such a name.
         said: dict[str, Any] = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
-        video, caption = pictures.video(outcome, workspace) if hasattr(pictures, "video") else (None, "")
+        wanted = getattr(run.settings, "video", None)
+        video, caption = pictures.video(outcome, workspace, wanted) if wanted else (None, "")
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
     told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]

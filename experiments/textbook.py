@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from scipy import stats
 
 from experiments import theme
-from experiments.failure import ExperimentError, suggest
+from experiments.config import ExperimentError, suggest
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.lines import Line2D
 
-from experiments.ablation.measure import Cost, Outcome, SceneOutcome, VariantOutcome
-from experiments.ablation.variants import NEEDED, REACHED
+from experiments.ablation.measure import NEEDED, REACHED, Cost, Outcome, SceneOutcome, VariantOutcome
 from experiments.parallel import num_compilers
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots

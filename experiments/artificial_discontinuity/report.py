@@ -4,8 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import linregress
 
-from experiments.artificial_discontinuity.outcome import GENTLE, PLAIN, WAYS, C, Judged, Outcome, largest, worst
-from experiments.artificial_discontinuity.pushes import TILT
+from experiments.artificial_discontinuity.measure import GENTLE, PLAIN, TILT, WAYS, C, Judged, Outcome, largest, worst
 from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.report import Table
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, shades, subplots

@@ -15,7 +15,7 @@ from scipy import stats
 
 import mjxgrad as mg
 from experiments.bias_variance.settings import Settings
-from experiments.failure import ExperimentError
+from experiments.config import ExperimentError
 from experiments.theme import power
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import BiasVariance, bias_variance

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
+from experiments.bias_variance.settings import ThrowsSettings
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
@@ -254,10 +255,10 @@ def choice(outcome: Outcome):
     return figure, "Which estimate is closer", caption
 
 
-def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
+def video(outcome: Outcome, workspace: Workspace, wanted: ThrowsSettings) -> tuple[str | None, str]:
     """Draw the throws that the settings ask for, and give the file and its caption; nothing if there are none."""
-    wanted, task = outcome.settings.video, outcome.task
-    if wanted is None or task is None:
+    task = outcome.task
+    if task is None:
         return None, ""
     knob = wall_contact(task, np.asarray(wanted.stiffness), outcome.settings.damping_ratio, with_default=False)
     mj_model = with_coarse_shadows(task.scene.mj_model)

@@ -12,6 +12,7 @@ from matplotlib.patches import Circle
 from experiments.planning.measure import Attempt, Outcome
 from experiments.planning.settings import NAMES
 from experiments.report import Table
+from experiments.settings import VideoSettings
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
 from experiments.video import film, shown_speed
 from experiments.words import capitalised, quantity
@@ -196,11 +197,8 @@ def pose(outcome: Outcome):
     return figure, "Where the rod is", caption
 
 
-def video(outcome: Outcome, workspace: Workspace) -> tuple[str | None, str]:
-    """Draw the best plan with the goal as a shade, and give the file and its caption; nothing if none was asked for."""
-    wanted = outcome.settings.video
-    if wanted is None:
-        return None, ""
+def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:
+    """Draw the best plan with the goal as a shade, and give the file and its caption."""
     mj_model = copy.copy(planar_pusher().system.scene.mj_model)
     target = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, "target")
     x, y, turn = outcome.goal

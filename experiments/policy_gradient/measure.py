@@ -62,13 +62,26 @@ def jackknife_error(function: Callable[..., float], *sets: Vectors) -> float:
     return variance**0.5
 
 
-class Estimates(NamedTuple):
-    """Independent estimates at one point, with α of the default rule and the numbers of its `mg.estimators.Reason`."""
+class Estimated(eqx.Module):
+    """Both parts of α-order estimates, first order and control variate, before they are mixed: of one, or many at one point.
 
-    first: Vectors
-    unbiased: Vectors
-    alpha: Float[np.ndarray, " estimates"]
-    reason: Int[np.ndarray, " estimates"]
+    α is what the default rule gives the first, for a reason of `mg.estimators.Reason`; the cost is the mean over the rollouts.
+    """
+
+    first: Float[Array, "*estimates dim"]
+    unbiased: Float[Array, "*estimates dim"]
+    alpha: Float[Array, "*estimates"]
+    reason: Int[Array, "*estimates"]
+    cost: Float[Array, "*estimates"]
+
+    def weight(self, estimator: str) -> Float[Array, ""]:
+        """Give α of "first" order, which is 1, or of "alpha"-order."""
+        return jnp.ones_like(self.alpha) if estimator == "first" else self.alpha
+
+    def value(self, estimator: str) -> Float[Array, " dim"]:
+        """Give the estimate of "first" order or of "alpha"-order."""
+        alpha = self.weight(estimator)
+        return alpha * self.first + (1 - alpha) * self.unbiased
 
 
 class Judged(NamedTuple):
@@ -95,7 +108,7 @@ class Cell:
     point: str  # its label
     hits_and_misses: bool  # whether the noise covers a jump of the cost
     has_jump_of_force: bool  # whether contacts set in with a force that is not zero
-    estimates: Mapping[str, Estimates]  # by gradient
+    estimates: Mapping[str, Estimated]  # by gradient
     reference: Vectors  # unbiased estimates from rollouts of their own
 
     @property
@@ -114,7 +127,7 @@ class Cell:
         """What each gradient is worth."""
         return {gradient: self._judge(self.estimates[gradient]) for gradient in GRADIENTS}
 
-    def _judge(self, one: Estimates) -> Judged:
+    def _judge(self, one: Estimated) -> Judged:
         sets, alpha = (one.first, self.reference), one.alpha[:, None]
         square, error = squared_distance(*sets), jackknife_error(squared_distance, *sets)
         reference, noise = mean_and_error(self.reference)
@@ -281,28 +294,6 @@ def _hopper(settings: Settings) -> Problem:
     return Problem("hopper", "Hopper", task, 0.1, points, 32, has_jump_of_force=True, descent=descent)
 
 
-class Estimated(eqx.Module):
-    """Both parts of one α-order estimate, first order and control variate, before they are mixed.
-
-    α is what the default rule gives the first, for a reason of `mg.estimators.Reason`; the cost is the mean over the rollouts.
-    """
-
-    first: Float[Array, " dim"]
-    unbiased: Float[Array, " dim"]
-    alpha: Float[Array, ""]
-    reason: Int[Array, ""]
-    cost: Float[Array, ""]
-
-    def weight(self, estimator: str) -> Float[Array, ""]:
-        """Give α of "first" order, which is 1, or of "alpha"-order."""
-        return jnp.ones_like(self.alpha) if estimator == "first" else self.alpha
-
-    def value(self, estimator: str) -> Float[Array, " dim"]:
-        """Give the estimate of "first" order or of "alpha"-order."""
-        alpha = self.weight(estimator)
-        return alpha * self.first + (1 - alpha) * self.unbiased
-
-
 @eqx.filter_jit
 def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKeyArray, num_samples: int) -> Estimated:
     """Estimate once, by all estimators from the same rollouts.
@@ -344,11 +335,10 @@ def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Ce
     return Cell(one.name, one.title, point.label, point.hits_and_misses, one.has_jump_of_force, estimates, reference)
 
 
-def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: Key[Array, " count"]) -> Estimates:
+def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: Key[Array, " count"]) -> Estimated:
     objective = one.objective(gradient, one.stddev)
     found = [estimated(objective, params, key, one.num_samples) for key in keys]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *found)
-    return Estimates(stacked.first, stacked.unbiased, stacked.alpha, stacked.reason)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
 
 def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:

@@ -1,13 +1,12 @@
 """How far gradients can be trusted, measured."""
 
-from mjxgrad.diagnostics.bias_variance import BiasVariance, bias_variance
+from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
 from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, unused
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
-from mjxgrad.diagnostics.reference import Landscape
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad.diagnostics.reference import map_in_chunks
+from mjxgrad.diagnostics.bias_variance import map_in_chunks
 from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval, variance_interval
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, as_vector, flattened

@@ -1,8 +1,7 @@
 """Plans through contact: trajectory optimisation and search trees, both on smoothed linear models."""
 
-from mjxgrad.planning.cost import Cost, GoalCost
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
-from mjxgrad.planning.system import FunctionSystem, SceneSystem, System
+from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
 from mjxgrad.planning.tree import Path, Sampling, Search, path, search
 

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad._arrays import known
-from mjxgrad.planning.cost import Cost, Quadratic, stage_model, terminal_model
 from mjxgrad.planning.linear_model import LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, System
+from mjxgrad.planning.system import ControlVector, Cost, Quadratic, System, stage_model, terminal_model
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]

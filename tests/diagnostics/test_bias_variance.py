@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from mjxgrad.diagnostics import Landscape, bias_variance, mean_interval
-from mjxgrad.diagnostics.reference import cell_points
+from mjxgrad.diagnostics.bias_variance import cell_points
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook

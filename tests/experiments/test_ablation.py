@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.ablation.measure import Cost, record, scene_path, segments
-from experiments.ablation.variants import EVERYTHING, FUSED, NEEDED, RENDERING, variants
+from experiments.ablation.measure import (
+    EVERYTHING,
+    FUSED,
+    NEEDED,
+    RENDERING,
+    Cost,
+    record,
+    scene_path,
+    segments,
+    variants,
+)
 
 
 @pytest.fixture(scope="module")

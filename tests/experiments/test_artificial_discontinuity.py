@@ -8,11 +8,9 @@ import pytest
 from scipy.stats import norm
 
 from experiments.__main__ import main
-from experiments.artificial_discontinuity.measure import overlap_force
-from experiments.artificial_discontinuity.pushes import slopes_at
+from experiments.artificial_discontinuity.measure import overlap_force, slopes_at
 from experiments.artificial_discontinuity.shapes import PATHS, shape
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 
 DEPTH = 0.005
 

@@ -8,8 +8,7 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.bounce import Outcome, Settings, drawings, findings, grid_of, tables, verdict
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
 from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases

@@ -2,8 +2,7 @@
 
 import pytest
 
-from experiments.config import FOLDER, load_runs, read_header
-from experiments.failure import ConfigurationError
+from experiments.config import FOLDER, ConfigurationError, load_runs, read_header
 
 VALID = """\
 # Is it so?

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 from experiments.long_horizon.measure import reference_gradient, zeroth
 from experiments.long_horizon.problems import problem
 

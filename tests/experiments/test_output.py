@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 
-from experiments.failure import ExperimentError
+from experiments.config import ExperimentError
 from experiments.output import building, write_csv, write_text, write_toml
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 from experiments.planning.measure import Attempt, Outcome
 from experiments.planning.report import drawings, findings, tables, verdict
 from experiments.planning.settings import Settings

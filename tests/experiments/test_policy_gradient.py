@@ -12,7 +12,7 @@ from experiments.__main__ import main
 from experiments.policy_gradient.measure import (
     Cell,
     Course,
-    Estimates,
+    Estimated,
     Outcome,
     estimated,
     jackknife_error,
@@ -43,7 +43,7 @@ def cell(discrete, onset, *, name="hopper", point="start", hits_and_misses=False
 
     def estimates(error, alpha, reason):
         first, unbiased = around(truth + error, 1e-4), around(truth, 0.5)
-        return Estimates(first, unbiased, np.full(16, alpha), np.full(16, reason))
+        return Estimated(first, unbiased, np.full(16, alpha), np.full(16, reason), np.zeros(16))
 
     both = {"discrete": estimates(discrete, 0.0, INCONSISTENT), "onset": estimates(onset, 0.8, TRUSTED)}
     return Cell(name, "Task", point, hits_and_misses, True, both, around(truth))
@@ -149,9 +149,8 @@ def test_every_task_gets_its_figure(tmp_path):
 
     def named(name, dim, point="start"):
         def estimates():
-            return Estimates(
-                rng.normal(size=(8, dim)), rng.normal(size=(8, dim)), rng.uniform(size=8), np.full(8, TRUSTED)
-            )
+            parts = rng.normal(size=(2, 8, dim))
+            return Estimated(*parts, rng.uniform(size=8), np.full(8, TRUSTED), np.zeros(8))
 
         both = {"discrete": estimates(), "onset": estimates()}
         return Cell(name, "Task", point, False, False, both, 1 + rng.normal(size=(8, dim)))

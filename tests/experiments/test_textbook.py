@@ -6,8 +6,7 @@ import json
 import pytest
 
 from experiments.__main__ import main
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 
 SETTINGS = """\
 # Does stiffness matter?

@@ -14,8 +14,7 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.config import load_runs
-from experiments.failure import ConfigurationError
+from experiments.config import ConfigurationError, load_runs
 from experiments.work_precision import report
 from experiments.work_precision.cases import case
 from experiments.work_precision.measure import Recorded, Truth, differences, quasi_random, smoothed_gradient, variants

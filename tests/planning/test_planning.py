@@ -21,8 +21,8 @@ from mjxgrad.planning import (
     search,
     shifted,
 )
-from mjxgrad.planning.cost import terminal_model
 from mjxgrad.planning.linear_model import LinearModel
+from mjxgrad.planning.system import terminal_model
 from mjxgrad.planning.trajectory import minimise_in_box
 from mjxgrad.planning.tree import reach
 
