@@ -68,11 +68,11 @@ class Estimated(eqx.Module):
     α is what the default rule gives the first, for a reason of `mg.estimators.Reason`; the cost is the mean over the rollouts.
     """
 
-    first: Float[Array, "*estimates dim"]
-    unbiased: Float[Array, "*estimates dim"]
-    alpha: Float[Array, "*estimates"]
-    reason: Int[Array, "*estimates"]
-    cost: Float[Array, "*estimates"]
+    first: Float[Any, "*estimates dim"]
+    unbiased: Float[Any, "*estimates dim"]
+    alpha: Float[Any, "*estimates"]
+    reason: Int[Any, "*estimates"]
+    cost: Float[Any, "*estimates"]
 
     def weight(self, estimator: str) -> Float[Array, ""]:
         """Give α of "first" order, which is 1, or of "alpha"-order."""
