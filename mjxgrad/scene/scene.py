@@ -123,9 +123,8 @@ class Scene(eqx.Module):
 
     def warnings(self) -> list[str]:
         """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
-        leaves = (self.model.geom_solref, self.model.pair_solref, self.model.opt.timestep)
-        is_batched = np.ndim(leaves[0]) != 2 or np.ndim(leaves[2]) != 0
-        if is_batched or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        is_batched = np.ndim(self.model.geom_solref) != 2 or np.ndim(self.model.opt.timestep) != 0
+        if is_batched or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self.model)):
             return []
         return contact_warnings(self.model, self.pairs)
 
