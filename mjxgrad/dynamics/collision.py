@@ -45,10 +45,13 @@ _Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Arra
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs."""
+    """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs.
+
+    Where data has fewer slots for contacts of one dimension than could touch, the nearest get them.
+    """
     if not data._impl.ncon:
         return data
-    most_pairs, most_contacts = (custom_number(model, name) for name in ("max_geom_pairs", "max_contact_points"))
+    most_pairs = custom_number(model, "max_geom_pairs")
     by_dim: dict[int, list] = {}
     members = geom_groups(model)
     for key, contact in contact_groups(model, data).items():
@@ -66,22 +69,35 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     ordered = []
     for dim in sorted(by_dim):
         contact = _joined(by_dim[dim])
-        if len(contact.dist) > most_contacts > -1:
-            contact = _greatest(contact, -contact.dist, most_contacts)
+        count = int(np.sum(data._impl.contact.dim == dim))
+        if len(contact.dist) > count:
+            contact = _greatest(contact, contact.includemargin - contact.dist, count)
         ordered.append(contact)
     return data.tree_replace({"_impl.contact": _joined(ordered)})  # pyright: ignore[reportReturnType]
 
 
-def slot_geoms(model: mjx.Model) -> Int[np.ndarray, "contacts 2"] | None:
+def slot_geoms(model: mjx.Model, data: mjx.Data) -> Int[np.ndarray, "contacts 2"] | None:
     """Return the two geoms of each contact slot; None where it is decided at run time who gets a slot."""
-    if custom_number(model, "max_geom_pairs") > -1 or custom_number(model, "max_contact_points") > -1:
-        return None
+    every = _candidates(model)
+    found = np.concatenate([np.zeros((0, 2), int), *(every[dim] for dim in sorted(every))])
+    return found if len(found) == len(data._impl.contact.dim) else None
+
+
+def _candidates(model: mjx.Model) -> dict[int, np.ndarray]:
+    """Return the two geoms of each contact that there could be, by dimension."""
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
         count = COLLISION_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
         by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
-    slots = [geoms for dim in sorted(by_dim) for geoms in by_dim[dim]]
-    return np.concatenate(slots) if slots else np.zeros((0, 2), int)
+    return {dim: np.concatenate(geoms) for dim, geoms in by_dim.items()}
+
+
+def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
+    """Return the distance, less the margin, from which a contact may have found no slot (m); infinite if all have one."""
+    contact, gap = data._impl.contact, data._impl.contact.dist - data._impl.contact.includemargin
+    slots = {dim: np.flatnonzero(np.asarray(contact.dim) == dim) for dim in np.unique(contact.dim)}
+    crowded = [gap[of_dim].max() for dim, of_dim in slots.items() if len(of_dim) < len(_candidates(model)[dim])]
+    return jnp.min(jnp.stack(crowded)) if crowded else jnp.asarray(jnp.inf, data.qpos.dtype)
 
 
 def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:

@@ -88,16 +88,6 @@ class DenseRows(RowMap):
     entries: Float[Array, "rows nv *batch"]
     cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
-    @classmethod
-    def of_contacts(
-        cls, directions: Float[Array, "contacts dim nv"], friction: Float[Array, "contacts tangents"] | None
-    ) -> "DenseRows":
-        """Return the rows of contacts: the edges of pyramids if there is friction for them, or the directions."""
-        count, dim, num_dofs = directions.shape
-        if friction is None:
-            return cls(flat(directions), ((count, dim),) if dim > 1 else ())
-        return cls(edges(directions, friction[:, :, None]).reshape(-1, num_dofs))
-
     @property
     def groups(self) -> tuple[Group, ...]:
         dofs, coupled = tuple(range(self.entries.shape[1])), sum(num * dim for num, dim in self.cones)
@@ -120,6 +110,33 @@ class DenseRows(RowMap):
 
     def matrix(self):
         return self.entries
+
+
+class SlotRows(RowMap):
+    """Rows of contacts of one dimension between bodies that are known at run time: entries and, of pyramids, μ of tangents."""
+
+    entries: Float[Array, "contacts dim nv *batch"]
+    friction: Float[Array, "contacts tangents *batch"] | None
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        count, dim, num_dofs = self.entries.shape[:3]
+        return (Group(tuple(range(num_dofs)), count, dim, is_pyramid=self.friction is not None),)
+
+    def rates(self, velocity):
+        return edges(contract("cdv,v->cd", self.entries, velocity), self.friction).reshape(-1)
+
+    def pull(self, force):
+        return contract("cdv,cd->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
+
+    def directions(self):
+        return [self.entries]
+
+    def tilts(self):
+        return [self.friction]
+
+    def matrix(self):
+        return flat(edges(self.entries, None if self.friction is None else self.friction[:, :, None]))
 
 
 class AxisRows(RowMap):

@@ -216,7 +216,7 @@ def _share(
     distance = block.residual[::each] + h * rate * slow
     if contacts is None:
         return _ramp(distance, width, 0.5), None
-    slots = slot_geoms(model)
+    slots = slot_geoms(model, data)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
     share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
     return share, _side(model, data, block, contacts, geoms, rate, least)

@@ -20,7 +20,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
 from mjxgrad.dynamics import linear, spatial, tree
 from mjxgrad.dynamics.collision import slot_geoms
-from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, fold
+from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, SlotRows, fold
 
 _PerRow = Float[Array, " rows"]
 
@@ -99,7 +99,7 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     contact = jax.tree.map(lambda x: x[first : chosen[-1] + 1], contact)
     contact = contact.replace(friction=least_friction(contact.friction))
     rows = row_map(model, data, contact, first, dim)
-    inverse_weight = jnp.sum(model.body_invweight0[_bodies(model, contact, first), 0], axis=1)
+    inverse_weight = jnp.sum(model.body_invweight0[_bodies(model, data, contact, first), 0], axis=1)
     distance = contact.dist - contact.includemargin
     is_pyramid, count = has_pyramids(model, dim), len(distance)
     each = 2 * (dim - 1) if is_pyramid else dim
@@ -146,10 +146,10 @@ def _cone_rows(
 def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
     """Return the map of consecutive contacts of one dimension, the first of which has a number."""
     friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
-    bodies = _bodies(model, contact, first)
+    bodies = _bodies(model, data, contact, first)
     if isinstance(bodies, np.ndarray):
         return contact_rows(model, data, contact, bodies, dim, friction)
-    return DenseRows.of_contacts(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
+    return SlotRows(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
 
 
 def has_pyramids(model: mjx.Model, dim: int) -> bool:
@@ -157,9 +157,9 @@ def has_pyramids(model: mjx.Model, dim: int) -> bool:
     return dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-def _bodies(model: mjx.Model, contact: Any, first: int) -> np.ndarray | Array:
+def _bodies(model: mjx.Model, data: mjx.Data, contact: Any, first: int) -> np.ndarray | Array:
     """Return the bodies of consecutive contacts, as constants where they are known."""
-    slots = slot_geoms(model)
+    slots = slot_geoms(model, data)
     if slots is None:
         return jnp.asarray(model.geom_bodyid)[contact.geom]
     return np.asarray(model.geom_bodyid)[slots[first : first + len(contact.dist)]]
@@ -242,7 +242,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
         ValueError: if there is no such geom, or no contact between the two.
     """
     wanted = [index_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in (first, second)]
-    contact, known = data._impl.contact, slot_geoms(model)
+    contact, known = data._impl.contact, slot_geoms(model, data)
     slots = range(len(contact.dim)) if known is None else np.flatnonzero((np.sort(known) == sorted(wanted)).all(axis=1))
     if not len(slots):
         raise ValueError(f"{first!r} and {second!r} can never touch: no contact between them is simulated")

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contact import Softness, softness_warnings
@@ -35,6 +36,7 @@ def load_scene(
     leave_out: LeaveOut | None = None,
     keep_everything: bool = False,
     timestep: float | None = None,
+    max_contacts: int | None = None,
 ) -> Scene:
     """Load a scene, convert or refuse what MJX lacks and leave out what the scene does not need.
 
@@ -49,6 +51,9 @@ def load_scene(
         keep_everything: leave out nothing, and keep the solver tolerance and the storage of
             matrices as in the file. The motion is the same to rounding.
         timestep: in s, instead of that in the file.
+        max_contacts: how many contacts of each friction dimension (`condim`) a state has room for: the nearest get it, and
+            only they cost anything in the solve. None has room for all that could touch. Where all of them are taken, in
+            some step, `Trajectory.crowded` says so.
 
     Returns:
         The scene. `print(scene.summary())` shows what it has.
@@ -57,13 +62,15 @@ def load_scene(
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if the path is a folder.
         TypeError: if the source is none of the three.
-        ValueError: if `timestep` is not positive, `leave_out` does not fit the scene or is given beside
+        ValueError: if `timestep` or `max_contacts` is not positive, `leave_out` does not fit the scene or is given beside
             `keep_everything`, or as `Softness.apply`.
         SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or MJX cannot simulate
             it; all unsupported features are named at once.
     """
     if keep_everything and leave_out is not None:
         raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
+    if max_contacts is not None and max_contacts < 1:
+        raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     mj_model, name = _compile(source)
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
@@ -80,7 +87,7 @@ def load_scene(
         omissions += switch_off(stepped)
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped)
-    model, data = _put(stepped, name)
+    model, data = _put(stepped, name, max_contacts)
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
     messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
@@ -143,7 +150,7 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
     return conversions
 
 
-def _put(model: mujoco.MjModel, name: str) -> tuple[mjx.Model, mjx.Data]:
+def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mjx.Model, mjx.Data]:
     """Model and data of MJX."""
     if not contact_pairs(model):
         # MJX insists on a collision function even for pairs whose contact is disabled.
@@ -151,20 +158,24 @@ def _put(model: mujoco.MjModel, name: str) -> tuple[mjx.Model, mjx.Data]:
         model.geom_conaffinity[:] = 0
     try:
         mjx_model = mjx.put_model(model, impl="jax")
-        return mjx_model, _make_data(model, mjx_model)
+        return mjx_model, _make_data(model, mjx_model, max_contacts)
     except NotImplementedError as error:
         raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
 
 
-def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
-    """Data of MJX, also for frictionless contacts beside elliptic ones, which MJX refuses."""
+def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
+    """Data of MJX with room for so many contacts, also for frictionless ones beside elliptic ones, which MJX refuses."""
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
     data = mjx.make_data(model, impl="jax")
     model.opt.cone = cone
-    if cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+    dims = np.asarray(data._impl.contact.dim)
+    of_dim = [np.flatnonzero(dims == dim)[:max_contacts] for dim in np.unique(dims)]
+    kept = np.concatenate([np.zeros(0, int), *of_dim])
+    if cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and len(kept) == len(dims):
         return data
-    condim = data._impl.contact.dim
-    efc_type = make_efc_type(mjx_model, condim)
+    dims = dims[kept]
+    contact = jax.tree.map(lambda x: x[kept], data._impl.contact)
+    efc_type = make_efc_type(mjx_model, dims)
     num_equality, num_friction, num_limit, _ = found = counts(efc_type)
     num_rows = sum(found)
     rows = {
@@ -177,7 +188,8 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model) -> mjx.Data:
         "_impl.nf": num_friction,
         "_impl.nl": num_limit,
         "_impl.nefc": num_rows,
+        "_impl.ncon": len(kept),
         "_impl.efc_type": efc_type,
-        "_impl.contact.efc_address": make_efc_address(mjx_model, condim, efc_type),
+        "_impl.contact": contact.replace(dim=dims, efc_address=make_efc_address(mjx_model, dims, efc_type)),
     }
     return cast(mjx.Data, data.tree_replace(rows | sizes))
