@@ -14,7 +14,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
+from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
+from mjxgrad.dynamics.onset import reach
 from mjxgrad.scene import Scene, SceneWarning
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
@@ -61,6 +63,8 @@ class Trajectory(eqx.Module):
             quite that of the model, and the derivative, which takes the solve for finished, not quite its own. Zero, unless
             `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
             hardly have such a limit). Only `rollout` counts it.
+        crowded: number of steps before it in which more contacts may have acted than the scene has room for, see `max_contacts`
+            of `load_scene`. Under smoothing, where contacts act at any distance, it counts every step of such a scene.
         growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
             velocities and positions alike; None unless asked for.
         act: activations of actuators, as positions; only `rollout` keeps them.
@@ -74,6 +78,7 @@ class Trajectory(eqx.Module):
     diverged: Bool[Array, ""]
     first_bad_step: Int[Array, ""]
     unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    crowded: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
     growth: Float[Array, ""] | None = None
     act: Float[Array, "states na"] | None = None
     seen: PyTree = None
@@ -213,7 +218,7 @@ def rollout(
         return observe(scene.model, stepped.replace(**at_start))
 
     def advance(carry: tuple, inputs: tuple[Array, Array, Array]):
-        state, before, first_bad, unsolved, tangent, growth = carry
+        state, before, first_bad, unsolved, crowded, tangent, growth = carry
         index, row, disturbance = inputs
         seen = None if before is None else look(state, before)
         ctrl = (row if policy is None else policy(params, state if before is None else seen)) + disturbance
@@ -234,7 +239,9 @@ def rollout(
         first_bad = jnp.where((first_bad < 0) & is_bad, index, first_bad)
         kept = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved)
         unsolved += (first_bad < 0) & (stepped._impl.solver_niter > scene.model.opt.iterations)
-        carry = (kept, None if before is None else ctrl.astype(before.dtype), first_bad, unsolved, tangent, growth)
+        crowded += (first_bad < 0) & _is_crowded(scene.model, jax.lax.stop_gradient(stepped), onset, smoothing)
+        shown = None if before is None else ctrl.astype(before.dtype)
+        carry = (kept, shown, first_bad, unsolved, crowded, tangent, growth)
         return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
 
     if checkpoint:
@@ -247,10 +254,11 @@ def rollout(
         scene.data.ctrl if policy_looks else None,  # the control before, under which a policy looks
         jnp.full((), -1, jnp.int32),
         jnp.zeros((), jnp.int32),
+        jnp.zeros((), jnp.int32),
         _direction(state) if measure_growth else None,
         jnp.ones((), state.qvel.dtype) if measure_growth else None,
     )
-    (final, _, first_bad, unsolved, _, growth), (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(
+    (final, _, first_bad, unsolved, crowded, _, growth), (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(
         advance,
         start,
         (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
@@ -267,10 +275,20 @@ def rollout(
         diverged=first_bad >= 0,
         first_bad_step=first_bad,
         unsolved=unsolved,
+        crowded=crowded,
         growth=None if growth is None else jnp.where(jnp.isnan(growth), jnp.inf, growth),
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
+
+
+def _is_crowded(model: mjx.Model, data: mjx.Data, onset: Onset | None, smoothing: Smoothing | None) -> Bool[Array, ""]:
+    """Return whether, in the step that the data is from, contacts may have acted that found no slot."""
+    if not data._impl.ncon or slot_geoms(model, data) is not None:
+        return jnp.array(False)
+    if smoothing is not None:
+        return jnp.array(True)
+    return first_missed(model, data) < (0.0 if onset is None else reach(model, data, onset))
 
 
 def _direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:

@@ -67,7 +67,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import as_float, is_known, safe_sqrt
+from mjxgrad._arrays import as_float, is_known, safe_norm, safe_sqrt
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
@@ -112,6 +112,30 @@ class Onset(eqx.Module):
                 "gradient must be 'discrete' with an onset, got 'event': that one is for MuJoCo's motion to the bit, "
                 "onset=None; a motion without jumps needs no correction"
             )
+
+
+def reach(model: mjx.Model, data: mjx.Data, onset: Onset) -> Float[Array, ""]:
+    """Return a distance, less the margin, from which on no contact acts in the coming step (m).
+
+    Contacts are taken to be no stiffer or slower than those of the data, and geoms to stay within their bounding spheres.
+    """
+    contact, h = data._impl.contact, model.opt.timestep
+    turning, moving = data.cvel[:, :3], data.cvel[:, 3:]
+    lever = data.geom_xpos - data.subtree_com[model.body_rootid[model.geom_bodyid]]
+    turning, moving = turning[model.geom_bodyid], moving[model.geom_bodyid]
+    speeds = safe_norm(moving + jnp.cross(turning, lever)) + safe_norm(turning) * model.geom_rbound
+    speed = jnp.sum(jnp.sort(speeds)[-2:])
+    stiffness, damping = stiffness_damping(model, contact.solref, contact.solimp[:, 1])
+    gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
+    creep = _creep(gravity, h, stiffness, damping) + _SLIP * h * damping * speed
+    least = safe_sqrt((h * creep) ** 2 + (onset.width * contact.solimp[:, 2]) ** 2)
+    return jnp.max(h * speed + 0.5 * jnp.maximum(h * speed, least))
+
+
+def _creep(gravity: Float[Array, ""], h: Float[Array, ""], stiffness: _PerContact, damping: _PerContact) -> _PerContact:
+    """Return the speed below which free motion, or the weight on a contact, moves bodies faster than they approach."""
+    resistance = damping + safe_sqrt(stiffness)
+    return gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
 
 
 class Shares(eqx.Module):
@@ -201,9 +225,8 @@ def _share(
     rates = block.map.rates(data.qvel).reshape(-1, each)
     rate = _normal(block, rates)
     stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
-    resistance = damping + safe_sqrt(stiffness)
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
-    creep = gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
+    creep = _creep(gravity, h, stiffness, damping)
     if block.is_pyramid:
         slip = jnp.max(jnp.abs(rates - rate[:, None]), axis=1)
         creep = creep + _SLIP * h * damping * slip * _is_slow(rate, 2 * h * gravity)

@@ -54,7 +54,7 @@ def test_a_box_on_a_plane_touches_where_it_does_in_c():
     mj_model = mujoco.MjModel.from_xml_string(BOXES)
     mj_data = mujoco.MjData(mj_model)
     model = mjx.put_model(mj_model)
-    start, find, geoms = mjx.make_data(mj_model), _finder(model), slot_geoms(model)
+    start, find, geoms = mjx.make_data(mj_model), _finder(model), slot_geoms(model, mjx.make_data(mj_model))
     for seed in range(20):
         mj_data.qpos[:] = _poses(seed)
         mujoco.mj_forward(mj_model, mj_data)
@@ -93,6 +93,6 @@ def test_slots_are_given_as_in_mjx(limits):
     ours, theirs = (jax.jit(find)(model, data)._impl.contact for find in (collide, mjx.collision))
     assert len(theirs.dist) == len(theirs.dim)
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
-    assert (slot_geoms(model) is None) == bool(limits)
+    assert (slot_geoms(model, data) is None) == bool(limits)
     if not limits:
-        np.testing.assert_array_equal(slot_geoms(model), theirs.geom)
+        np.testing.assert_array_equal(slot_geoms(model, data), theirs.geom)
