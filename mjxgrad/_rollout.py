@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
+from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
@@ -24,6 +25,7 @@ Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """From model and data to anything made of arrays."""
 Sees = Literal["state", "observations"]
+Engine = Literal["mjx", "mujoco"]
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
@@ -144,6 +146,7 @@ def rollout(
     smoothing: Smoothing | None = None,
     velocity_limit: float | None = 1e4,
     measure_growth: bool = False,
+    engine: Engine = "mjx",
 ) -> Trajectory:
     """Step a scene many times.
 
@@ -175,6 +178,8 @@ def rollout(
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
         measure_growth: carry one tangent along and tell by `growth` and `explodes` whether derivatives of this rollout can be
             believed: contacts that chatter may multiply them at every switch. It takes as long as a derivative in forward mode.
+        engine: "mujoco" has C MuJoCo do it, on all cores of the processor: for controls, and where no derivative is wanted. Its
+            motion is that without an onset, to the solver's tolerance; what has no meaning there is refused.
 
     Returns:
         The trajectory, with `horizon + 1` states.
@@ -201,6 +206,12 @@ def rollout(
         if (shape := jnp.shape(getattr(state, name))) != (size,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
+    if engine != "mjx":
+        given = {"a policy": callable(controls), "observe": observe, "onset": onset, "smoothing": smoothing}
+        given |= {"measure_growth": measure_growth, f"gradient={gradient!r}": gradient != "discrete"}
+        _check_engine(engine, [name for name, value in given.items() if value is not None and value is not False])
+        resting = jnp.broadcast_to(scene.data.ctrl if sequence is None else sequence, (horizon, nu))
+        return _native_trajectory(scene, state, resting + (0 if noise is None else jnp.asarray(noise)), velocity_limit)
     policy = controls if callable(controls) else None
     resting = jnp.broadcast_to(scene.data.ctrl, (horizon, nu))
     base = resting if sequence is None else sequence
@@ -279,6 +290,41 @@ def rollout(
         growth=None if growth is None else jnp.where(jnp.isnan(growth), jnp.inf, growth),
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
+    )
+
+
+def _check_engine(engine: str, given: list[str]) -> None:
+    if engine != "mujoco":
+        raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
+    if given:
+        raise ValueError(
+            f'engine="mujoco" rolls out controls in MuJoCo\'s own motion, got {" and ".join(given)}: leave it out'
+        )
+
+
+def _native_trajectory(
+    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], velocity_limit: float | None
+) -> Trajectory:
+    """Return what C MuJoCo makes of controls; from the first bad step on the last good state."""
+    start = (state.qpos, state.qvel, state.act)
+    is_finite = jnp.isfinite(ctrl)  # MuJoCo takes another for zero
+    found = roll_out(scene, *start, jnp.asarray(state.time), jnp.where(is_finite, ctrl, 0.0))
+    qpos, qvel, act = (jnp.concatenate([first[None], rest]) for first, rest in zip(start, found, strict=True))
+    time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
+    states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
+    is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
+    diverged, first_bad = jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32)
+    kept = jnp.where(diverged, jnp.minimum(jnp.arange(len(ctrl) + 1), first_bad), jnp.arange(len(ctrl) + 1))
+    states = jax.tree.map(lambda x: x[kept], states)
+    return Trajectory(
+        qpos=states.qpos,
+        qvel=states.qvel,
+        ctrl=ctrl,
+        observations=None,
+        final=jax.tree.map(lambda x: x[-1], states),
+        diverged=diverged,
+        first_bad_step=jnp.where(diverged, first_bad, -1),
+        act=states.act,
     )
 
 

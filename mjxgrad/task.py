@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._rollout import Observe, Policy, Sees, State, Trajectory, rollout
+from mjxgrad._rollout import Engine, Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
@@ -133,6 +133,7 @@ class SceneTask(Task, InScene):
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
         observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
         policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
+        engine: "mjx", or "mujoco" for costs alone; see `with_engine`.
     """
 
     state: State
@@ -141,6 +142,11 @@ class SceneTask(Task, InScene):
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
     observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
+    engine: Engine = eqx.field(static=True, default="mjx", kw_only=True)
+
+    def with_engine(self: Same, engine: Engine) -> Same:
+        """Return the same in MuJoCo's own motion, by MJX or, for controls and without derivatives, by C MuJoCo."""
+        return dataclasses.replace(self.with_onset(None), engine=engine)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -178,6 +184,7 @@ class SceneTask(Task, InScene):
             gradient=self.gradient,
             onset=self.onset,
             smoothing=self.smoothing,
+            engine=self.engine,
         )
         states = trajectory.seen
         if states is None:

@@ -14,6 +14,7 @@ ORDER = (
     ("contact",),
     ("dynamics",),
     ("scene",),
+    ("_native",),
     ("_rollout",),
     ("task",),
     ("objective", "policy"),

@@ -134,16 +134,10 @@ class Scene(eqx.Module):
         Raises:
             ValueError: if the scene is batched or traced.
         """
-        target = copy.deepcopy(self.mj_model)
-        for source, destination in ((self.model, target), (self.model.opt, target.opt)):
-            for field in source.fields():
-                value = getattr(source, field.name, None)
-                if not isinstance(value, jax.Array):
-                    continue
-                if isinstance(value, jax.core.Tracer):
-                    raise ValueError("to_mujoco needs known values, got a traced scene")
-                _copy_into(destination, field.name, np.asarray(value))
-        return target
+        numbers = numbers_of(self.model)
+        if any(isinstance(value, jax.core.Tracer) for value in numbers.values()):
+            raise ValueError("to_mujoco needs known values, got a traced scene")
+        return with_numbers(self.mj_model, numbers)
 
     def summary(self) -> str:
         """Describe the scene in text for a terminal 120 characters wide: sizes, options, contacts, conversions, omissions.
@@ -170,6 +164,22 @@ class Scene(eqx.Module):
 def _warn(scene: Scene, message: str) -> None:
     """Warn whoever called a method of the scene; Equinox wraps methods, so this is one level further up."""
     warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
+
+
+def numbers_of(model: mjx.Model) -> dict[str, Array]:
+    """Return the floating-point arrays of a model by name, those of its options as `opt.timestep`."""
+    parts = (("", model), ("opt.", model.opt))
+    every = {prefix + f.name: getattr(part, f.name, None) for prefix, part in parts for f in part.fields()}
+    return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
+
+
+def with_numbers(mj_model: mujoco.MjModel, numbers: dict[str, Array] | dict[str, np.ndarray]) -> mujoco.MjModel:
+    """Return a copy of a C model with the numbers of one of MJX's, where it has them."""
+    target = copy.deepcopy(mj_model)
+    for name, value in numbers.items():
+        is_option = name.startswith("opt.")
+        _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
+    return target
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
