@@ -6,10 +6,10 @@ the compiled program besides its arguments.
 `bench`: steps and gradients on the same scene, batch and number of steps; each row is the median of several runs, with the range.
 
 - `mjx.step`: MJX as it is, its solver run to the same tolerance.
-- `mg.rollout`: our step, lean carry.
+- `mg.rollout`: our step, lean carry; on scenes with many contacts that could be, also with room for the nearest alone.
 - `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
-- `C MuJoCo`: `mujoco.rollout` on as many threads as there are cores.
+- `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it; `C MuJoCo`: `mujoco.rollout` itself; on as many threads as there are cores.
 
 With `--per-core` every core is a device of its own, and each row of JAX's, MJX's included, is split over them by
 `mg.over_devices`.
@@ -41,13 +41,19 @@ import numpy as np
 import mjxgrad as mg
 from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
+from mjxgrad.tasks import scene_path
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _SCENES = {
-    "two_bodies": Path(__file__).parents[1] / "mjcf" / "two_bodies.xml",
+    "two_bodies": scene_path("two_bodies"),
     "hopper": _ASSETS / "hopper.xml",
     "half_cheetah": _ASSETS / "half_cheetah.xml",
+    "ant": _ASSETS / "ant.xml",
+    "quadruped": scene_path("quadruped"),
+    "humanoid": _ASSETS / "humanoid.xml",
 }
+# Of `bench`: contacts that a state has room for, where that is faster; in these motions no more ever act.
+_ROOM = {"ant": 8, "humanoid": 12}
 _TOLERANCE = 1e-6
 _PATCHED_ITERATIONS = 10
 
@@ -97,6 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench.add_argument(
         "--runs", type=int, default=5, help="0 compiles and reports memory, which may exceed the machine's"
     )
+    bench.add_argument("--forward", action="store_true", help="leave out all gradients")
     bench.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
     bench.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
     bench.set_defaults(run=_bench)
@@ -155,17 +162,24 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
     ours = functools.partial(_outcome, scene, steps=options.steps)
-    cases = {
-        "mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps),
-        "mg.rollout": ours,
-        "mg value_and_grad": jax.value_and_grad(ours),
-        "mg value_and_grad, all kept": jax.value_and_grad(functools.partial(ours, checkpoint=False)),
-    }
+    cases = {"mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps), "mg.rollout": ours}
+    if name in _ROOM:
+        roomy = mg.load_scene(mj_model, max_contacts=_ROOM[name])
+        nearest = functools.partial(_outcome, roomy, steps=options.steps)
+        cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest
+        cases[f"mg value_and_grad, {_ROOM[name]} contacts"] = jax.value_and_grad(nearest)
+    cases["mg value_and_grad"] = jax.value_and_grad(ours)
+    cases["mg value_and_grad, all kept"] = jax.value_and_grad(functools.partial(ours, checkpoint=False))
+    if options.forward:
+        cases = {case: function for case, function in cases.items() if "grad" not in case}
     for case, function in cases.items():
         yield _time(case, mg.over_devices(function), states, options.runs)
-    if not options.skip_patched:
+    if not options.skip_patched and not options.forward:
         yield _patched(scene, states, options)
     if jax.default_backend() == "cpu" and options.runs:
+        if len(jax.devices()) == 1:
+            native = functools.partial(ours, engine="mujoco")
+            yield _time('mg.rollout, engine="mujoco"', jax.vmap(native), states, options.runs)
         yield _native(mj_model, states, options)
 
 
@@ -178,9 +192,8 @@ def _states(mj_model: mujoco.MjModel, batch: int) -> tuple[jax.Array, jax.Array]
     return jnp.asarray(np.tile(data.qpos, (batch, 1))), jnp.asarray(qvel)
 
 
-def _outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int, checkpoint: bool = True) -> jax.Array:
-    start = mg.initial_state(scene, *state)
-    final = mg.rollout(scene, start, horizon=steps, checkpoint=checkpoint).final
+def _outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int, **settings: Any) -> jax.Array:
+    final = mg.rollout(scene, mg.initial_state(scene, *state), horizon=steps, **settings).final
     return jnp.sum(final.qpos**2) + jnp.sum(final.qvel**2)
 
 
@@ -244,7 +257,7 @@ def _print(row: Row, base: Row, steps: int) -> None:
     span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
     memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
     print(
-        f"  {row.name:28s} {row.median * 1e3:9.1f} ms {span}"
+        f"  {row.name:32s} {row.median * 1e3:9.1f} ms {span}"
         f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / base.median:6.2f} of mjx.step"
         f"  compile {row.compilation:5.1f} s {memory}",
         flush=True,
