@@ -9,7 +9,7 @@ the compiled program besides its arguments.
 - `mg.rollout`: our step, lean carry; on scenes with many contacts that could be, also with room for the nearest alone.
 - `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
-- `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it; `C MuJoCo`: `mujoco.rollout` itself; on as many threads as there are cores.
+- `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
 
 With `--per-core` every core is a device of its own, and each row of JAX's, MJX's included, is split over them by
 `mg.over_devices`.
