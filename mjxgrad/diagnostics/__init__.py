@@ -5,7 +5,7 @@ from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compar
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
-from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, unused
+from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, contacts_needed, unused
 from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
@@ -36,6 +36,7 @@ __all__ = [
     "check_stability",
     "compare",
     "compare_to_slope",
+    "contacts_needed",
     "crossover",
     "derivative_against_slope",
     "empirical_bias",

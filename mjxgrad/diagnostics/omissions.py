@@ -173,6 +173,28 @@ def unused(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01, lim
     return LeaveOut(pairs=pairs, limits=tuple(filter(None, joints)))
 
 
+def contacts_needed(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01) -> int:
+    """Count the contacts that recorded motions came near at once, for `max_contacts` of `load_scene`.
+
+    It is a guess about other motions, and `Trajectory.crowded` tells where it was too few. Arguments are those of `unused`.
+
+    Returns:
+        The largest number in any state, of those of one friction dimension; at least 1.
+
+    Raises:
+        ValueError: as `check_omissions`.
+    """
+    full = scene.to_mujoco()
+    qpos, _, _ = _rollouts(full, trajectory)
+    full.geom_margin[:] += clearance / 2  # margins of a pair are added
+    data, most = mujoco.MjData(full), 1
+    for position in qpos.reshape(-1, full.nq):
+        data.qpos[:] = position
+        mujoco.mj_fwdPosition(full, data)
+        most = max(most, *np.bincount(data.contact.dim, minlength=1).tolist())
+    return most
+
+
 def without_omissions(scene: Scene, full: mujoco.MjModel) -> mujoco.MjModel:
     """Give the full C model without what the scene leaves out of its constraints."""
     lean = copy.deepcopy(full)

@@ -140,6 +140,17 @@ def test_what_came_near_is_not_proposed():
     assert ("floor", "ball") not in mg.diagnostics.unused(full, trajectory, clearance=0.32).pairs
 
 
+def test_contacts_that_came_near_at_once_are_counted():
+    """A box falls flat from 5 cm, for three steps of 2 ms: no farther than 0.2 mm."""
+    scene = mg.load_scene(
+        """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .15"><freejoint/>
+        <geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+    )
+    trajectory = jax.jit(lambda: mg.rollout(scene, mg.initial_state(scene), horizon=3))()
+    assert mg.diagnostics.contacts_needed(scene, trajectory, clearance=0.051) == 4
+    assert mg.diagnostics.contacts_needed(scene, trajectory, clearance=0.049) == 1
+
+
 def test_states_after_a_divergence_are_not_looked_at():
     scene = mg.load_scene(SCENE, leave_out=FLOOR)
     trajectory = _recorded(scene, [[0.0, 0.0]], [[0.0, 0.0]], horizon=20)
