@@ -1,7 +1,6 @@
 """How fast, against what, and in how much memory: `make bench`, `make costs`, `make throughput`.
 
-Everything of one benchmark is measured in one process on the same work. Compilation is apart. Memory is what XLA sets aside for
-the compiled program besides its arguments.
+Each in one process on the same work, compilation apart. Memory is what XLA sets aside for a program besides its arguments.
 
 `bench`: steps and gradients on the same scene, batch and number of steps; each row is the median of several runs, with the range.
 
@@ -11,8 +10,7 @@ the compiled program besides its arguments.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
 - `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
 
-With `--per-core` every core is a device of its own, and each row of JAX's, MJX's included, is split over them by
-`mg.over_devices`.
+With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
 `costs`: what continuous onset, the event gradient and smoothing cost, as ratios to the plain step and its gradient. Every case is
 compiled first; then all take turns, so that a change of the machine's load meets all alike.
@@ -53,7 +51,7 @@ _SCENES = {
     "humanoid": _ASSETS / "humanoid.xml",
 }
 # Of `bench`: contacts that a state has room for, where that is faster; in these motions no more ever act.
-_ROOM = {"ant": 8, "humanoid": 12}
+_ROOM = {"ant": 8, "quadruped": 8, "humanoid": 12}
 _TOLERANCE = 1e-6
 _PATCHED_ITERATIONS = 10
 
@@ -161,13 +159,14 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
-    ours = functools.partial(_outcome, scene, steps=options.steps)
+    ours, is_cpu = functools.partial(_outcome, scene, steps=options.steps), jax.default_backend() == "cpu"
     cases = {"mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps), "mg.rollout": ours}
     if name in _ROOM:
-        roomy = mg.load_scene(mj_model, max_contacts=_ROOM[name])
-        nearest = functools.partial(_outcome, roomy, steps=options.steps)
+        nearest = functools.partial(_outcome, mg.load_scene(mj_model, max_contacts=_ROOM[name]), steps=options.steps)
         cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest
         cases[f"mg value_and_grad, {_ROOM[name]} contacts"] = jax.value_and_grad(nearest)
+    if is_cpu and len(jax.devices()) == 1:
+        cases['mg.rollout, engine="mujoco"'] = functools.partial(ours, engine="mujoco")
     cases["mg value_and_grad"] = jax.value_and_grad(ours)
     cases["mg value_and_grad, all kept"] = jax.value_and_grad(functools.partial(ours, checkpoint=False))
     if options.forward:
@@ -176,10 +175,7 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
         yield _time(case, mg.over_devices(function), states, options.runs)
     if not options.skip_patched and not options.forward:
         yield _patched(scene, states, options)
-    if jax.default_backend() == "cpu" and options.runs:
-        if len(jax.devices()) == 1:
-            native = functools.partial(ours, engine="mujoco")
-            yield _time('mg.rollout, engine="mujoco"', jax.vmap(native), states, options.runs)
+    if is_cpu and options.runs:
         yield _native(mj_model, states, options)
 
 

@@ -338,7 +338,6 @@ def _friction(num_points: int) -> Jumps:
 _NUM_STEPS = 15  # of 2 ms: the body is still in contact, or has just left it
 # Of the outcome's largest jump near the start; smaller ones are teeth of the time step.
 _SMALLEST_RISE = 1e-3
-
 # A peg and a hole, whose contact is told by boxes, by points on the peg alone, or by points on both.
 TILT = 0.1  # rad
 _LENGTH = 0.04  # m, half length of the peg
