@@ -78,12 +78,12 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def slot_geoms(model: mjx.Model, data: mjx.Data) -> Int[np.ndarray, "contacts 2"] | None:
     """Return the two geoms of each contact slot; None where it is decided at run time who gets a slot."""
-    every = _candidates(model)
+    every = candidates(model)
     found = np.concatenate([np.zeros((0, 2), int), *(every[dim] for dim in sorted(every))])
     return found if len(found) == len(data._impl.contact.dim) else None
 
 
-def _candidates(model: mjx.Model) -> dict[int, np.ndarray]:
+def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
     """Return the two geoms of each contact that there could be, by dimension."""
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
@@ -96,7 +96,7 @@ def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
     """Return the distance, less the margin, from which a contact may have found no slot (m); infinite if all have one."""
     contact, gap = data._impl.contact, data._impl.contact.dist - data._impl.contact.includemargin
     slots = {dim: np.flatnonzero(np.asarray(contact.dim) == dim) for dim in np.unique(contact.dim)}
-    crowded = [gap[of_dim].max() for dim, of_dim in slots.items() if len(of_dim) < len(_candidates(model)[dim])]
+    crowded = [gap[of_dim].max() for dim, of_dim in slots.items() if len(of_dim) < len(candidates(model)[dim])]
     return jnp.min(jnp.stack(crowded)) if crowded else jnp.asarray(jnp.inf, data.qpos.dtype)
 
 
