@@ -160,7 +160,10 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
     ours, is_cpu = functools.partial(_outcome, scene, steps=options.steps), jax.default_backend() == "cpu"
-    cases = {"mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps), "mg.rollout": ours}
+    cases: dict[str, Callable] = {
+        "mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps),
+        "mg.rollout": ours,
+    }
     if name in _ROOM:
         nearest = functools.partial(_outcome, mg.load_scene(mj_model, max_contacts=_ROOM[name]), steps=options.steps)
         cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest

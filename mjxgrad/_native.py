@@ -78,9 +78,9 @@ class _Threads:
             # Numbers that are not finite are seen in the result; MuJoCo would write them into a file.
             mujoco.set_mju_user_warning(lambda _: None)
             try:
-                found, _ = self.pool.rollout(models, self.data, initial, flat(controls).astype(float))
+                found = self.pool.rollout(models, self.data, initial, flat(controls).astype(float))[0]
             finally:
                 mujoco.set_mju_user_warning(None)
         ends = np.cumsum([x.shape[-1] for x in start])
-        pieces = zip(np.split(found, ends, axis=2)[1 : len(start)], start[1:], strict=True)
+        pieces = zip(np.split(np.asarray(found), ends, axis=2)[1 : len(start)], start[1:], strict=True)
         return tuple(piece.reshape(*batch, *piece.shape[1:]).astype(x.dtype) for piece, x in pieces)
