@@ -12,8 +12,7 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
-`costs`: what continuous onset, the event gradient and smoothing cost, as ratios to the plain step and its gradient. Every case is
-compiled first; then all take turns, so that a change of the machine's load meets all alike.
+`costs`: onset, event gradient and smoothing over the plain step and its gradient; all take turns, so that load meets all alike.
 
 `throughput`: ten stiffness values × 1000 samples × three estimators on `ball_wall`, once with the softness as an argument of one
 compiled program and once as ten programs, as ten runs of a script would make them. Nothing is read from a compilation cache.
@@ -160,10 +159,8 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
     scene = mg.load_scene(mj_model)
     states = _states(mj_model, options.batch)
     ours, is_cpu = functools.partial(_outcome, scene, steps=options.steps), jax.default_backend() == "cpu"
-    cases: dict[str, Callable] = {
-        "mjx.step": functools.partial(_mjx_outcome, scene, steps=options.steps),
-        "mg.rollout": ours,
-    }
+    theirs = functools.partial(_mjx_outcome, scene, steps=options.steps)
+    cases: dict[str, Callable] = {"mjx.step": theirs, "mg.rollout": ours}
     if name in _ROOM:
         nearest = functools.partial(_outcome, mg.load_scene(mj_model, max_contacts=_ROOM[name]), steps=options.steps)
         cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest
