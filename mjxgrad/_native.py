@@ -14,8 +14,6 @@ from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of, with_numbers
 
 _Sequences = tuple[Float[Array, "horizon nq"], Float[Array, "horizon nv"], Float[Array, "horizon na"]]
-
-
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
