@@ -136,6 +136,14 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
+def bounds(layout: RowLayout, rows: Rows) -> tuple[_PerRow, _PerRow]:
+    """Return least and largest force of rows that stand for themselves without noise: where it lies between, it is -D x."""
+    bound, one_sided = rows.bound[layout.friction], jnp.zeros_like(rows.bound[layout.friction.stop :])
+    equality = jnp.full_like(rows.bound[: layout.num_equality], jnp.inf)
+    low = jnp.concatenate([-equality, -bound, one_sided])
+    return low, jnp.concatenate([equality, bound, jnp.full_like(one_sided, jnp.inf)])
+
+
 class Bend(eqx.Module):
     """The second derivative of the cost by x: of rows that stand for themselves, and a matrix for each elliptic contact."""
 

@@ -20,6 +20,7 @@ the rounding errors of a poor start.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, hessian, linear
+from mjxgrad.dynamics import constraint, hessian, linear, on_gpu
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 from mjxgrad.dynamics.kinematics import Inertia
@@ -209,6 +210,24 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     number is one more than `max_iterations` where these, or the digits of this precision, were too few.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
+    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.fits(layout.num_rows, len(start)) and on_gpu.has_kernels():
+        # The program may yet be compiled for the CPU beside the GPU.
+        return jax.lax.platform_dependent(
+            system,
+            start,
+            tolerance,
+            cuda=functools.partial(_in_one_kernel, layout, max_iterations),
+            default=functools.partial(_in_turns, layout, max_iterations),
+        )
+    return _in_turns(layout, max_iterations, system, start, tolerance)
+
+
+def _in_one_kernel(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar, interpret=False) -> _Result:
+    jacobian = jnp.where(system.is_active[:, None], system.map.matrix(), 0.0)
+    return on_gpu.minimise(layout, max_iterations, system.inertia.matrix, system.force, jacobian, system.rows, start, tolerance, interpret=interpret)
+
+
+def _in_turns(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
     batch, problem = start.shape[1:], system.problem()
     solver = _Solver(layout, problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
