@@ -63,7 +63,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
         block = rows.joined(blocks)
         reference, weight = rows.law(model, data.qvel, block)
         fields = {
-            "J": jnp.where(block.is_active[:, None], block.map.matrix(), 0.0),
+            "J": jnp.where(block.is_active[:, None], block.map.matrix(model.nv), 0.0),
             "D": weight,
             "aref": reference,
             "frictionloss": block.friction_loss,

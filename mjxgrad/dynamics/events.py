@@ -146,7 +146,7 @@ def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contact
     for block in blocks:
         if not block.rows_each:
             continue
-        matrix = block.map.matrix()
+        matrix = block.map.matrix(model.nv)
         jacobian = matrix.reshape(-1, block.rows_each, matrix.shape[1])
         distance.append(block.residual[:: block.rows_each])
         normal.append(jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0])

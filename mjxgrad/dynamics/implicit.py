@@ -123,7 +123,7 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
         return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
 
     def run(system, bend, force):
-        problem = system.problem()
+        problem = system.problem(layout)
         return hessian.solve(problem.mass, problem.jacobian, layout, bend, force)[0]
 
     def run_where(system, bend, force, is_needed):

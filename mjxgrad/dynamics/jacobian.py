@@ -77,9 +77,9 @@ class RowMap(eqx.Module):
         """Return μ of each tangent of a pyramid, one array per group; None where there is none."""
         return [None] * len(self.groups)
 
-    @abc.abstractmethod
-    def matrix(self) -> Float[Array, "rows nv"]:
+    def matrix(self, num_dofs: int) -> Float[Array, "rows nv *batch"]:
         """Return J."""
+        return dense(self.groups, self.directions(), self.tilts(), num_dofs)
 
 
 class DenseRows(RowMap):
@@ -108,9 +108,6 @@ class DenseRows(RowMap):
             start += group.num_rows
         return pieces
 
-    def matrix(self):
-        return self.entries
-
 
 class SlotRows(RowMap):
     """Rows of contacts of one dimension between bodies that are known at run time: entries and, of pyramids, μ of tangents."""
@@ -135,9 +132,6 @@ class SlotRows(RowMap):
     def tilts(self):
         return [self.friction]
 
-    def matrix(self):
-        return flat(edges(self.entries, None if self.friction is None else self.friction[:, :, None]))
-
 
 class AxisRows(RowMap):
     """Rows of one joint velocity each, `dofs` of all `num_dofs`, with entries `sign`."""
@@ -158,10 +152,6 @@ class AxisRows(RowMap):
 
     def directions(self):
         return [self.sign[:, None, None]]
-
-    def matrix(self):
-        selection = _selection(self.dofs, self.num_dofs)
-        return self.sign[:, None] * selection.reshape(*selection.shape, *(1,) * (self.sign.ndim - 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,13 +270,6 @@ class ContactRows(RowMap):
     def tilts(self):
         return [None if self.friction is None else self.friction[start:stop] for start, stop, _ in self._runs()]
 
-    def matrix(self):
-        rows = []
-        for entries, group, tilt in zip(self.directions(), self.groups, self.tilts(), strict=True):
-            own = edges(_spread(entries, group.dofs, len(self.axes)), None if tilt is None else tilt[:, :, None])
-            rows.append(own.reshape(group.num_rows, *own.shape[2:]))
-        return jnp.concatenate(rows)
-
 
 class JoinedRows(RowMap):
     """Rows of several maps, one after the other."""
@@ -320,8 +303,23 @@ class JoinedRows(RowMap):
     def tilts(self):
         return [tilt for part in self.parts for tilt in part.tilts()]
 
-    def matrix(self):
-        return jnp.concatenate([part.matrix() for part in self.parts])
+
+def dense(
+    groups: Sequence[Group],
+    pieces: Sequence[Float[Array, "num dim dofs *batch"]],
+    tilts: Sequence[Float[Array, "num tangents *batch"] | None],
+    num_dofs: int,
+) -> Float[Array, "rows nv *batch"]:
+    """Return J from its entries, group by group."""
+    rows = []
+    for group, entries, tilt in zip(groups, pieces, tilts, strict=True):
+        if group.is_diagonal:
+            selection = _selection(group.dofs, num_dofs)
+            own = entries[:, 0] * selection.reshape(*selection.shape, *(1,) * (entries.ndim - 3))
+        else:
+            own = edges(_spread(entries, group.dofs, num_dofs), None if tilt is None else tilt[:, :, None])
+        rows.append(own.reshape(group.num_rows, num_dofs, *entries.shape[3:]))
+    return jnp.concatenate(rows)
 
 
 def edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:

@@ -19,9 +19,11 @@ The gradient is formed afresh in each iteration rather than updated along the li
 the rounding errors of a poor start.
 """
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,6 +38,7 @@ from mjxgrad.dynamics.kinematics import Inertia
 from mjxgrad.dynamics.sparse import SparseRows
 
 _Vector = Float[Array, "nv *batch"]
+_PerRow = Float[Array, "rows *batch"]
 _Scalar = Float[Array, "*batch"]
 _Truth = Bool[Array, "*batch"]
 _Result = tuple[_Vector, Int[Array, "*batch"]]
@@ -122,26 +125,61 @@ class System(eqx.Module):
         rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
         return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
 
-    def problem(self) -> "Problem":
+    def problem(self, layout: RowLayout) -> "Entries":
         """Return the same with entries; arrays may carry the batch as trailing axes here."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return Problem(self.inertia.matrix, self.force, jacobian, self.rows)
+        return Entries(self.force, self.rows, self.inertia.matrix, jacobian, layout)
 
 
 class Problem(eqx.Module):
-    """A system whose M and J are entries. Arrays may carry the batch as trailing axes."""
+    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's kernel."""
 
-    mass: Float[Array, "nv nv *batch"]
     force: _Vector
-    jacobian: SparseRows
     rows: Rows
 
-    def at(self, layout: RowLayout, acceleration: _Vector) -> "Point":
+    @abc.abstractmethod
+    def weigh(self, acceleration: _Vector) -> _Vector:
+        """Return M a."""
+
+    @abc.abstractmethod
+    def rates(self, acceleration: _Vector) -> _PerRow:
+        """Return J a."""
+
+    @abc.abstractmethod
+    def pull(self, force: _PerRow) -> _Vector:
+        """Return Jᵀ f."""
+
+    @abc.abstractmethod
+    def push(self, x: _PerRow) -> _PerRow:
+        """Return the forces of the rows."""
+
+    @abc.abstractmethod
+    def bent(self, x: _PerRow, along: _PerRow) -> _PerRow:
+        """Return the second derivative of the cost by x, times a vector."""
+
+    @abc.abstractmethod
+    def newton(self, point: "Point") -> tuple[_Vector, _Vector]:
+        """Return H⁻¹ times the gradient, not finite where H is not positive definite, and the diagonal of H."""
+
+    @property
+    @abc.abstractmethod
+    def diagonal(self) -> _Vector:
+        """The diagonal of M, positive."""
+
+    @property
+    @abc.abstractmethod
+    def is_piecewise_quadratic(self) -> bool:
+        """Whether the cost along a line is."""
+
+    @abc.abstractmethod
+    def is_finite(self, vector: _Vector) -> _Truth:
+        """Return whether all of a vector is finite."""
+
+    def at(self, acceleration: _Vector) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = self.jacobian.matvec(acceleration) - self.rows.reference
-        row_force = constraint.force(layout, self.rows, x)
-        inertia = linear.matvec(self.mass, acceleration)
-        pull = self.jacobian.rmatvec(row_force)
+        x = self.rates(acceleration) - self.rows.reference
+        row_force = self.push(x)
+        inertia, pull = self.weigh(acceleration), self.pull(row_force)
         return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
 
     def rounding(self, point: "Point") -> _Scalar:
@@ -164,10 +202,98 @@ class Problem(eqx.Module):
         own, free = linear.dot(point.acceleration, point.inertia), linear.dot(self.force / self.diagonal, self.force)
         return self.rounding(point) <= _RESOLVED**2 * (own + free)
 
+
+class Entries(Problem):
+    """A problem whose M and J are entries."""
+
+    mass: Float[Array, "nv nv *batch"]
+    jacobian: SparseRows
+    layout: RowLayout = eqx.field(static=True)
+
+    def weigh(self, acceleration):
+        return linear.matvec(self.mass, acceleration)
+
+    def rates(self, acceleration):
+        return self.jacobian.matvec(acceleration)
+
+    def pull(self, force):
+        return self.jacobian.rmatvec(force)
+
+    def push(self, x):
+        return constraint.force(self.layout, self.rows, x)
+
+    def bent(self, x, along):
+        return constraint.curvature_product(self.layout, self.rows, x, along[:, None])[:, 0]
+
+    def newton(self, point):
+        bend = constraint.bend(self.layout, self.rows, point.x)
+        return hessian.solve(self.mass, self.jacobian, self.layout, bend, point.gradient)
+
     @property
-    def diagonal(self) -> _Vector:
-        """The diagonal of M, positive."""
+    def diagonal(self):
         return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
+
+    @property
+    def is_piecewise_quadratic(self):
+        return self.layout.is_piecewise_quadratic
+
+    def is_finite(self, vector):
+        return jnp.all(jnp.isfinite(vector), axis=0)
+
+
+class _InRegisters(Problem):
+    """A problem whose M and J a GPU's program keeps, and whose rows stand for themselves: their force is -D x between bounds."""
+
+    mass: Float[Array, "width width"]
+    jacobian: Float[Array, "height width"]
+    bounds: tuple[_PerRow, _PerRow]
+    refs: Any  # of the program's inputs: M, J
+
+    @classmethod
+    def load(cls, mass, jacobian, force, weight, reference, low, high) -> "_InRegisters":
+        """Return that of the program's state."""
+        entries = on_gpu.load(mass)
+        entries = jnp.where(on_gpu.eye(len(entries)) & (entries == 0.0), 1.0, entries)  # beyond the joint velocities
+        rows = Rows(on_gpu.load(reference), on_gpu.load(weight), on_gpu.load(low), ())
+        bounds = on_gpu.load(low), on_gpu.load(high)
+        return cls(on_gpu.load(force), rows, entries, on_gpu.load(jacobian), bounds, (mass, jacobian))
+
+    def weigh(self, acceleration):
+        return (self.mass * acceleration[None]).sum(axis=1)
+
+    def rates(self, acceleration):
+        return (self.jacobian * acceleration[None]).sum(axis=1)
+
+    def pull(self, force):
+        return (self.jacobian * force[:, None]).sum(axis=0)
+
+    def push(self, x):
+        force, (low, high) = -self.rows.weight * x, self.bounds
+        return jnp.where(force < low, low, jnp.where(force > high, high, force))
+
+    def curvature(self, x: _PerRow) -> _PerRow:
+        """Return the second derivative of the cost by x."""
+        force, (low, high) = -self.rows.weight * x, self.bounds
+        return jnp.where((force > low) & (force < high), self.rows.weight, 0.0)
+
+    def bent(self, x, along):
+        return self.curvature(x) * along
+
+    def newton(self, point):
+        mass, jacobian = self.refs
+        matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, self.curvature(point.x), jacobian)
+        return on_gpu.solve_blocks(matrix, point.gradient, mass.shape[0]), on_gpu.diagonal(matrix)
+
+    @property
+    def diagonal(self):
+        return jnp.maximum(jnp.where(on_gpu.eye(len(self.mass)), self.mass, 0.0).sum(axis=0), mujoco.mjMINVAL)
+
+    @property
+    def is_piecewise_quadratic(self):
+        return True
+
+    def is_finite(self, vector):
+        return (~(jnp.abs(vector) < jnp.inf)).astype(jnp.int32).sum() == 0
 
 
 class Point(eqx.Module):
@@ -210,26 +336,45 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     number is one more than `max_iterations` where these, or the digits of this precision, were too few.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
-    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.fits(layout.num_rows, len(start)) and on_gpu.has_kernels():
+    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(layout.num_rows, len(start)):
         # The program may yet be compiled for the CPU beside the GPU.
-        return jax.lax.platform_dependent(
-            system,
-            start,
-            tolerance,
-            cuda=functools.partial(_in_one_kernel, layout, max_iterations),
-            default=functools.partial(_in_turns, layout, max_iterations),
-        )
+        ways = (functools.partial(way, layout, max_iterations) for way in (in_one_kernel, _in_turns))
+        return jax.lax.platform_dependent(system, start, tolerance, cuda=next(ways), default=next(ways))
     return _in_turns(layout, max_iterations, system, start, tolerance)
 
 
-def _in_one_kernel(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar, interpret=False) -> _Result:
-    jacobian = jnp.where(system.is_active[:, None], system.map.matrix(), 0.0)
-    return on_gpu.minimise(layout, max_iterations, system.inertia.matrix, system.force, jacobian, system.rows, start, tolerance, interpret=interpret)
+def in_one_kernel(
+    layout: RowLayout,
+    max_iterations: int,
+    system: System,
+    start: Float[Array, "nv batch"],
+    tolerance: Float[Array, " batch"],
+    *,
+    interpret: bool = False,
+) -> _Result:
+    """Do what `minimise` does for rows that stand for themselves; `interpret` runs on any device, slowly."""
+    problem, size = system.problem(layout), len(start)
+    jacobian, rows = problem.jacobian.matrix(), problem.rows
+    smallest = tolerance**2 * linear.add(problem.diagonal)
+
+    def kernel(*refs):
+        *problem, start, smallest, acceleration, num_iterations = refs
+        solver = _Solver(_InRegisters.load(*problem), smallest[...], max_iterations)
+        first = solver.measure(on_gpu.load(start), jnp.array(False), jnp.int32(0))
+        acceleration[...], num_iterations[0] = solver.result(solver.run(first, 0))
+
+    inputs = problem.mass, jacobian, problem.force, rows.weight, rows.reference, *constraint.bounds(layout, rows), start
+    width, height = on_gpu.padded(size), on_gpu.padded(layout.num_rows)
+    found, count = on_gpu.run(
+        kernel, (*inputs, smallest), ((start.dtype, width), (jnp.int32, 1)), width * height, interpret=interpret
+    )
+    return found[:size], count[0]
 
 
 def _in_turns(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
-    batch, problem = start.shape[1:], system.problem()
-    solver = _Solver(layout, problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
+    """Do what `minimise` does, each operation for the whole batch."""
+    batch, problem = start.shape[1:], system.problem(layout)
+    solver = _Solver(problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
     # On a CPU, where it was measured.
     splits = jax.default_backend() == "cpu" and bool(batch) and batch[0] >= _LEAST_BATCH
@@ -257,13 +402,12 @@ def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], 
 class _Solver(eqx.Module):
     """The iteration for a batch of problems; `smallest` is the decrement at which a solve has converged."""
 
-    layout: RowLayout = eqx.field(static=True)
     problem: Problem
     smallest: _Scalar
     max_iterations: int = eqx.field(static=True)
 
     def measure(self, acceleration: _Vector, is_near: _Truth, num_iterations: Int[Array, "*batch"]) -> _Iterate:
-        return _Iterate(self.problem.at(self.layout, acceleration), is_near, num_iterations)
+        return _Iterate(self.problem.at(acceleration), is_near, num_iterations)
 
     def is_solved(self, state: _Iterate) -> _Truth:
         """Return who has converged."""
@@ -274,7 +418,7 @@ class _Solver(eqx.Module):
 
     def is_done(self, state: _Iterate) -> _Truth:
         """Return who does not move any more."""
-        is_broken = ~jnp.all(jnp.isfinite(state.point.gradient), axis=0)
+        is_broken = ~self.problem.is_finite(state.point.gradient)
         return self.is_solved(state) | is_broken | (state.num_iterations >= self.max_iterations)
 
     def run(self, state: _Iterate, num_left: int) -> _Iterate:
@@ -282,23 +426,25 @@ class _Solver(eqx.Module):
 
         def goes_on(state: _Iterate) -> Bool[Array, ""]:
             goes = ~self.is_done(state)
+            if not goes.ndim:
+                return goes
             return jnp.sum(goes) > num_left if num_left else jnp.any(goes)
 
         return jax.lax.while_loop(goes_on, lambda state: self.iterate(state), state)
 
     def iterate(self, state: _Iterate) -> _Iterate:
         """Take one step of Newton's method, those that are done excepted."""
-        layout, problem = self.layout, self.problem
-        point, stays = state.point, self.is_done(state)
-        bend = constraint.bend(layout, problem.rows, point.x)
-        solution, diagonal = hessian.solve(problem.mass, problem.jacobian, layout, bend, point.gradient)
+        problem, point = self.problem, state.point
+        # A single state is not done, or would not be here.
+        stays = self.is_done(state) if state.is_near.ndim else jnp.zeros_like(state.is_near)
+        solution, diagonal = problem.newton(point)
         newton = -solution
         # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
         scaled = -point.gradient / diagonal
-        direction = jnp.where(jnp.all(jnp.isfinite(newton), axis=0), newton, scaled)
+        direction = jnp.where(problem.is_finite(newton), newton, scaled)
         decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
         noise = jnp.sqrt(jnp.maximum(decrement, 0.0) * floor)
-        length = _line_search(layout, problem, point, direction, noise, stays)
+        length = _line_search(problem, point, direction, noise, stays)
         moved = jnp.where(stays, point.acceleration, point.acceleration + length * direction)
         is_near = state.is_near | ~stays & ((decrement < self.smallest) | (decrement <= _LAST * floor))
         return self.measure(moved, is_near, state.num_iterations + ~stays)
@@ -306,7 +452,7 @@ class _Solver(eqx.Module):
     def result(self, state: _Iterate) -> _Result:
         """Return what `minimise` does."""
         # Non-finite forces or rows have no minimiser: the start must not pass for one.
-        is_sound = jnp.all(jnp.isfinite(state.point.gradient), axis=0)
+        is_sound = self.problem.is_finite(state.point.gradient)
         finished = self.is_solved(state) & self.problem.is_resolved(state.point)
         num_iterations = jnp.where(finished, state.num_iterations, self.max_iterations + 1)
         return jnp.where(is_sound, state.point.acceleration, jnp.nan), num_iterations
@@ -325,25 +471,23 @@ class _Search(eqx.Module):
 
 
 def _line_search(
-    layout: RowLayout, problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth
+    problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth
 ) -> _Scalar:
     """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers it.
 
     `noise` is the size of the slope by rounding alone; for those who are done the answer does not matter.
     """
-    along = problem.jacobian.matvec(direction)
+    along = problem.rates(direction)
     smooth_slope = linear.dot(direction, point.inertia - problem.force)
-    smooth_curvature = linear.dot(direction, linear.matvec(problem.mass, direction))
+    smooth_curvature = linear.dot(direction, problem.weigh(direction))
     start = linear.dot(point.gradient, direction)
     flat = jnp.maximum(_LINE_TOLERANCE * jnp.abs(start), noise)
 
     def improve(search: _Search) -> _Search:
         length = search.length
         x = point.x + length * along
-        bend = constraint.curvature_product(layout, problem.rows, x, along[:, None])[:, 0]
-        forces = constraint.force(layout, problem.rows, x)
-        value = smooth_slope + length * smooth_curvature - linear.dot(forces, along)
-        curvature = smooth_curvature + linear.dot(bend, along)
+        value = smooth_slope + length * smooth_curvature - linear.dot(problem.push(x), along)
+        curvature = smooth_curvature + linear.dot(problem.bent(x, along), along)
         low, high = jnp.where(value < 0, length, search.low), jnp.where(value < 0, search.high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
         inside = (newton >= low) & (newton <= high)
@@ -352,10 +496,10 @@ def _line_search(
     # The inertial part alone bounds the root from above: the rows only add to the slope's growth.
     high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
-    if layout.is_piecewise_quadratic:
+    if problem.is_piecewise_quadratic:
         # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA
         # writes each step out again wherever the next one uses its length.
-        unroll = jax.default_backend() != "cpu"
+        unroll = jax.default_backend() != "cpu" and start.ndim > 0
         search = jax.lax.fori_loop(0, _LINE_STEPS, lambda _, s: improve(s), search, unroll=unroll)
     else:
         search = _until_flat(improve, search)

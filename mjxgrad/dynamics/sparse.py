@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjxgrad.dynamics import linear
 from mjxgrad.dynamics.constraint import Bend, RowLayout
-from mjxgrad.dynamics.jacobian import DenseRows, Group, RowMap, edges, flat, fold
+from mjxgrad.dynamics.jacobian import DenseRows, Group, RowMap, dense, edges, flat, fold
 
 _Entries = Float[Array, "num dim dofs *batch"]
 _Square = Float[Array, "dofs dofs *batch"]
@@ -35,7 +35,7 @@ class SparseRows(eqx.Module):
         """Return the entries of a map; rows that are not active are zero."""
         if len(rows.groups) > _MOST_GROUPS:
             rows = DenseRows(
-                rows.matrix(), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
+                rows.matrix(num_dofs), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
             )
         pieces, start = [], 0
         for group, entries in zip(rows.groups, rows.directions(), strict=True):
@@ -84,24 +84,23 @@ class SparseRows(eqx.Module):
             total = linear.add_to_block(total, group.dofs, square)
         return total
 
-    def curvatures(self, layout: RowLayout, bend: Bend) -> list[Float[Array, "num _ *batch"]]:
-        """Return s'' item by item, one array per group: of elliptic contacts the whole matrix, of others its diagonal.
+    def matrix(self) -> Float[Array, "rows nv *batch"]:
+        """Return J, zeros and all."""
+        return dense(self.groups, self.pieces, self.tilts, self.num_dofs)
 
-        Of pyramids, by their directions, the arrow: that of the normal, those that couple it with each tangent, those of the
-        tangents.
-        """
-        found, start = [], 0
-        for group, tilt in zip(self.groups, self.tilts, strict=True):
-            rows, batch = slice(start, start + group.num_rows), bend.simple.shape[1:]
-            start = rows.stop
-            if rows.start >= layout.simple_stop:
-                found.append(_cone_matrices(layout, bend, rows, group.num).reshape(group.num, -1, *batch))
-            elif tilt is None:
-                found.append(bend.simple[rows].reshape(group.num, group.dim, *batch))
-            else:
-                both, difference = _both_edges(bend.simple[rows].reshape(*tilt.shape[:2], 2, *batch), tilt)
-                found.append(jnp.concatenate([linear.sum_of_few(both), difference, tilt**2 * both], axis=1))
-        return found
+    def bent(
+        self, matrix: Float[Array, "rows nv *batch"], layout: RowLayout, bend: Bend
+    ) -> tuple[Float[Array, "rows *batch"], Float[Array, "rows nv *batch"] | None]:
+        """Return factors of the rows of J, and other rows, if need be: s'' J is the one times the other, or times J."""
+        if not layout.cones:
+            return bend.simple, None
+        parts = [matrix[: layout.simple_stop]]
+        for cone, square in zip(layout.cones, bend.cones, strict=True):
+            own = matrix[cone.start : cone.stop].reshape(cone.count, cone.dim, *matrix.shape[1:])
+            both = linear.add(square[:, :, k, None] * own[:, None, k] for k in range(cone.dim))
+            parts.append(both.reshape(-1, *matrix.shape[1:]))
+        factors = [bend.simple, jnp.ones_like(matrix[layout.simple_stop :, 0])]
+        return jnp.concatenate(factors), jnp.concatenate(parts)
 
 
 def _gram(left: _Entries, right: _Entries) -> _Square:

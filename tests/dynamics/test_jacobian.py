@@ -54,7 +54,7 @@ def _rows(cone):
         data = kinematics.com_pos(model, kinematics.kinematics(model, data))
         data = collide(model, kinematics.com_vel(model, kinematics.crb(model, data)))
         block = joined(assembly.gather(model, data))
-        return data, block, block.map.matrix()
+        return data, block, block.map.matrix(model.nv)
 
     data, block, matrix = jax.jit(prepare)(mjx.put_data(mj_model, mj_data))
     return model, data, block, np.asarray(matrix)
