@@ -132,10 +132,14 @@ class System(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's kernel."""
+    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program.
+
+    `diagonal` is that of M, positive.
+    """
 
     force: _Vector
     rows: Rows
+    diagonal: eqx.AbstractVar[_Vector]
 
     @abc.abstractmethod
     def weigh(self, acceleration: _Vector) -> _Vector:
@@ -160,11 +164,6 @@ class Problem(eqx.Module):
     @abc.abstractmethod
     def newton(self, point: "Point") -> tuple[_Vector, _Vector]:
         """Return H⁻¹ times the gradient, not finite where H is not positive definite, and the diagonal of H."""
-
-    @property
-    @abc.abstractmethod
-    def diagonal(self) -> _Vector:
-        """The diagonal of M, positive."""
 
     @property
     @abc.abstractmethod
@@ -247,6 +246,7 @@ class _InRegisters(Problem):
     mass: Float[Array, "width width"]
     jacobian: Float[Array, "height width"]
     bounds: tuple[_PerRow, _PerRow]
+    diagonal: _Vector
     refs: Any  # of the program's inputs: M, J
 
     @classmethod
@@ -256,7 +256,8 @@ class _InRegisters(Problem):
         entries = jnp.where(on_gpu.eye(len(entries)) & (entries == 0.0), 1.0, entries)  # beyond the joint velocities
         rows = Rows(on_gpu.load(reference), on_gpu.load(weight), on_gpu.load(low), ())
         bounds = on_gpu.load(low), on_gpu.load(high)
-        return cls(on_gpu.load(force), rows, entries, on_gpu.load(jacobian), bounds, (mass, jacobian))
+        diagonal = jnp.maximum(jnp.where(on_gpu.eye(len(entries)), entries, 0.0).sum(axis=0), mujoco.mjMINVAL)
+        return cls(on_gpu.load(force), rows, entries, on_gpu.load(jacobian), bounds, diagonal, (mass, jacobian))
 
     def weigh(self, acceleration):
         return (self.mass * acceleration[None]).sum(axis=1)
@@ -283,10 +284,6 @@ class _InRegisters(Problem):
         mass, jacobian = self.refs
         matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, self.curvature(point.x), jacobian)
         return on_gpu.solve_blocks(matrix, point.gradient, mass.shape[0]), on_gpu.diagonal(matrix)
-
-    @property
-    def diagonal(self):
-        return jnp.maximum(jnp.where(on_gpu.eye(len(self.mass)), self.mass, 0.0).sum(axis=0), mujoco.mjMINVAL)
 
     @property
     def is_piecewise_quadratic(self):
@@ -426,17 +423,21 @@ class _Solver(eqx.Module):
 
         def goes_on(state: _Iterate) -> Bool[Array, ""]:
             goes = ~self.is_done(state)
-            if not goes.ndim:
-                return goes
             return jnp.sum(goes) > num_left if num_left else jnp.any(goes)
 
-        return jax.lax.while_loop(goes_on, lambda state: self.iterate(state), state)
+        if state.is_near.ndim:
+            return jax.lax.while_loop(goes_on, lambda state: self.iterate(state, self.is_done(state)), state)
 
-    def iterate(self, state: _Iterate) -> _Iterate:
-        """Take one step of Newton's method, those that are done excepted."""
+        # In a program the question takes registers if asked of the carry.
+        def turn(carry: tuple[_Iterate, _Truth]) -> tuple[_Iterate, _Truth]:
+            state = self.iterate(carry[0], ~carry[1])
+            return state, ~self.is_done(state)
+
+        return jax.lax.while_loop(lambda carry: carry[1], turn, (state, ~self.is_done(state)))[0]
+
+    def iterate(self, state: _Iterate, stays: _Truth) -> _Iterate:
+        """Take one step of Newton's method, those that stay excepted."""
         problem, point = self.problem, state.point
-        # A single state is not done, or would not be here.
-        stays = self.is_done(state) if state.is_near.ndim else jnp.zeros_like(state.is_near)
         solution, diagonal = problem.newton(point)
         newton = -solution
         # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
