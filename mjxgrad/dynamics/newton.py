@@ -247,20 +247,11 @@ class _InRegisters(Problem):
     jacobian: Float[Array, "height width"]
     bounds: tuple[_PerRow, _PerRow]
     diagonal: _Vector
-    refs: Any  # of the program's inputs: M, J
-
-    @classmethod
-    def load(cls, mass, jacobian, force, weight, reference, low, high) -> "_InRegisters":
-        """Return that of the program's state."""
-        entries = on_gpu.load(mass)
-        entries = jnp.where(on_gpu.eye(len(entries)) & (entries == 0.0), 1.0, entries)  # beyond the joint velocities
-        rows = Rows(on_gpu.load(reference), on_gpu.load(weight), on_gpu.load(low), ())
-        bounds = on_gpu.load(low), on_gpu.load(high)
-        diagonal = jnp.maximum(jnp.where(on_gpu.eye(len(entries)), entries, 0.0).sum(axis=0), mujoco.mjMINVAL)
-        return cls(on_gpu.load(force), rows, entries, on_gpu.load(jacobian), bounds, diagonal, (mass, jacobian))
+    refs: tuple[Any, Any]  # M and J in memory
+    size: int = eqx.field(static=True)
 
     def weigh(self, acceleration):
-        return (self.mass * acceleration[None]).sum(axis=1)
+        return (self.mass * acceleration[:, None]).sum(axis=0)  # by symmetry; along a row it takes more registers
 
     def rates(self, acceleration):
         return (self.jacobian * acceleration[None]).sum(axis=1)
@@ -283,7 +274,7 @@ class _InRegisters(Problem):
     def newton(self, point):
         mass, jacobian = self.refs
         matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, self.curvature(point.x), jacobian)
-        return on_gpu.solve_blocks(matrix, point.gradient, mass.shape[0]), on_gpu.diagonal(matrix)
+        return on_gpu.solve_blocks(matrix, point.gradient, self.size), on_gpu.diagonal(matrix)
 
     @property
     def is_piecewise_quadratic(self):
@@ -354,16 +345,21 @@ def in_one_kernel(
     jacobian, rows = problem.jacobian.matrix(), problem.rows
     smallest = tolerance**2 * linear.add(problem.diagonal)
 
-    def kernel(*refs):
-        *problem, start, smallest, acceleration, num_iterations = refs
-        solver = _Solver(_InRegisters.load(*problem), smallest[...], max_iterations)
-        first = solver.measure(on_gpu.load(start), jnp.array(False), jnp.int32(0))
+    def kernel(mass, jacobian, *refs):
+        *vectors, smallest, acceleration, num_iterations = refs
+        force, weight, reference, low, high, diagonal, start = (ref[...] for ref in vectors)
+        rows, bounds = Rows(reference, weight, low, ()), (low, high)
+        problem = _InRegisters(force, rows, mass[...], jacobian[...], bounds, diagonal, (mass, jacobian), size)
+        solver = _Solver(problem, smallest[...], max_iterations)
+        first = solver.measure(start, jnp.array(False), jnp.int32(0))
         acceleration[...], num_iterations[0] = solver.result(solver.run(first, 0))
 
-    inputs = problem.mass, jacobian, problem.force, rows.weight, rows.reference, *constraint.bounds(layout, rows), start
+    mass = on_gpu.filled(problem.mass)
+    diagonal = jnp.maximum(linear.diagonal(mass), mujoco.mjMINVAL)
+    vectors = problem.force, rows.weight, rows.reference, *constraint.bounds(layout, rows), diagonal, start
     width, height = on_gpu.padded(size), on_gpu.padded(layout.num_rows)
     found, count = on_gpu.run(
-        kernel, (*inputs, smallest), ((start.dtype, width), (jnp.int32, 1)), width * height, interpret=interpret
+        kernel, (mass, jacobian, *vectors, smallest), ((start.dtype, width), (jnp.int32, 1)), width * height, interpret=interpret
     )
     return found[:size], count[0]
 

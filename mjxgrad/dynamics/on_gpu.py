@@ -16,14 +16,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-_Square = Float[Array, "width width"]
 _Part = Float[Array, " 16"]
 _Blocks = list[list[Float[Array, "16 16"]]]
 
 # Matrices are eliminated in blocks of so many columns: to take a row out of one a program adds up all of it.
 _BLOCK, _MOST_COLUMNS = 16, 32
 # Entries of J in the registers of one thread, threads of a warp, and entries for which there are registers.
-_EACH, _WARP, _MOST_ENTRIES = 64, 32, 4096
+_EACH, _WARP, _MOST_ENTRIES = 32, 32, 8192
 _MOST_ROWS = 1024
 
 
@@ -73,14 +72,13 @@ def solve(
         *refs, solution, on_diagonal = refs
         matrix = blocks(mass)
         if left is not None:
-            matrix = add_rows(matrix, refs[0], load(refs[1]), refs[2 if right is not None else 0])
+            matrix = add_rows(matrix, refs[0], refs[1][...], refs[2 if right is not None else 0])
         on_diagonal[...] = diagonal(matrix)
-        solution[...] = solve_blocks(matrix, load(vector), mass.shape[0])
+        solution[...] = solve_blocks(matrix, vector[...], size)
 
-    inputs = [x for x in (mass, vector, left, scale, right) if x is not None]
-    kinds = (vector.dtype, padded(len(vector))), (vector.dtype, padded(len(vector)))
-    found = run(kernel, inputs, kinds, interpret=interpret)
-    return found[0][: len(vector)], found[1][: len(vector)]
+    size, inputs = len(vector), [x for x in (filled(mass), vector, left, scale, right) if x is not None]
+    found = run(kernel, inputs, [(vector.dtype, padded(size))] * 2, interpret=interpret)
+    return found[0][:size], found[1][:size]
 
 
 def run(
@@ -93,13 +91,14 @@ def run(
 ) -> list[Array]:
     """Run a program for every state on its part of the inputs, and return its outputs, of these types and lengths.
 
-    It has registers for so many entries.
+    The inputs are filled up with zeros to powers of two: neighbours in memory can then be read at once, and are kept by one
+    thread. The program has registers for so many entries.
     """
     # Imported here: no other device needs it, and it takes half a second.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    inputs = [jnp.moveaxis(x, -1, 0) for x in inputs]
+    inputs = [jnp.moveaxis(_padded_to(x, [padded(size) for size in x.shape[:-1]]), -1, 0) for x in inputs]
     shapes = [jax.ShapeDtypeStruct((len(inputs[0]), length), dtype) for dtype, length in outputs]
 
     def of_one(x) -> pallas.BlockSpec:
@@ -117,46 +116,31 @@ def run(
     return [jnp.moveaxis(x, 0, -1) for x in found]
 
 
-def load(ref: Any, fill: float = 0.0) -> Array:
-    """Return an array of a kernel's inputs, filled up to padded lengths."""
-    index, is_inside = [], True
-    for axis, size in enumerate(ref.shape):
-        place = jnp.arange(padded(size), dtype=jnp.int32)
-        place = place.reshape([-1 if axis == other else 1 for other in range(len(ref.shape))])
-        index.append(jnp.minimum(place, size - 1))
-        is_inside &= place < size
-    return jnp.where(is_inside, ref[tuple(index)], fill)
+def _padded_to(x: Float[Array, "*shape batch"], shape: Sequence[int]) -> Array:
+    return jnp.pad(x, [*((0, wanted - size) for wanted, size in zip(shape, x.shape[:-1], strict=True)), (0, 0)])
 
 
-def eye(size: int) -> _Square:
-    """Return the unit matrix, as truths."""
-    index = jnp.arange(size, dtype=jnp.int32)
-    return index[:, None] == index[None]
+def filled(matrix: Float[Array, "n n batch"]) -> Float[Array, "width width batch"]:
+    """Return a matrix filled up by a unit matrix."""
+    size, width = len(matrix), padded(len(matrix))
+    beyond = jnp.diag(jnp.arange(width) >= size).astype(matrix.dtype)
+    return _padded_to(matrix, (width, width)) + beyond[:, :, None]
 
 
 def blocks(ref: Any) -> _Blocks:
-    """Return a symmetric matrix in blocks, on and above its diagonal, filled up by a unit matrix."""
-    size, index = ref.shape[0], jnp.arange(_BLOCK, dtype=jnp.int32)
-
-    def block(b: int, c: int) -> Array:
-        row, column = b * _BLOCK + index[:, None], c * _BLOCK + index[None]
-        entries = ref[jnp.minimum(row, size - 1), jnp.minimum(column, size - 1)]
-        return jnp.where((row < size) & (column < size), entries, jnp.where(row == column, 1.0, 0.0).astype(entries.dtype))
-
-    return _above(-(-size // _BLOCK), block)
+    """Return a symmetric matrix in blocks, on and above its diagonal."""
+    return _above(ref.shape[0] // _BLOCK, lambda b, c: ref[b * _BLOCK : (b + 1) * _BLOCK, c * _BLOCK : (c + 1) * _BLOCK])
 
 
 def add_rows(matrix: _Blocks, left: Any, scale: Float[Array, " rows"], right: Any) -> _Blocks:
     """Return a matrix plus Σ scale left rightᵀ, the sum over rows of two inputs, those alone whose scale is not zero."""
-    index, number = jnp.arange(_BLOCK, dtype=jnp.int32), jnp.arange(len(scale), dtype=jnp.int32)
-    size = left.shape[1]
+    number = jnp.arange(len(scale), dtype=jnp.int32)
 
     def after(row: Array) -> Array:
         return jnp.where((scale != 0) & (number > row), number, len(scale)).min()
 
     def parts(ref: Any, row: Array) -> list[_Part]:
-        places = [b * _BLOCK + index for b in range(len(matrix))]
-        return [jnp.where(place < size, ref[row, jnp.minimum(place, size - 1)], 0.0) for place in places]
+        return [ref[row, b * _BLOCK : (b + 1) * _BLOCK] for b in range(len(matrix))]
 
     def add_row(carry):
         row, matrix = carry
@@ -205,7 +189,7 @@ def _solve(matrix: _Blocks, vector: list[_Part], size: int) -> list[_Part]:
         return [_eliminate(matrix[0][0], vector[0], size)]
     product, others = functools.partial(jnp.dot, precision="highest"), range(1, len(vector))
     inverse = _inverse(matrix[0][0])
-    first = (inverse * vector[0][None]).sum(axis=1)
+    first = (inverse * vector[0][:, None]).sum(axis=0)
     above = [product(inverse, matrix[0][c]) for c in others]
     rest = _above(len(others), lambda b, c: matrix[b + 1][c + 1] - product(matrix[0][b + 1].T, above[c]))
     left = [vector[b] - (matrix[0][b] * first[:, None]).sum(axis=0) for b in others]
@@ -249,5 +233,6 @@ def _inverse(matrix: Float[Array, "16 16"]) -> Float[Array, "16 16"]:
     return jax.lax.fori_loop(0, _BLOCK, eliminate, matrix)
 
 
-def _diagonal(matrix: _Square) -> Float[Array, " width"]:
-    return jnp.where(eye(len(matrix)), matrix, 0.0).sum(axis=1)
+def _diagonal(matrix: Float[Array, "16 16"]) -> _Part:
+    index = jnp.arange(_BLOCK, dtype=jnp.int32)
+    return jnp.where(index[:, None] == index[None], matrix, 0.0).sum(axis=1)
