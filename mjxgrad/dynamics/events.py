@@ -119,7 +119,7 @@ def correct(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
     """Return solved data with the tangents of a semi-implicit step's events added to acceleration and constraint force."""
     if not any(block.rows_each for block in blocks):
         return data
-    distance, normal = contacts_of(blocks)
+    distance, normal = contacts_of(blocks, model.nv)
     before = distance - model.opt.timestep * (normal @ data.qvel)
     change, system = _change(model, data, blocks, normal, data.qvel, before, distance, is_spread=False)
     change = change / model.opt.timestep
@@ -134,19 +134,19 @@ def impulse(model: mjx.Model, data: mjx.Data, blocks: list[Block], mean_velocity
     """
     if not any(block.rows_each for block in blocks):
         return jnp.zeros_like(data.qvel)
-    distance, normal = contacts_of(blocks)
+    distance, normal = contacts_of(blocks, model.nv)
     after = distance + model.opt.timestep * (normal @ mean_velocity)
     velocity = data.qvel + 0.5 * model.opt.timestep * data.qacc
     return _change(model, data, blocks, normal, velocity, distance, after, is_spread=True)[0]
 
 
-def contacts_of(blocks: list[Block]) -> tuple[_PerContact, Float[Array, "contacts nv"]]:
+def contacts_of(blocks: list[Block], num_dofs: int) -> tuple[_PerContact, Float[Array, "contacts nv"]]:
     """Return distance less margin, and normal row, of each contact and limit."""
     distance, normal = [], []
     for block in blocks:
         if not block.rows_each:
             continue
-        matrix = block.map.matrix(model.nv)
+        matrix = block.map.matrix(num_dofs)
         jacobian = matrix.reshape(-1, block.rows_each, matrix.shape[1])
         distance.append(block.residual[:: block.rows_each])
         normal.append(jnp.mean(jacobian, axis=1) if block.is_pyramid else jacobian[:, 0])

@@ -306,8 +306,8 @@ class JoinedRows(RowMap):
 
 def dense(
     groups: Sequence[Group],
-    pieces: Sequence[Float[Array, "num dim dofs *batch"]],
-    tilts: Sequence[Float[Array, "num tangents *batch"] | None],
+    pieces: Sequence[Float[Array, "_ _ _ *batch"]],
+    tilts: Sequence[Float[Array, "_ _ *batch"] | None],
     num_dofs: int,
 ) -> Float[Array, "rows nv *batch"]:
     """Return J from its entries, group by group."""

@@ -359,7 +359,11 @@ def in_one_kernel(
     vectors = problem.force, rows.weight, rows.reference, *constraint.bounds(layout, rows), diagonal, start
     width, height = on_gpu.padded(size), on_gpu.padded(layout.num_rows)
     found, count = on_gpu.run(
-        kernel, (mass, jacobian, *vectors, smallest), ((start.dtype, width), (jnp.int32, 1)), width * height, interpret=interpret
+        kernel,
+        (mass, jacobian, *vectors, smallest),
+        ((start.dtype, width), (jnp.int32, 1)),
+        width * height,
+        interpret=interpret,
     )
     return found[:size], count[0]
 
@@ -467,9 +471,7 @@ class _Search(eqx.Module):
     is_flat: _Truth
 
 
-def _line_search(
-    problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth
-) -> _Scalar:
+def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth) -> _Scalar:
     """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers it.
 
     `noise` is the size of the slope by rounding alone; for those who are done the answer does not matter.

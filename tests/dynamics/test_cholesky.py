@@ -7,14 +7,8 @@ import pytest
 
 from mjxgrad.dynamics import cholesky
 
-
-def _in_one_kernel(matrix, vector):
-    return cholesky.in_one_kernel(matrix, vector, interpret=jax.default_backend() != "gpu")[0]
-
-
 _WAYS = {
     "written out": cholesky.written_out,
-    "kernel": _in_one_kernel,
     "chosen": cholesky.cholesky_solve,
 }
 
@@ -42,15 +36,3 @@ def test_an_indefinite_member_is_not_finite_and_its_neighbour_is_right(way):
     found = jax.jit(way)(jnp.moveaxis(matrices, 0, -1), vectors.T)
     assert not np.isfinite(found[:, 0]).any()
     np.testing.assert_allclose(found[:, 1], np.linalg.solve(matrices[1], vectors[1]), rtol=1e-10)
-
-
-@pytest.mark.skipif(
-    jax.__version_info__ >= (0, 11) and jax.default_backend() != "gpu",
-    reason="from 0.11 on JAX lowers GPU kernels only where there is a GPU",
-)
-def test_a_gpu_is_given_one_kernel_and_the_cpu_beside_it_none(monkeypatch):
-    monkeypatch.setattr(cholesky, "has_kernels", lambda: True)
-    matrices, vectors = _systems(5, 4)
-    traced = jax.jit(cholesky.cholesky_solve).trace(jnp.moveaxis(matrices, 0, -1), vectors.T)
-    count = {name: traced.lower(lowering_platforms=(name,)).as_text().count("gpu.triton") for name in ("cuda", "cpu")}
-    assert count == {"cuda": 1, "cpu": 0}
