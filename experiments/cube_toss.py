@@ -263,7 +263,7 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
     blocks = assembly.gather(model, after.replace(qpos=before.qpos))
     if not any(block.rows_each for block in blocks):
         return jnp.zeros((), bool)
-    distance, normal = contacts_of(blocks)
+    distance, normal = contacts_of(blocks, model.nv)
     later = distance + model.opt.timestep * normal @ after.qvel
     return jnp.any((distance < 0) != (later < 0))
 

@@ -132,14 +132,10 @@ class System(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program.
-
-    `diagonal` is that of M, positive.
-    """
+    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program."""
 
     force: _Vector
     rows: Rows
-    diagonal: eqx.AbstractVar[_Vector]
 
     @abc.abstractmethod
     def weigh(self, acceleration: _Vector) -> _Vector:
@@ -164,6 +160,11 @@ class Problem(eqx.Module):
     @abc.abstractmethod
     def newton(self, point: "Point") -> tuple[_Vector, _Vector]:
         """Return H⁻¹ times the gradient, not finite where H is not positive definite, and the diagonal of H."""
+
+    @property
+    @abc.abstractmethod
+    def diagonal(self) -> _Vector:
+        """The diagonal of M, positive."""
 
     @property
     @abc.abstractmethod
@@ -246,7 +247,7 @@ class _InRegisters(Problem):
     mass: Float[Array, "width width"]
     jacobian: Float[Array, "height width"]
     bounds: tuple[_PerRow, _PerRow]
-    diagonal: _Vector
+    on_diagonal: _Vector
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
 
@@ -275,6 +276,10 @@ class _InRegisters(Problem):
         mass, jacobian = self.refs
         matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, self.curvature(point.x), jacobian)
         return on_gpu.solve_blocks(matrix, point.gradient, self.size), on_gpu.diagonal(matrix)
+
+    @property
+    def diagonal(self):
+        return self.on_diagonal
 
     @property
     def is_piecewise_quadratic(self):

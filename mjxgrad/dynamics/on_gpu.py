@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mjxgrad.dynamics import linear
+
 _Part = Float[Array, " 16"]
 _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
 
@@ -168,7 +170,7 @@ def join(parts: list[_Part]) -> Float[Array, " width"]:
     if len(parts) == 1:
         return parts[0]
     index = jnp.arange(padded(len(parts) * _BLOCK), dtype=jnp.int32)[:, None]
-    return sum(jnp.where(_is_part(index, b), part[None], 0.0).sum(axis=1) for b, part in enumerate(parts))
+    return linear.add(jnp.where(_is_part(index, b), part[None], 0.0).sum(axis=1) for b, part in enumerate(parts))
 
 
 def _part(vector: Float[Array, " width"], number: int) -> _Part:
@@ -196,7 +198,8 @@ def _solve(matrix: _Blocks, vector: list[_Part], size: int) -> list[_Part]:
     rest = _above(len(others), lambda b, c: matrix[b + 1][c + 1] - product(matrix[0][b + 1].T, above[c]))
     left = [vector[b] - (matrix[0][b] * first[:, None]).sum(axis=0) for b in others]
     found = _solve(rest, left, size - _BLOCK)
-    return [first - sum((one * other[None]).sum(axis=1) for one, other in zip(above, found, strict=True)), *found]
+    back = linear.add((one * other[None]).sum(axis=1) for one, other in zip(above, found, strict=True))
+    return [first - back, *found]
 
 
 def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part:
