@@ -9,6 +9,9 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 - `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
 - `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
+- `MuJoCo Warp`: its step, captured as a graph on a GPU; where warp-lang is installed (`pip install warp-lang`).
+
+With several batches it also draws the steps per second of the forward rows against them, runs/bench.png.
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
@@ -21,6 +24,8 @@ compiled program and once as ten programs, as ten runs of a script would make th
 import argparse
 import dataclasses
 import functools
+import importlib.util
+import itertools
 import platform
 import statistics
 import time
@@ -36,6 +41,7 @@ import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
+from experiments import theme
 from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad.tasks import scene_path
@@ -51,6 +57,8 @@ _SCENES = {
 }
 # Of `bench`: contacts that a state has room for, where that is faster; in these motions no more ever act.
 _ROOM = {"ant": 8, "quadruped": 8, "humanoid": 12}
+# Contacts of a state that MuJoCo Warp has room for.
+_WARP_ROOM = 64
 _TOLERANCE = 1e-6
 _PATCHED_ITERATIONS = 10
 
@@ -95,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     commands = parser.add_subparsers(required=True)
     bench = commands.add_parser("bench", help="speed and memory against mjx.step")
     bench.add_argument("--scene", nargs="*", choices=list(_SCENES), default=list(_SCENES))
-    bench.add_argument("--batch", type=int, default=256)
+    bench.add_argument("--batch", type=int, nargs="*", default=[256])
     bench.add_argument("--steps", type=int, default=100)
     bench.add_argument(
         "--runs", type=int, default=5, help="0 compiles and reports memory, which may exceed the machine's"
@@ -138,26 +146,71 @@ def _compile(function: Any, *arguments: Any) -> tuple[Any, float, float]:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    """Print one table per scene."""
+    """Print one table per scene and batch, and draw them."""
     if options.per_core:
         jax.config.update("jax_num_cpu_devices", num_cores())
-    _announce(
-        f"batch {options.batch}, {options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]"
-    )
+    _announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
+    found: dict[str, dict[int, list[Row]]] = {}
     for name in options.scene:
-        print(f"\n{name}")
-        base = None
-        for row in _rows(name, options):
-            base = base or row
-            _print(row, base, options.batch * options.steps)
+        for batch in options.batch:
+            print(f"\n{name}, batch {batch}")
+            rows = found.setdefault(name, {}).setdefault(batch, [])
+            for row in _rows(name, batch, options):
+                rows.append(row)
+                _print(row, rows[0], batch * options.steps)
+    if len(options.batch) > 1 and options.runs:
+        _draw(found, options.steps)
 
 
-def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
+def _draw(found: dict[str, dict[int, list[Row]]], steps: int) -> None:
+    """Draw steps per second against batch, a panel for each scene, and last the time of the largest batch against rows."""
+    batches = list(next(iter(found.values())))
+    panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for scene, by_batch in found.items():
+        num_rows = mg.load_scene(str(_SCENES[scene])).data._impl.efc_J.shape[0]
+        for batch, rows in by_batch.items():
+            for row in rows:
+                if "grad" not in row.name:
+                    kind = "mg.rollout, room for the nearest" if "contacts" in row.name else row.name
+                    panels.setdefault(scene, {}).setdefault(kind, []).append((batch, batch * steps / row.median))
+                    if batch == batches[-1]:
+                        last = panels.setdefault(f"batch {batch}", {}).setdefault(kind, [])
+                        last.append((num_rows, row.median / batch / steps * 1e6))
+    panels |= {last: panels.pop(last) for last in [f"batch {batches[-1]}"]}
+    columns = min(3, len(panels))
+    lines = -(-len(panels) // columns)
+    figure, axes = theme.subplots(lines, columns, height=3.4 * lines)
+    looks: dict[str, dict] = {}
+    for axis, (title, kinds) in itertools.zip_longest(axes.flat, panels.items(), fillvalue=("", {})):
+        axis.set_visible(bool(kinds))
+        axis.set(title=title, xscale="log", yscale="log", ylabel="steps per second", xlabel="batch")
+        axis.set_xticks(batches, batches, minor=False)
+        if title not in found:
+            axis.set(ylabel="µs per step", xlabel="rows of constraints")
+            axis.set_xticks(sorted({x for points in kinds.values() for x, _ in points}), minor=False)
+            theme.plain(axis.xaxis)
+        axis.minorticks_off()
+        for kind, points in kinds.items():
+            new = {
+                "color": (theme.FIRST, theme.ZEROTH, *theme.OTHERS)[len(looks)],
+                "marker": theme.MARKERS[len(looks)],
+                "label": kind,
+            }
+            axis.plot(*zip(*sorted(points), strict=True), **looks.setdefault(kind, new))
+    handles = {label: one for axis in axes.flat for one, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3)
+    path = Path("runs/bench.png")
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path)
+    print(f"\n{path}")
+
+
+def _rows(name: str, batch: int, options: argparse.Namespace) -> Iterator[Row]:
     mj_model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
     mj_model.opt.tolerance, mj_model.opt.iterations, mj_model.opt.ls_iterations = _TOLERANCE, 100, 20
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = mg.load_scene(mj_model)
-    states = _states(mj_model, options.batch)
+    states = _states(mj_model, batch)
     ours, is_cpu = functools.partial(_outcome, scene, steps=options.steps), jax.default_backend() == "cpu"
     theirs = functools.partial(_mjx_outcome, scene, steps=options.steps)
     cases: dict[str, Callable] = {"mjx.step": theirs, "mg.rollout": ours}
@@ -177,6 +230,8 @@ def _rows(name: str, options: argparse.Namespace) -> Iterator[Row]:
         yield _patched(scene, states, options)
     if is_cpu and options.runs:
         yield _native(mj_model, states, options)
+    if options.runs and importlib.util.find_spec("warp"):
+        yield _warp(mj_model, states, options)
 
 
 def _states(mj_model: mujoco.MjModel, batch: int) -> tuple[jax.Array, jax.Array]:
@@ -236,16 +291,48 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
     return Row(name, [_seconds(program, states) for _ in range(runs + 1 if runs else 0)][1:], compilation, memory)
 
 
+def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
+    import warp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    warp.config.quiet = True
+    qpos, qvel = (np.asarray(x) for x in states)
+    data = mujoco.MjData(mj_model)
+    data.qpos[:] = qpos[0]
+    mujoco.mj_forward(mj_model, data)
+    model = mujoco_warp.put_model(mj_model)
+    worlds = mujoco_warp.put_data(mj_model, data, nworld=len(qpos), nconmax=_WARP_ROOM, njmax=4 * _WARP_ROOM)
+    begin = time.perf_counter()
+    mujoco_warp.step(model, worlds)
+    graph = None
+    if warp.get_device().is_cuda:
+        with warp.ScopedCapture() as capture:
+            mujoco_warp.step(model, worlds)
+        graph = capture.graph
+    compilation = time.perf_counter() - begin
+
+    def run() -> None:
+        worlds.qpos.assign(qpos)
+        worlds.qvel.assign(qvel)
+        worlds.qacc_warmstart.zero_()
+        for _ in range(options.steps):
+            mujoco_warp.step(model, worlds) if graph is None else warp.capture_launch(graph)
+        warp.synchronize()
+
+    return Row("MuJoCo Warp", [_seconds(run) for _ in range(options.runs + 1)][1:], compilation, float("nan"))
+
+
 def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
     threads = num_cores()
     data = [mujoco.MjData(mj_model) for _ in range(threads)]
     size = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    initial = np.zeros((options.batch, size))
+    batch = len(states[0])
+    initial = np.zeros((batch, size))
     state = np.concatenate([np.asarray(x, np.float64) for x in states], axis=1)
     initial[:, 1 : 1 + state.shape[1]] = state
     with mujoco.rollout.Rollout(nthread=threads) as pool:
         run = functools.partial(pool.rollout, nstep=options.steps)
-        seconds = [_seconds(run, [mj_model] * options.batch, data, initial) for _ in range(options.runs + 1)]
+        seconds = [_seconds(run, [mj_model] * batch, data, initial) for _ in range(options.runs + 1)]
     return Row(f"C MuJoCo, {threads} threads", seconds[1:], 0.0, float("nan"))
 
 
