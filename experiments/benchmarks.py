@@ -292,7 +292,7 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
 
 
 def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
-    import warp
+    import warp  # pyright: ignore[reportMissingImports]
     from mujoco.mjx.third_party import mujoco_warp
 
     warp.config.quiet = True

@@ -12,7 +12,7 @@ from mjxgrad._rollout import (
 from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
-from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, solve, step
+from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -68,6 +68,7 @@ __all__ = [
     "render",
     "rollout",
     "sensor",
+    "set_const",
     "site_position",
     "solve",
     "step",

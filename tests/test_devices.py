@@ -19,24 +19,24 @@ _PROGRAM = """
 
     import mjxgrad as mg
 
-    jax.config.update("jax_num_cpu_devices", 3)  # which fails if importing mjxgrad has used a device
+    jax.config.update("jax_num_cpu_devices", 8)  # which fails if importing mjxgrad has used a device
 
 
     def root(x, start):  # a loop that each member leaves at its own time
         return jax.lax.while_loop(lambda y: jnp.abs(y * y - x["square"]) > 1e-4, lambda y: (y + x["square"] / y) / 2, start)
 
 
-    squares, starts = {"square": jnp.linspace(1.0, 400.0, 6)}, jnp.ones(6)
+    squares, starts = {"square": jnp.linspace(1.0, 400.0, 16)}, jnp.ones(16)
     function = jax.jit(mg.over_devices(root))
     found = function(squares, starts)
-    assert len(found.sharding.device_set) == 3
+    assert len(found.sharding.device_set) == 8
     np.testing.assert_array_equal(found, jax.vmap(root)(squares, starts))
     text = function.lower(squares, starts).compile().as_text()
     assert not any(word in text for word in ("all-reduce", "all-gather", "collective")), "devices wait for each other"
     try:
         function({"square": jnp.ones(4)}, jnp.ones(4))
     except ValueError as error:
-        assert str(error) == "the batch must be a multiple of the 3 devices, got 4"
+        assert str(error) == "the batch must be a multiple of the 8 devices, got 4"
     else:
         raise AssertionError("an uneven batch was taken")
 """

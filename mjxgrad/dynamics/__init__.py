@@ -1,5 +1,6 @@
 """One step that can be differentiated."""
 
+from mjxgrad.dynamics.constants import set_const
 from mjxgrad.dynamics.onset import Onset
 from mjxgrad.dynamics.rows import contact_force
 from mjxgrad.dynamics.smoothing import Smoothing, smoothing_warnings
@@ -12,6 +13,7 @@ __all__ = [
     "check_gradient",
     "contact_force",
     "forward",
+    "set_const",
     "smoothing_warnings",
     "solve",
     "step",

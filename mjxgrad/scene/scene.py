@@ -17,6 +17,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.dynamics import constants
 from mjxgrad.dynamics.collision import candidates
 from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene.conversions import Conversion
@@ -24,8 +25,6 @@ from mjxgrad.scene.omissions import Omission
 
 _WIDTH = 118  # characters; what a laptop's terminal shows
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
-# What MuJoCo computes from mass and inertia when it compiles a model.
-_COMPILED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "dof_M0")
 
 
 class SceneWarning(UserWarning):
@@ -84,8 +83,8 @@ class Scene(eqx.Module):
     def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
         """Replace numbers of the MJX model, such as `geom_friction`, `body_mass` or `dof_damping`.
 
-        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo
-        computes from mass and size when it compiles a model stays as it is, unless it is given, too; a warning says so.
+        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo computes
+        from masses, inertias, lengths and sizes when it compiles a model follows, unless it is given, too; see `mg.set_const`.
 
         Args:
             **fields: new values of the model's floating-point arrays, each of the shape that it has.
@@ -108,13 +107,15 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
-        if {"body_mass", "body_inertia"} & fields.keys() and not set(_COMPILED) & fields.keys():
-            constants = ", ".join(_COMPILED)
-            _warn(self, f"{constants} do not follow the mass; give them, too, or contacts yield as for the old one")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
-        return eqx.tree_at(lambda s: s.model, self, self.model.replace(**changed))
+        model = self.model.replace(**changed)
+        if constants.CAUSES & fields.keys():
+            model = jax.jit(constants.set_const)(model).replace(**changed)
+        elif "geom_size" in fields and "geom_rbound" not in fields:
+            model = model.replace(geom_rbound=constants.bounding_radii(model))
+        return eqx.tree_at(lambda s: s.model, self, model)
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:

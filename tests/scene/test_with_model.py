@@ -50,14 +50,6 @@ def test_a_field_that_is_none_or_of_another_shape_is_refused(scene, fields, mess
         scene.with_model(**fields)
 
 
-def test_a_mass_that_constants_do_not_follow_is_said_and_a_damping_is_not(scene):
-    with pytest.warns(SceneWarning, match=r"dof_invweight0.* do not follow the mass"):
-        scene.with_model(body_mass=2 * scene.model.body_mass)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        scene.with_model(dof_damping=jnp.ones(1))
-
-
 def test_a_damping_of_a_scene_loaded_without_is_said():
     bare = mg.load_scene(SLIDER.replace('damping="1"', ""))
     with pytest.warns(SceneWarning, match="integrated explicitly"):
