@@ -14,7 +14,7 @@ EXPERIMENTS := $(sort $(basename $(notdir $(wildcard experiments/*.toml))))
 
 # Compiling is most of the time of a first run; kept on disk, the second run starts at once.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
-export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
 .PHONY: help setup demo test test-slow bench throughput costs docs lint clean $(EXPERIMENTS)
