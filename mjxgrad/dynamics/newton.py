@@ -15,6 +15,8 @@ the minimiser may lie at a thousandth of the step that it promises, and what is 
 The solve ends by the Newton decrement, gᵀ H⁻¹ g: the step left to go, in the norm of kinetic energy. It does not depend on the
 units of joints, nor on how light one body is beside another.
 
+The same steps serve a batch, operation by operation, and one state in a GPU's program; what differs is a `Problem`.
+
 The gradient is formed afresh in each iteration rather than updated along the line: in single precision an update keeps
 the rounding errors of a poor start.
 """
