@@ -207,15 +207,11 @@ def _solve(matrix: _Blocks, vector: list[_Part], size: int) -> list[_Part]:
 def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part:
     """Return matrix⁻¹ vector by Gauss and Jordan's elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
-    down, across = index[:, None], index[None]
 
     def eliminate(pivot, carry):
         entries, rest = carry
-        row = jnp.where(down == pivot, entries, 0.0).sum(axis=0)
-        column = jnp.where(across == pivot, entries, 0.0).sum(axis=1)
+        row, column, inverse = _cross(entries, pivot)
         own = jnp.where(index == pivot, rest, 0.0).sum()
-        # By the root, so that a pivot that is not positive spoils all.
-        inverse = jax.lax.rsqrt(jnp.where(index == pivot, column, 0.0).sum()) ** 2
         factor = jnp.where(index == pivot, 0.0, column * inverse)
         return entries - factor[:, None] * row[None], rest - factor * own
 
@@ -226,18 +222,24 @@ def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part
 def _inverse(matrix: Float[Array, "16 16"]) -> Float[Array, "16 16"]:
     """Return the inverse by the same elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
-    down, across = index[:, None], index[None]
 
     def eliminate(pivot, entries):
-        row = jnp.where(down == pivot, entries, 0.0).sum(axis=0)
-        column = jnp.where(across == pivot, entries, 0.0).sum(axis=1)
-        inverse = jax.lax.rsqrt(jnp.where(index == pivot, column, 0.0).sum()) ** 2
-        # The pivot's row and column become those of the inverse.
-        rest = jnp.where((down == pivot) | (across == pivot), 0.0, entries)
+        row, column, inverse = _cross(entries, pivot)
+        # They become those of the inverse.
+        rest = jnp.where((index == pivot)[:, None] | (index == pivot)[None], 0.0, entries)
         row, column = jnp.where(index == pivot, 1.0, row), jnp.where(index == pivot, -1.0, column)
         return rest - (column * inverse)[:, None] * row[None]
 
     return jax.lax.fori_loop(0, _BLOCK, eliminate, matrix)
+
+
+def _cross(matrix: Float[Array, "16 16"], pivot: Array) -> tuple[_Part, _Part, Array]:
+    """Return row and column of a pivot, and its inverse."""
+    index = jnp.arange(_BLOCK, dtype=jnp.int32)
+    row = jnp.where((index == pivot)[:, None], matrix, 0.0).sum(axis=0)
+    column = jnp.where((index == pivot)[None], matrix, 0.0).sum(axis=1)
+    # By the root, so that a pivot that is not positive spoils all.
+    return row, column, jax.lax.rsqrt(jnp.where(index == pivot, column, 0.0).sum()) ** 2
 
 
 def _diagonal(matrix: Float[Array, "16 16"]) -> _Part:
