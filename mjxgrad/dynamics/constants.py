@@ -34,17 +34,16 @@ def set_const(model: mjx.Model) -> mjx.Model:
     Args:
         model: of MJX's JAX implementation.
     """
+    return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
+
+
+def constants_of(model: mjx.Model) -> dict[str, Array]:
+    """Return these constants by name."""
     with jax.default_matmul_precision("highest"):
-        data = mjx.make_data(model).replace(qpos=model.qpos0)
-        data = kinematics.com_pos(model, kinematics.kinematics(model, data))
-        if model.ntendon:
-            data = mjx.tendon(model, data)
-        data = kinematics.crb(model, data)
-        if model.ntendon:
-            data = mjx.tendon_armature(model, data)
+        data = kinematics.up_to_inertia(model, mjx.make_data(model).replace(qpos=model.qpos0))
         mass = mjx.full_m(model, data)
         inverse = jnp.linalg.inv(mass)
-        changed = {
+        found = {
             "body_subtreemass": jnp.asarray(tree.descendants(model), mass.dtype) @ model.body_mass,
             "body_invweight0": _of_bodies(model, data, inverse),
             "dof_invweight0": _of_dofs(model, inverse),
@@ -53,12 +52,12 @@ def set_const(model: mjx.Model) -> mjx.Model:
         }
         if model.ntendon:
             along = data._impl.ten_J
-            changed["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", along, inverse, along)
-            changed["tendon_length0"] = data.ten_length
+            found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", along, inverse, along)
+            found["tendon_length0"] = data.ten_length
         if model.nu:
             moment = forces.transmission(model, data)._impl.actuator_moment
-            changed["actuator_acc0"] = jnp.sqrt(jnp.sum((moment @ inverse) ** 2, axis=1))
-    return model.replace(**changed)  # pyright: ignore[reportReturnType]
+            found["actuator_acc0"] = jnp.sqrt(jnp.sum((moment @ inverse) ** 2, axis=1))
+    return found
 
 
 def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"]) -> Float[Array, "nbody 2"]:

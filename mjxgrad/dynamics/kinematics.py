@@ -32,6 +32,14 @@ _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _UP = np.array([0.0, 0.0, 1.0])
 
 
+def up_to_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Run the stages from the position to the mass matrix; those of tendons are MJX's."""
+    data = com_pos(model, kinematics(model, data))
+    if not model.ntendon:
+        return crb(model, data)
+    return mjx.tendon_armature(model, crb(model, mjx.tendon(model, data)))
+
+
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Place bodies, joints, geoms and sites, and normalise the quaternions of `qpos`; a drop-in for `mjx.kinematics`."""
     frames = tree.frames(model)

@@ -274,13 +274,7 @@ def _solved(data: mjx.Data, acceleration: Array, total: Array, force: Array, num
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     """Run the stages up to the unconstrained acceleration and gather the rows; tendons and cameras are MJX's."""
-    data = kinematics.com_pos(model, kinematics.kinematics(model, data))
-    data = mjx.camlight(model, data)
-    if model.ntendon:
-        data = mjx.tendon(model, data)
-    data = kinematics.crb(model, data)
-    if model.ntendon:
-        data = mjx.tendon_armature(model, data)
+    data = mjx.camlight(model, kinematics.up_to_inertia(model, data))
     data = mjx.factor_m(model, data)
     data = collide(model, data)
     blocks = assembly.gather(model, data)

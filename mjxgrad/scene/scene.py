@@ -110,12 +110,13 @@ class Scene(eqx.Module):
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
-        model = self.model.replace(**changed)
+        model, derived = self.model.replace(**changed), {}
         if constants.CAUSES & fields.keys():
-            model = jax.jit(constants.set_const)(model).replace(**changed)
-        elif "geom_size" in fields and "geom_rbound" not in fields:
-            model = model.replace(geom_rbound=constants.bounding_radii(model))
-        return eqx.tree_at(lambda s: s.model, self, model)
+            # These alone: what else is known of the model stays so while it is traced.
+            derived = jax.jit(constants.constants_of)(model)
+        elif "geom_size" in fields:
+            derived = {"geom_rbound": constants.bounding_radii(model)}
+        return eqx.tree_at(lambda s: s.model, self, model.replace(**derived | changed))
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:

@@ -50,6 +50,23 @@ def test_a_field_that_is_none_or_of_another_shape_is_refused(scene, fields, mess
         scene.with_model(**fields)
 
 
+def test_a_mass_and_a_damping_are_taken_without_a_word(scene):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene.with_model(dof_damping=jnp.ones(1))
+        scene.with_model(body_mass=2 * scene.model.body_mass)
+
+
+def test_what_a_changed_mass_does_not_touch_stays_known_while_traced(scene):
+    def damping_is_known(mass):
+        model = scene.with_model(body_mass=mass).model
+        assert not isinstance(model.dof_damping, jax.core.Tracer)
+        return model.dof_invweight0
+
+    found = jax.jit(damping_is_known)(2 * scene.model.body_mass)
+    np.testing.assert_allclose(found, scene.model.dof_invweight0 / 2, rtol=1e-12)  # 1/m
+
+
 def test_a_damping_of_a_scene_loaded_without_is_said():
     bare = mg.load_scene(SLIDER.replace('damping="1"', ""))
     with pytest.warns(SceneWarning, match="integrated explicitly"):
