@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, estimators, integration, planning, render, tasks
+from mjxgrad import baselines, diagnostics, envs, estimators, integration, planning, render, tasks
 from mjxgrad._rollout import (
     DivergedError,
     State,
@@ -52,6 +52,7 @@ __all__ = [
     "closed_loop",
     "contact_force",
     "diagnostics",
+    "envs",
     "estimated_gradient",
     "estimators",
     "forward",

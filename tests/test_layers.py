@@ -23,6 +23,8 @@ ORDER = (
     ("baselines",),
     ("devices", "diagnostics", "integration", "planning", "render"),
     ("tasks",),
+    ("envs",),
+    ("learning",),
 )
 LINE = {part: i for i, line in enumerate(ORDER) for part in line}
 MODULES = {

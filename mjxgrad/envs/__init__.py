@@ -1,0 +1,47 @@
+"""Environments for learning policies: known tasks, one's own, and the way to other programs."""
+
+from collections.abc import Callable
+
+from mjxgrad.envs import diffrl, gymnasium_robots
+from mjxgrad.envs.environment import Environment, EnvState
+from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
+from mjxgrad.envs.quadruped import quadruped
+
+ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
+    "ant": ant,
+    "half_cheetah": half_cheetah,
+    "hopper": hopper,
+    "humanoid": humanoid,
+    "walker2d": walker2d,
+    "diffrl_ant": diffrl.ant,
+    "diffrl_cartpole": diffrl.cartpole,
+    "diffrl_half_cheetah": diffrl.half_cheetah,
+    "diffrl_hopper": diffrl.hopper,
+    "diffrl_humanoid": diffrl.humanoid,
+    "quadruped": quadruped,
+}
+
+__all__ = [
+    "ENVIRONMENTS",
+    "EnvState",
+    "Environment",
+    "ant",
+    "diffrl",
+    "half_cheetah",
+    "hopper",
+    "humanoid",
+    "load",
+    "quadruped",
+    "walker2d",
+]
+
+
+def load(name: str) -> Environment:
+    """Return an environment by its name, one of `ENVIRONMENTS`.
+
+    Raises:
+        ValueError: if there is no such environment; the message lists them.
+    """
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"name must be one of {', '.join(ENVIRONMENTS)}, got {name!r}")
+    return ENVIRONMENTS[name]()

@@ -1,0 +1,186 @@
+r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole to be swung up.
+
+Observations, rewards, starts and ends are DiffRL's; the bodies are gymnasium's, and their contact is MuJoCo's. Returns can
+therefore be compared within this project, and with the published ones as ratios only. An action holds for 1/60 s, an episode takes
+1000 of them (cart-pole 240).
+
+References:
+    Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
+    ICLR 2022, arXiv:2204.07137 (SHAC and these tasks).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from mjxgrad._rollout import State, initial_state
+from mjxgrad.dynamics.spatial import exponential, multiply, rotation_matrix
+from mjxgrad.envs.environment import Environment
+from mjxgrad.envs.gymnasium_robots import robot_scene
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks.action_task import scene_path
+
+Memory = dict[str, Float[Array, "..."]]
+_TILT = jnp.pi / 24  # rad, largest at the start of a floating base
+
+
+class _Remembers(Environment):
+    """An environment whose policy sees its last action."""
+
+    def first_memory(self, key: PRNGKeyArray) -> Memory:
+        return {"action": jnp.zeros(self.num_actions)}
+
+    def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
+        return {"action": action}
+
+
+class Walker(_Remembers):
+    """Ant and humanoid: a floating base that is to run along x, upright.
+
+    Attributes:
+        fallen: height of the torso below which it is over (m).
+        action_weight: charged per squared action.
+        rise_scale: paid per m above the wanted height, 0.1 m above `fallen`; None pays every m above `fallen` alike (the ant).
+    """
+
+    fallen: float = eqx.field(static=True, kw_only=True)
+    action_weight: float = eqx.field(static=True, default=0.0, kw_only=True)
+    rise_scale: float | None = eqx.field(static=True, default=None, kw_only=True)
+
+    def start(self, key: PRNGKeyArray) -> State:
+        place, axis, angle, joints, speeds = jax.random.split(key, 5)
+        rest = initial_state(self.scene)
+        where = rest.qpos[:3] + jax.random.uniform(place, (3,), minval=-0.1, maxval=0.1)
+        direction = jax.random.uniform(axis, (3,), minval=-1, maxval=1)
+        direction = direction / jnp.linalg.norm(direction)
+        tilt = exponential(direction * jax.random.uniform(angle, (), minval=-_TILT, maxval=_TILT))
+        posture = rest.qpos[7:] + jax.random.uniform(joints, rest.qpos[7:].shape, minval=-0.2, maxval=0.2)
+        qpos = jnp.concatenate([where, multiply(rest.qpos[3:7], tilt), posture])
+        return initial_state(self.scene, qpos, jax.random.uniform(speeds, rest.qvel.shape, minval=-0.25, maxval=0.25))
+
+    def observe(self, state: State, memory: Memory) -> Float[Array, " obs"]:
+        upright, heading = _posture(state)
+        base, joints = state.qpos[2:7], state.qpos[7:]
+        course = jnp.stack([upright, heading])
+        return jnp.concatenate([base, state.qvel[:6], joints, 0.1 * state.qvel[6:], course, memory["action"]])
+
+    def rewards(
+        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
+    ) -> dict[str, Float[Array, ""]]:
+        upright, heading = _posture(after)
+        height = after.qpos[2] - self.fallen
+        rise = height if self.rise_scale is None else _rise(height - 0.1, self.rise_scale, 0.1)
+        terms = {"forward": after.qvel[0], "upright": 0.1 * upright, "heading": heading, "height": rise}
+        return {**terms, "action": -self.action_weight * (action**2).sum()}
+
+    def is_over(self, state: State) -> Bool[Array, ""]:
+        return state.qpos[2] < self.fallen
+
+
+class Planar(Environment):
+    """Hopper and cheetah: bodies in a plane that are to run along x.
+
+    Attributes:
+        action_weight: charged per squared action.
+        fallen: change of the torso's height below which it is over (m); None is never, and height and tilt do not count.
+        rise_scale: paid per m above the wanted height, 0.15 m above `fallen`.
+        most_tilt: angle at which the reward for an upright torso is gone (rad).
+    """
+
+    action_weight: float = eqx.field(static=True, default=0.1, kw_only=True)
+    fallen: float | None = eqx.field(static=True, default=None, kw_only=True)
+    rise_scale: float = eqx.field(static=True, default=1.0, kw_only=True)
+    most_tilt: float = eqx.field(static=True, default=jnp.pi / 6, kw_only=True)
+
+    def start(self, key: PRNGKeyArray) -> State:
+        place, tilt, joints, speeds = jax.random.split(key, 4)
+        rest = initial_state(self.scene)
+        change = jnp.concatenate(
+            [
+                jax.random.uniform(place, (2,), minval=-0.05, maxval=0.05),
+                jax.random.uniform(tilt, (1,), minval=-0.1, maxval=0.1),
+                jax.random.uniform(joints, (rest.qpos.size - 3,), minval=-0.05, maxval=0.05),
+            ]
+        )
+        speed = jax.random.uniform(speeds, rest.qvel.shape, minval=-0.05, maxval=0.05)
+        return initial_state(self.scene, rest.qpos + change, speed)
+
+    def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
+        return jnp.concatenate([state.qpos[1:], state.qvel])
+
+    def rewards(
+        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
+    ) -> dict[str, Float[Array, ""]]:
+        terms = {"forward": after.qvel[0], "action": -self.action_weight * (action**2).sum()}
+        if self.fallen is None:
+            return terms
+        rest = self.scene.data.qpos[1]
+        rise = _rise(after.qpos[1] - rest - self.fallen - 0.15, self.rise_scale, 0.3)
+        return {**terms, "height": rise, "upright": 1 - (after.qpos[2] / self.most_tilt) ** 2}
+
+    def is_over(self, state: State) -> Bool[Array, ""]:
+        return jnp.array(False) if self.fallen is None else state.qpos[1] - self.scene.data.qpos[1] < self.fallen
+
+
+class CartPole(Environment):
+    """A pole that hangs from a cart and is to be swung up and held."""
+
+    def start(self, key: PRNGKeyArray) -> State:
+        place, speed = jax.random.split(key)
+        spread = jnp.array([0.5, jnp.pi / 4])
+        hanging = jnp.array([0.0, jnp.pi])
+        return initial_state(
+            self.scene,
+            hanging + spread * jax.random.uniform(place, (2,), minval=-1, maxval=1),
+            0.5 * jax.random.uniform(speed, (2,), minval=-1, maxval=1),
+        )
+
+    def observe(self, state: State, memory: PyTree) -> Float[Array, " 5"]:
+        (place, angle), (speed, rate) = state.qpos, state.qvel
+        return jnp.stack([place, speed, jnp.sin(angle), jnp.cos(angle), rate])
+
+    def rewards(
+        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
+    ) -> dict[str, Float[Array, ""]]:
+        (place, angle), (speed, rate) = after.qpos, after.qvel
+        upward = jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+        return {"pole": -(upward**2) - 0.1 * rate**2, "cart": -0.05 * place**2 - 0.1 * speed**2}
+
+
+def cartpole() -> CartPole:
+    """Return the swing-up: 1 kg of cart, 0.1 kg of pole of 1 m, at most 20 N. Zero is upright."""
+    return CartPole(load_scene(scene_path("cartpole")), frame_skip=2, episode_length=240)
+
+
+def hopper() -> Planar:
+    """Return the hopper, which is over when its torso is 0.45 m lower."""
+    return Planar(robot_scene("hopper", timestep=1 / 240), frame_skip=4, fallen=-0.45)
+
+
+def half_cheetah() -> Planar:
+    """Return the cheetah, which is never over."""
+    return Planar(robot_scene("half_cheetah", timestep=1 / 120), frame_skip=2)
+
+
+def ant() -> Walker:
+    """Return the ant, which is over when its torso is below 0.27 m."""
+    return Walker(robot_scene("ant", timestep=1 / 120, max_contacts=8), frame_skip=2, fallen=0.27)
+
+
+def humanoid() -> Walker:
+    """Return the humanoid, which is over when its torso is below 0.74 m."""
+    scene = robot_scene("humanoid", timestep=1 / 240, max_contacts=12)
+    return Walker(scene, frame_skip=4, fallen=0.74, action_weight=0.002, rise_scale=10.0)
+
+
+def _posture(state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return how far the torso's own z and x axes point up and forward."""
+    turn = rotation_matrix(state.qpos[None, 3:7])[0]
+    return turn[2, 2], turn[0, 0]
+
+
+def _rise(height: Float[Array, ""], scale: float, most: float) -> Float[Array, ""]:
+    """Return what a height above the wanted one is worth: paid up to `most`, charged by its square below."""
+    height = jnp.clip(height, -1.0, most)
+    return jnp.where(height < 0, -200 * height**2, scale * height)

@@ -1,0 +1,180 @@
+"""Gymnasium's walking robots: its bodies, starts, observations, rewards and ends (version 5).
+
+Two things differ. Steps are Euler's, not Runge-Kutta's, which cost four times as much. Ant and humanoid are those of the options
+`include_..._in_observation=False` and `contact_cost_weight=0`: contact forces and inertias are neither seen nor charged.
+
+References:
+    Towers et al. Gymnasium: A Standard Interface for Reinforcement Learning Environments. arXiv:2407.17032.
+"""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from mjxgrad._rollout import State, data_of, initial_state
+from mjxgrad.dynamics.kinematics import kinematics
+from mjxgrad.envs.environment import Environment
+from mjxgrad.scene import Scene, load_scene
+
+_ANY = (-float("inf"), float("inf"))
+
+
+class Robot(Environment):
+    """A robot that is paid for going forward, for staying upright, and charged for its controls.
+
+    Attributes:
+        forward_weight: per m/s of the torso, or of the centre of mass.
+        control_weight: per squared control.
+        alive_reward: for every step that ends within the healthy ranges.
+        healthy_height: of the torso (m); beyond it an episode ends.
+        healthy_angle: of a planar torso (rad).
+        num_unseen: leading positions that are not observed, where it is.
+        speed_limit: what observed speeds are clipped to.
+        position_noise, velocity_noise: uniform about the reference pose at the start; `is_normal` draws velocities from a normal
+            distribution.
+        by_mass: whether the speed is that of the centre of mass.
+    """
+
+    forward_weight: float = eqx.field(static=True, default=1.0, kw_only=True)
+    control_weight: float = eqx.field(static=True, kw_only=True)
+    alive_reward: float = eqx.field(static=True, default=0.0, kw_only=True)
+    healthy_height: tuple[float, float] = eqx.field(static=True, default=_ANY, kw_only=True)
+    healthy_angle: tuple[float, float] = eqx.field(static=True, default=_ANY, kw_only=True)
+    num_unseen: int = eqx.field(static=True, default=1, kw_only=True)
+    speed_limit: float = eqx.field(static=True, default=float("inf"), kw_only=True)
+    noise: float = eqx.field(static=True, kw_only=True)
+    is_normal: bool = eqx.field(static=True, default=False, kw_only=True)
+    by_mass: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def start(self, key: PRNGKeyArray) -> State:
+        pose, speed = jax.random.split(key)
+        rest = initial_state(self.scene)
+        shape, dtype = rest.qvel.shape, rest.qvel.dtype
+        draw = jax.random.normal if self.is_normal else _uniform
+        qpos = rest.qpos + self.noise * _uniform(pose, rest.qpos.shape, dtype)
+        return initial_state(self.scene, qpos, self.noise * draw(speed, shape, dtype))
+
+    def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
+        speeds = jnp.clip(state.qvel, -self.speed_limit, self.speed_limit)
+        return jnp.concatenate([state.qpos[self.num_unseen :], speeds])
+
+    def rewards(
+        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
+    ) -> dict[str, Float[Array, ""]]:
+        speed = (self._place(after) - self._place(before)) / self.interval
+        return {
+            "forward": self.forward_weight * speed,
+            "control": -self.control_weight * (self.control(action) ** 2).sum(),
+            "alive": self.alive_reward * self._is_healthy(after).astype(speed.dtype),
+        }
+
+    def is_over(self, state: State) -> Bool[Array, ""]:
+        return ~self._is_healthy(state)
+
+    def _is_healthy(self, state: State) -> Bool[Array, ""]:
+        is_planar = self.num_unseen == 1
+        is_healthy = _is_within(state.qpos[1 if is_planar else 2], self.healthy_height)
+        return is_healthy & _is_within(state.qpos[2], self.healthy_angle) if is_planar else is_healthy
+
+    def _place(self, state: State) -> Float[Array, ""]:
+        if not self.by_mass:
+            return state.qpos[0]
+        model = self.scene.model
+        places = kinematics(model, data_of(self.scene, state, self.scene.data.ctrl)).xipos[:, 0]
+        return (model.body_mass * places).sum() / model.body_mass.sum()
+
+
+def hopper() -> Robot:
+    """Return Hopper-v5: one leg, three motors, 8 ms an action."""
+    return Robot(
+        robot_scene("hopper"),
+        frame_skip=4,
+        control_weight=1e-3,
+        alive_reward=1.0,
+        healthy_height=(0.7, float("inf")),
+        healthy_angle=(-0.2, 0.2),
+        speed_limit=10.0,
+        noise=5e-3,
+    )
+
+
+def walker2d() -> Robot:
+    """Return Walker2d-v5: two legs in a plane, six motors, 8 ms an action."""
+    return Robot(
+        robot_scene("walker2d_v5"),
+        frame_skip=4,
+        control_weight=1e-3,
+        alive_reward=1.0,
+        healthy_height=(0.8, 2.0),
+        healthy_angle=(-1.0, 1.0),
+        speed_limit=10.0,
+        noise=5e-3,
+    )
+
+
+def half_cheetah() -> Robot:
+    """Return HalfCheetah-v5: six motors, 50 ms an action, never over."""
+    return Robot(robot_scene("half_cheetah"), frame_skip=5, control_weight=0.1, noise=0.1, is_normal=True)
+
+
+def ant() -> Robot:
+    """Return Ant-v5 without contact forces: four legs, eight motors, 50 ms an action."""
+    return Robot(
+        robot_scene("ant", max_contacts=8),
+        frame_skip=5,
+        control_weight=0.5,
+        alive_reward=1.0,
+        healthy_height=(0.2, 1.0),
+        num_unseen=2,
+        noise=0.1,
+        is_normal=True,
+    )
+
+
+def humanoid() -> Robot:
+    """Return Humanoid-v5 without inertias and forces: seventeen motors, 15 ms an action."""
+    return Robot(
+        robot_scene("humanoid", max_contacts=12),
+        frame_skip=5,
+        forward_weight=1.25,
+        control_weight=0.1,
+        alive_reward=5.0,
+        healthy_height=(1.0, 2.0),
+        num_unseen=2,
+        noise=1e-2,
+        by_mass=True,
+    )
+
+
+def robot_scene(name: str, *, timestep: float | None = None, max_contacts: int | None = None) -> Scene:
+    """Load one of gymnasium's robots, to be stepped by Euler's method.
+
+    Args:
+        name: of the file, without its ending.
+        timestep: in s, instead of that in the file.
+        max_contacts: see `load_scene`.
+
+    Raises:
+        ImportError: if gymnasium is not installed.
+    """
+    # Imported here: only what loads its robots needs it.
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ImportError(f"{name} is gymnasium's, not installed: pip install 'mjxgrad[envs]'") from error
+    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    return load_scene(model, timestep=timestep, max_contacts=max_contacts)
+
+
+def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], dtype) -> Float[Array, "*shape"]:
+    return jax.random.uniform(key, shape, dtype, -1, 1)
+
+
+def _is_within(value: Float[Array, ""], bounds: tuple[float, float]) -> Bool[Array, ""]:
+    return (value > bounds[0]) & (value < bounds[1])

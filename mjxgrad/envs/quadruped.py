@@ -1,0 +1,105 @@
+"""A quadruped that follows velocity commands, blind: it sees its joints, its turning and which way is down, not its speed.
+
+References:
+    Open-DiffLoco, arXiv:2608.02069 (rewards, commands, ends and the spread of the models, there on another robot).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from mjxgrad._rollout import State, initial_state
+from mjxgrad.dynamics.spatial import rotation_matrix
+from mjxgrad.envs.environment import Environment
+from mjxgrad.scene import Scene, load_scene
+from mjxgrad.tasks.action_task import scene_path
+
+Memory = dict[str, Float[Array, "..."]]
+MOST_COMMAND = (2.0, 1.0, 1.5)  # m/s forward, m/s to the left, rad/s about the vertical
+_CHANGE = 0.004  # chance per action of a new command: after 5 s on average
+_REACH = 0.5  # rad that an action of 1 moves a joint's target
+_HEIGHT = 0.3  # m, of the trunk
+_LOWEST = 0.18
+
+
+class Quadruped(Environment):
+    """Twelve position servos, 50 actions a second; the command changes every 5 s on average."""
+
+    def start(self, key: PRNGKeyArray) -> State:
+        joints, speeds = jax.random.split(key)
+        rest = initial_state(self.scene)
+        posture = rest.qpos[7:] + jax.random.uniform(joints, (12,), minval=-0.1, maxval=0.1)
+        speed = jax.random.uniform(speeds, rest.qvel.shape, minval=-0.1, maxval=0.1)
+        return initial_state(self.scene, jnp.concatenate([rest.qpos[:7], posture]), speed)
+
+    def first_memory(self, key: PRNGKeyArray) -> Memory:
+        return {"command": _command(key), "action": jnp.zeros(12)}
+
+    def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
+        change, draw = jax.random.split(key)
+        command = jnp.where(jax.random.bernoulli(change, _CHANGE), _command(draw), memory["command"])
+        return {"command": command, "action": action}
+
+    def control(self, action: Float[Array, " nu"]) -> Float[Array, " nu"]:
+        return self.scene.data.qpos[7:] + _REACH * action
+
+    def observe(self, state: State, memory: Memory) -> Float[Array, " 45"]:
+        down, _, turning = _in_trunk(state)
+        posture = state.qpos[7:] - self.scene.data.qpos[7:]
+        return jnp.concatenate([turning, down, memory["command"], posture, 0.1 * state.qvel[6:], memory["action"]])
+
+    def rewards(
+        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
+    ) -> dict[str, Float[Array, ""]]:
+        down, speed, turning = _in_trunk(after)
+        command = memory["command"]
+        return {
+            "speed": -((speed[:2] - command[:2]) ** 2).sum(),
+            "turning": -((turning[2] - command[2]) ** 2),
+            "height": jnp.exp(-10 * (after.qpos[2] - _HEIGHT) ** 2),
+            "bouncing": -0.5 * speed[2] ** 2,
+            "upright": -0.5 * down[2],
+            "rocking": -0.05 * (turning[:2] ** 2).sum(),
+            "posture": -0.3 * ((after.qpos[7:] - self.scene.data.qpos[7:]) ** 2).sum(),
+            "change": -0.02 * ((action - memory["action"]) ** 2).sum(),
+            "action": -0.05 * (action**2).sum(),
+        }
+
+    def is_over(self, state: State) -> Bool[Array, ""]:
+        return (state.qpos[2] < _LOWEST) | (_in_trunk(state)[0][2] > -0.3)
+
+
+def quadruped(*, is_randomised: bool = True) -> Quadruped:
+    """Return the task on a robot of 12 kg; a time step is 4 ms, an action holds for five.
+
+    Args:
+        is_randomised: friction, masses and gains differ between copies, see `Environment.randomised`.
+    """
+    scene = load_scene(scene_path("quadruped"), timestep=0.004, max_contacts=8)
+    return Quadruped(scene, frame_skip=5, randomisation=spread if is_randomised else None)
+
+
+def spread(key: PRNGKeyArray, scene: Scene) -> Scene:
+    """Draw friction from 0.5 to 2, masses within 15 %, stiffness of the servos within 25 %, damping within 40 %."""
+    friction, mass, stiffness, damping = jax.random.split(key, 4)
+    model = scene.model
+    sliding = jax.random.uniform(friction, (), minval=0.5, maxval=2.0)
+    gain = jax.random.uniform(stiffness, (model.nu, 1), minval=0.75, maxval=1.25)
+    return scene.with_model(
+        geom_friction=model.geom_friction.at[:, 0].set(sliding),
+        body_mass=model.body_mass * jax.random.uniform(mass, (model.nbody,), minval=0.85, maxval=1.15),
+        actuator_gainprm=model.actuator_gainprm * gain,
+        actuator_biasprm=model.actuator_biasprm * gain,
+        dof_damping=model.dof_damping * jax.random.uniform(damping, (model.nv,), minval=0.6, maxval=1.4),
+    )
+
+
+def _command(key: PRNGKeyArray) -> Float[Array, "3"]:
+    most = jnp.array(MOST_COMMAND)
+    return jax.random.uniform(key, (3,), minval=-most, maxval=most)
+
+
+def _in_trunk(state: State) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Return which way is down, the speed (m/s) and the turning (rad/s), all in the trunk's own axes."""
+    turn = rotation_matrix(state.qpos[None, 3:7])[0]
+    return -turn[2], turn.T @ state.qvel[:3], state.qvel[3:6]
