@@ -1,8 +1,8 @@
 r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole to be swung up.
 
-Observations, rewards, starts and ends are DiffRL's; the bodies are gymnasium's, and their contact is MuJoCo's. Returns can
-therefore be compared within this project, and with the published ones as ratios only. An action holds for 1/60 s, an episode takes
-1000 of them (cart-pole 240).
+Observations, rewards and ends are DiffRL's, starts up to the cart-pole's; the bodies are gymnasium's, and contact is MuJoCo's.
+Returns can therefore be compared within this project, and with the published ones as ratios only. An action holds for 1/60 s, an
+episode takes 1000 of them (cart-pole 240).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
