@@ -122,7 +122,21 @@ class InScene(eqx.Module):
         return dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
-class SceneTask(Task, InScene):
+class InEngine(InScene):
+    """What moves in a scene by controls alone, so that C MuJoCo may do it where no derivative is wanted.
+
+    Attributes:
+        engine: "mjx", or "mujoco" for costs alone; see `with_engine`.
+    """
+
+    engine: Engine = eqx.field(static=True, default="mjx", kw_only=True)
+
+    def with_engine(self: Same, engine: Engine) -> Same:
+        """Return the same in MuJoCo's own motion, by MJX or, for controls and without derivatives, by C MuJoCo."""
+        return dataclasses.replace(self.with_onset(None), engine=engine)
+
+
+class SceneTask(Task, InEngine):
     """A scene, where it starts, how long it runs, and what the trajectory costs.
 
     Attributes:
@@ -133,7 +147,6 @@ class SceneTask(Task, InScene):
         start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
         observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
         policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
-        engine: "mjx", or "mujoco" for costs alone; see `with_engine`.
     """
 
     state: State
@@ -142,11 +155,6 @@ class SceneTask(Task, InScene):
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
     observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
-    engine: Engine = eqx.field(static=True, default="mjx", kw_only=True)
-
-    def with_engine(self: Same, engine: Engine) -> Same:
-        """Return the same in MuJoCo's own motion, by MJX or, for controls and without derivatives, by C MuJoCo."""
-        return dataclasses.replace(self.with_onset(None), engine=engine)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

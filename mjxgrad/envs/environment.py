@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._rollout import State, initial_state, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.task import InScene, optional_pytree
+from mjxgrad.task import InEngine, optional_pytree
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """From a key and a scene to one with other friction, masses, gains, by `scene.with_model`."""
@@ -52,12 +52,12 @@ class EnvState(eqx.Module):
         return self.terminated | self.truncated
 
 
-class Environment(InScene):
+class Environment(InEngine):
     """A scene with a reward; a subclass says what is seen, what counts, where it starts and when it is over.
 
     An action has one number per actuator, from −1 to 1, the ends of its `ctrlrange`; beyond them nothing changes. It holds for
     `frame_skip` time steps. Contacts begin within the step (`mg.Onset()`), so that rewards have no jumps but real ones;
-    `with_onset(None)` is MuJoCo's motion.
+    `with_onset(None)` is MuJoCo's motion, `with_engine("mujoco")` C MuJoCo's.
 
     Attributes:
         frame_skip: time steps per action.
@@ -160,6 +160,7 @@ class Environment(InScene):
             gradient=self.gradient,
             onset=self.onset,
             smoothing=self.smoothing,
+            engine=self.engine,
         )
         after = course.final
         terms = self.rewards(state.physics, action, after, state.memory)

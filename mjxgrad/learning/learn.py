@@ -1,0 +1,123 @@
+r"""Policies by short windows: SHAC, its α-order form, and the likelihood ratio, in one loop.
+
+An update runs one window in every environment (see `window`), moves the policy along a mixture of both gradients, fits the
+value function to TD($\lambda$) targets, and lets the target value function follow. The rule that mixes is the only
+difference between methods:
+
+| `rule` | method |
+|---|---|
+| `rules.FixedAlpha(1)` | first order: SHAC |
+| `rules.FixedAlpha(0)` | zeroth order: REINFORCE with a value function |
+| `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
+| `rules.Consistent()` | the same with an eye for bias: α-order, the default |
+
+With `is_episodic=True` every window begins anew and there is no value function: analytic policy gradients (APG).
+
+References:
+    Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
+    ICLR 2022, arXiv:2204.07137 (SHAC). Onoda et al., arXiv:2604.18161 (IVW-H).
+"""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.envs import Environment
+from mjxgrad.learning.learner import Learner, Policy, Settings, begin
+from mjxgrad.learning.update import update
+from mjxgrad.optimiser import checkpoint as checkpoints
+
+Log = Callable[[int, dict[str, float]], Any]
+
+
+class Learned(eqx.Module):
+    """What came of it.
+
+    Attributes:
+        policy: to act by.
+        history: by name, one number per update; see `learn`.
+        learner: to go on from.
+    """
+
+    policy: Policy
+    history: dict[str, Float[Array, " updates"]]
+    learner: Learner
+
+
+def learn(
+    environment: Environment,
+    key: PRNGKeyArray,
+    *,
+    num_updates: int,
+    settings: Settings | None = None,
+    log: Log | None = None,
+    log_every: int = 10,
+    checkpoint: str | Path | None = None,
+) -> Learned:
+    """Learn a policy.
+
+    Its history has a number per update:
+
+    - `reward`, mean per step; `return`, mean of the episodes that ended, NaN without any;
+    - `alpha`, mean weight of first order; `gradient_norm`, by the parameters;
+    - `first_variance`, `zeroth_variance` of one environment's gradient by its actions; `squared_bias`, of the difference of
+      their means, less what noise explains, so that it may be negative;
+    - `ended`, share of windows in which an episode ended for good: no derivative sees across that;
+    - `not_finite`, share of first-order gradients that were not numbers; `diverged`, steps without a meaningful next state;
+      `skipped`, 1 if the mixture was not finite and nothing was changed;
+    - `critic_loss`.
+
+    Args:
+        environment: to learn in.
+        key: consumed here.
+        num_updates: in all, those before a checkpoint included.
+        settings: how; None are the defaults.
+        log: called as `log(update, metrics)` after every `log_every` updates with their means.
+        log_every: updates in one program; between them are logs and checkpoints.
+        checkpoint: file to go on from if it is there, and to write after every `log_every` updates. The same settings,
+            environment and key are needed; the result is that of an uninterrupted run to the bit.
+
+    Raises:
+        ValueError: if a number is below 1, or the checkpoint is of another run.
+    """
+    settings = Settings() if settings is None else settings
+    for name, number in (("num_updates", num_updates), ("log_every", log_every)):
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    learner = jax.jit(functools.partial(begin, environment, settings=settings, num_updates=num_updates))(key)
+    step = functools.partial(update, environment, settings=settings, num_updates=num_updates)
+    history = {name: jnp.zeros(0, x.dtype) for name, x in jax.eval_shape(step, learner)[1].items()}
+    path = None if checkpoint is None else Path(checkpoint)
+    fingerprint = _fingerprint(environment, settings, num_updates, key)
+    if path is not None and path.is_file():
+        learner, history = checkpoints.load(path, (learner, history), fingerprint)
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def some(learner: Learner, count: int) -> tuple[Learner, dict[str, Float[Array, " updates"]]]:
+        return jax.lax.scan(lambda now, _: step(now), learner, length=count)
+
+    while (done := int(learner.num_updates)) < num_updates:
+        learner, found = some(learner, min(log_every, num_updates - done))
+        history = {name: jnp.concatenate([before, found[name]]) for name, before in history.items()}
+        if path is not None:
+            checkpoints.save(path, (learner, history), fingerprint)
+        if log is not None:
+            log(int(learner.num_updates), {name: float(jnp.nanmean(values)) for name, values in found.items()})
+    return Learned(learner.policy, history, learner)
+
+
+def _fingerprint(environment: Environment, settings: Settings, num_updates: int, key: PRNGKeyArray) -> dict[str, Any]:
+    """Return what must agree between a checkpoint and the run that goes on from it."""
+    return {
+        "settings": repr(settings),
+        "num_updates": num_updates,
+        "environment": type(environment).__qualname__,
+        "numbers of the environment": checkpoints.digest(eqx.filter(environment, eqx.is_array)),
+        "key": checkpoints.digest(key),
+    }

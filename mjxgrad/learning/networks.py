@@ -1,0 +1,89 @@
+"""What learns: networks with layer normalisation, and running moments of what they see."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mjxgrad.policy import FINAL_SCALE
+
+
+class Network(eqx.Module):
+    """A multilayer perceptron whose hidden layers end in an exponential linear unit and layer normalisation.
+
+    References:
+        Xu et al. Accelerated Policy Learning with Parallel Differentiable Simulation. ICLR 2022, arXiv:2204.07137.
+    """
+
+    layers: tuple[eqx.nn.Linear, ...]
+    norms: tuple[eqx.nn.LayerNorm, ...]
+
+    @classmethod
+    def make(cls, sizes: Sequence[int], key: PRNGKeyArray, *, final_scale: float = 1.0) -> "Network":
+        """Draw one.
+
+        Args:
+            sizes: numbers of inputs, of each hidden layer, of outputs.
+            key: consumed here.
+            final_scale: what the gains of the last layer are multiplied with.
+        """
+        keys = jax.random.split(key, len(sizes) - 1)
+        layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]
+        last = layers[-1]
+        layers[-1] = eqx.tree_at(lambda x: (x.weight, x.bias), last, (final_scale * last.weight, 0 * last.bias))
+        return cls(tuple(layers), tuple(eqx.nn.LayerNorm(size) for size in sizes[1:-1]))
+
+    def __call__(self, inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        *hidden, last = self.layers
+        for layer, norm in zip(hidden, self.norms, strict=True):
+            inputs = norm(jax.nn.elu(layer(inputs)))
+        return last(inputs)
+
+
+class Normaliser(eqx.Module):
+    """Mean and variance of all observations so far, by which they are shifted and scaled.
+
+    References:
+        Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample variances. COMPSTAT 1982,
+        equation 2.1.
+    """
+
+    count: Float[Array, ""]
+    mean: Float[Array, " obs"]
+    squares: Float[Array, " obs"]
+
+    @classmethod
+    def make(cls, size: int) -> "Normaliser":
+        """Begin with no observations, by which nothing is changed."""
+        return cls(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
+
+    def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+        variance = jnp.where(self.count > 1, self.squares / jnp.maximum(self.count, 1), 1.0)
+        # A number that never changes is left as it is.
+        return (obs - self.mean) / jnp.where(variance > 1e-8, jnp.sqrt(variance), 1.0)
+
+    def with_more(self, obs: Float[Array, "*batch obs"]) -> "Normaliser":
+        """Return the moments with more observations in them; those that are not finite are left out."""
+        rows = obs.reshape(-1, obs.shape[-1])
+        is_sound = jnp.isfinite(rows).all(axis=1, keepdims=True)
+        added = is_sound.sum().astype(self.count.dtype)
+        rows = jnp.where(is_sound, rows, 0)
+        mean = rows.sum(axis=0) / jnp.maximum(added, 1)
+        squares = jnp.where(is_sound, (rows - mean) ** 2, 0).sum(axis=0)
+        count, shift = self.count + added, mean - self.mean
+        share = added / jnp.maximum(count, 1)
+        return Normaliser(count, self.mean + share * shift, self.squares + squares + shift**2 * self.count * share)
+
+
+def make_actor(num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray) -> Network:
+    """Draw a network for actions before their squashing, which begin near zero."""
+    return Network.make([num_observations, *hidden, num_actions], key, final_scale=FINAL_SCALE)
+
+
+def make_critic(
+    num_observations: int, hidden: Sequence[int], key: PRNGKeyArray, *, final_scale: float = 1.0
+) -> Network:
+    """Draw a network for the value of an observation."""
+    return Network.make([num_observations, *hidden, 1], key, final_scale=final_scale)

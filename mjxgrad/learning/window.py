@@ -1,0 +1,241 @@
+r"""One short window in all environments, and two gradients of what it returns, by the action of every step.
+
+A window of $H$ steps under the policy $u_t = \mu_\theta(o_t) + \sigma w_t$, action $\tanh u_t$, returns
+$J = \sum_{t<H} \gamma^t r_t + \gamma^H V(o_H)$; where an episode ends within, the sum starts anew, after $V$ of its last
+observation if only its time was up. Two gradients by $u_t$:
+
+- first order, $\lambda_t = dJ/du_t$ through physics, policy and value function, by one reverse pass;
+- zeroth order, $z_t = \gamma^t A_t\, w_t/\sigma$ with the advantage $A_t = \sum_{k \ge t} \gamma^{k-t} r_k + \ldots - V(o_t)$.
+
+Both have the mean of $J$'s gradient where nothing jumps, the second one everywhere. Either goes to the parameters by one pull-back,
+$\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the observations as they were. So they can be compared, and mixed, by
+step and action, and a derivative that is not finite is seen where it arises.
+
+References:
+    Xu et al. Accelerated Policy Learning with Parallel Differentiable Simulation. ICLR 2022, arXiv:2204.07137 (the window).
+    Onoda et al., arXiv:2604.18161 (the mixture by step).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from mjxgrad.envs import Environment, EnvState
+from mjxgrad.estimators.moments import Moments, as_real
+from mjxgrad.estimators.rules import Evidence, Rule, Weights
+from mjxgrad.learning.networks import Network, Normaliser
+
+Value = Callable[[Float[Array, " obs"]], Float[Array, ""]]
+
+
+class Window(eqx.Module):
+    """What happened in one environment, step by step; under `jax.vmap` every field gains leading axes.
+
+    Attributes:
+        obs: in which an action was chosen.
+        next_obs: to which it led, before any reset.
+        rewards: for it.
+        terminated: whether the episode ended for good.
+        truncated: whether its time was up.
+        metrics: the terms of the rewards, and `diverged`.
+    """
+
+    obs: Float[Array, "steps obs"]
+    next_obs: Float[Array, "steps obs"]
+    rewards: Float[Array, " steps"]
+    terminated: Bool[Array, " steps"]
+    truncated: Bool[Array, " steps"]
+    metrics: dict[str, Float[Array, " steps"]]
+
+    def next_values(self, value: Value) -> Float[Array, " steps"]:
+        """Return the values after each step; an episode that ended for good has none."""
+        return jnp.where(self.terminated, 0.0, jax.vmap(value)(self.next_obs))
+
+    @property
+    def done(self) -> Bool[Array, "*batch steps"]:
+        return self.terminated | self.truncated
+
+
+class Gradients(eqx.Module):
+    """Both gradients of the windows' returns, by step and action before squashing; the first leading axis is the environment's.
+
+    Attributes:
+        first: of first order.
+        zeroth: of zeroth order.
+        is_finite: whether the first-order one is a number, for all actions of a step.
+    """
+
+    first: Float[Array, "environments steps nu"]
+    zeroth: Float[Array, "environments steps nu"]
+    is_finite: Bool[Array, "environments steps"]
+
+
+def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
+    r"""Return $J$ of a window."""
+    following = window.next_values(value)
+    is_last = window.done.at[-1].set(True)
+
+    def add(weight: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        reward, after, is_over = now
+        part = weight * (reward + jnp.where(is_over, discount * after, 0))
+        return jnp.where(is_over, 1.0, discount * weight), part
+
+    one = jnp.ones((), window.rewards.dtype)
+    return jax.lax.scan(add, one, (window.rewards, following, is_last))[1].sum()
+
+
+def lambda_returns(window: Window, value: Value, discount: float, trace: float) -> Float[Array, " steps"]:
+    r"""Return TD($\lambda$) targets of the values, $G_t = r_t + \gamma((1 - \lambda)V_{t+1} + \lambda G_{t+1})$.
+
+    With $\lambda = 1$ they are the discounted sums to the end of the window.
+
+    References:
+        Sutton, Barto. Reinforcement Learning: An Introduction, 2nd edition, 2018, equation 12.20.
+    """
+    following = window.next_values(value)
+    is_last = window.done.at[-1].set(True)
+
+    def add(later: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        reward, after, is_over = now
+        target = reward + discount * jnp.where(is_over, after, (1 - trace) * after + trace * later)
+        return target, target
+
+    zero = jnp.zeros((), window.rewards.dtype)
+    return jax.lax.scan(add, zero, (window.rewards, following, is_last), reverse=True)[1]
+
+
+def weights_in_return(window: Window, discount: float) -> Float[Array, " steps"]:
+    r"""Return $\gamma^t$ of each step, counted from the window's start or the last reset."""
+    one = jnp.ones((), window.rewards.dtype)
+
+    def count(weight: Array, is_over: Array) -> tuple[Array, Array]:
+        return jnp.where(is_over, 1.0, discount * weight), weight
+
+    return jax.lax.scan(count, one, window.done)[1]
+
+
+def run_window(
+    environment: Environment,
+    state: EnvState,
+    actor: Network,
+    normaliser: Normaliser,
+    noise: Float[Array, "steps nu"],
+    change: Float[Array, "steps nu"] | None = None,
+) -> tuple[Window, EnvState]:
+    """Let a policy act for as many steps as there are rows of noise.
+
+    Args:
+        environment: of one copy.
+        state: to go on from.
+        actor: from normalised observations to actions before their squashing.
+        normaliser: of observations.
+        noise: added before the squashing.
+        change: added, too; to differentiate by.
+
+    Returns:
+        What happened, and where to go on.
+    """
+
+    def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
+        action = jnp.tanh(actor(normaliser(state.obs)) + added)
+        stepped, following = environment.step_on(state, action)
+        ends = (stepped.terminated, stepped.truncated)
+        return following, Window(state.obs, stepped.obs, stepped.reward, *ends, stepped.metrics)
+
+    final, window = jax.lax.scan(advance, state, noise if change is None else noise + change)
+    return window, final
+
+
+def window_gradients(
+    environment: Environment,
+    state: EnvState,
+    model_key: PRNGKeyArray,
+    noise: Float[Array, "steps nu"],
+    actor: Network,
+    critic: Network,
+    normaliser: Normaliser,
+    stddev: Float[Array, ""],
+    discount: float,
+) -> tuple[Window, EnvState, Gradients]:
+    """Run a window in one environment and differentiate what it returns; under `jax.vmap`, in many.
+
+    Args:
+        environment: before it is randomised.
+        state: to go on from.
+        model_key: of this copy's model.
+        noise: standard normal.
+        actor: of the actions' means.
+        critic: of the values.
+        normaliser: of observations.
+        stddev: of the noise on the actions before their squashing.
+        discount: per step.
+    """
+    copy = environment.randomised(model_key)
+
+    def value(obs: Float[Array, " obs"]) -> Float[Array, ""]:
+        return critic(normaliser(obs))[0]
+
+    def gain(change: Float[Array, "steps nu"]):
+        window, final = run_window(copy, state, actor, normaliser, stddev * noise, change)
+        return returned(window, value, discount), (window, final)
+
+    first, (window, final) = jax.grad(gain, has_aux=True)(jnp.zeros_like(noise))
+    advantages = lambda_returns(window, value, discount, 1.0) - jax.vmap(value)(window.obs)
+    zeroth = (weights_in_return(window, discount) * advantages)[:, None] * noise / stddev
+    return window, final, Gradients(first, zeroth, jnp.isfinite(first).all(axis=1))
+
+
+def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
+    """Weigh both gradients by step and action.
+
+    Where a first-order one is not finite, the zeroth-order one stands in.
+
+    Args:
+        gradients: of all environments.
+        rule: from the evidence of a step and action to its weight. It learns nothing of differences between costs
+            (`inconsistency` is zero), since no two environments share a start.
+
+    Returns:
+        The mixture, the weights by step and action, and what they were made of.
+    """
+
+    def moments(samples: Float[Array, "environments nu"], mask: Bool[Array, " environments"]) -> Moments:
+        return Moments.of(samples, mask)
+
+    by_step = jax.vmap(moments, in_axes=1)
+    first = by_step(gradients.first, gradients.is_finite)
+    zeroth = by_step(gradients.zeroth, jnp.ones_like(gradients.is_finite))
+    difference = by_step(gradients.zeroth - gradients.first, gradients.is_finite)
+    evidence = _evidence(first, zeroth, difference)
+    weights = jax.vmap(jax.vmap(rule))(evidence)
+    alpha = jnp.where(evidence.count >= 2, weights.alpha, 0)
+    share = jnp.where(gradients.is_finite[..., None], alpha, 0)
+    derivative = jnp.where(gradients.is_finite[..., None], gradients.first, 0)
+    return share * derivative + (1 - share) * gradients.zeroth, eqx.tree_at(lambda w: w.alpha, weights, alpha), evidence
+
+
+def _evidence(first: Moments, zeroth: Moments, difference: Moments) -> Evidence:
+    """Return what a rule may look at, of each step and action."""
+    zero, unknown = jnp.zeros_like(first.offset), jnp.full_like(first.offset, jnp.nan)
+    return Evidence(
+        count=jnp.broadcast_to(first.count[:, None], zero.shape),
+        dim=jnp.ones_like(zero),
+        first_norm=jnp.abs(first.mean),
+        zeroth_norm=jnp.abs(zeroth.mean),
+        difference_norm=jnp.abs(difference.mean),
+        first_variance=_variance(first),
+        zeroth_variance=_variance(zeroth),
+        difference_variance=_variance(difference),
+        inconsistency=zero,
+        relative_bias_bound=unknown,
+        cost_variance=unknown,
+        scaled_first_variance=unknown,
+        scaled_first_norm=unknown,
+    )
+
+
+def _variance(moments: Moments) -> Float[Array, "steps nu"]:
+    return moments.squares / as_real(jnp.maximum(moments.count - 1, 1), moments.squares)[:, None]
