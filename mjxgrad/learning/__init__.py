@@ -1,6 +1,21 @@
 """Policies learned through contact: short windows with a value function, by first order, zeroth order, or a mixture."""
 
-from mjxgrad.learning.learn import Learned, Log, learn
+from mjxgrad.learning.evaluate import Evaluation, evaluate
+from mjxgrad.learning.learn import Learned, learn
 from mjxgrad.learning.learner import Learner, Policy, Settings
+from mjxgrad.learning.logs import Log, to_all, to_csv, to_tensorboard, to_tracker
 
-__all__ = ["Learned", "Learner", "Log", "Policy", "Settings", "learn"]
+__all__ = [
+    "Evaluation",
+    "Learned",
+    "Learner",
+    "Log",
+    "Policy",
+    "Settings",
+    "evaluate",
+    "learn",
+    "to_all",
+    "to_csv",
+    "to_tensorboard",
+    "to_tracker",
+]

@@ -26,14 +26,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import Learner, Policy, Settings, begin
+from mjxgrad.learning.logs import Log
 from mjxgrad.learning.update import update
 from mjxgrad.optimiser import checkpoint as checkpoints
-
-Log = Callable[[int, dict[str, float]], Any]
 
 
 class Learned(eqx.Module):
@@ -90,26 +91,51 @@ def learn(
     for name, number in (("num_updates", num_updates), ("log_every", log_every)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    learner = jax.jit(functools.partial(begin, environment, settings=settings, num_updates=num_updates))(key)
+    place, jit = _on_all_devices()
+    start = functools.partial(begin, environment, settings=settings, num_updates=num_updates)
     step = functools.partial(update, environment, settings=settings, num_updates=num_updates)
-    history = {name: jnp.zeros(0, x.dtype) for name, x in jax.eval_shape(step, learner)[1].items()}
+    # As numbers on the host, a key is the same in all processes.
+    numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
+    learner = jit(lambda numbers: start(jax.random.wrap_key_data(numbers, impl=kind)))(numbers)
+    history = {name: np.zeros(0, x.dtype) for name, x in jax.eval_shape(step, learner)[1].items()}
     path = None if checkpoint is None else Path(checkpoint)
     fingerprint = _fingerprint(environment, settings, num_updates, key)
     if path is not None and path.is_file():
         learner, history = checkpoints.load(path, (learner, history), fingerprint)
+        learner = place(learner)
 
-    @functools.partial(jax.jit, static_argnums=1)
-    def some(learner: Learner, count: int) -> tuple[Learner, dict[str, Float[Array, " updates"]]]:
-        return jax.lax.scan(lambda now, _: step(now), learner, length=count)
+    @functools.lru_cache
+    def several(count: int) -> Callable[[Learner], tuple[Learner, dict[str, Array]]]:
+        return jit(lambda learner: jax.lax.scan(lambda now, _: step(now), learner, length=count))
 
+    is_first = jax.process_index() == 0
     while (done := int(learner.num_updates)) < num_updates:
-        learner, found = some(learner, min(log_every, num_updates - done))
-        history = {name: jnp.concatenate([before, found[name]]) for name, before in history.items()}
-        if path is not None:
+        learner, found = several(min(log_every, num_updates - done))(learner)
+        found = {name: np.asarray(values) for name, values in found.items()}
+        history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
+        if path is not None and is_first:
             checkpoints.save(path, (learner, history), fingerprint)
-        if log is not None:
-            log(int(learner.num_updates), {name: float(jnp.nanmean(values)) for name, values in found.items()})
-    return Learned(learner.policy, history, learner)
+        if log is not None and is_first:
+            log(int(learner.num_updates), {name: _mean(values) for name, values in found.items()})
+    return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
+
+
+def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Callable]]:
+    """Return how to place arrays, and how to compile what gives arrays, that all devices of all processes are to have."""
+    devices = jax.devices()
+    if len(devices) == 1:
+        return lambda tree: tree, jax.jit
+    if jax.process_count() > 1:
+        # Meet before compiling: by how much that differs in time can exceed the deadline for connecting.
+        sync_global_devices("learn")
+    whole = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec())
+    return functools.partial(jax.device_put, device=whole), functools.partial(jax.jit, out_shardings=whole)
+
+
+def _mean(values: np.ndarray) -> float:
+    """Return the mean of what is a number; NaN if nothing is."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")
 
 
 def _fingerprint(environment: Environment, settings: Settings, num_updates: int, key: PRNGKeyArray) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class Network(eqx.Module):
         keys = jax.random.split(key, len(sizes) - 1)
         layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]
         last = layers[-1]
-        layers[-1] = eqx.tree_at(lambda x: (x.weight, x.bias), last, (final_scale * last.weight, 0 * last.bias))
+        layers[-1] = eqx.tree_at(lambda x: (x.weight, x.bias), last, (final_scale * last.weight, jnp.zeros(sizes[-1])))
         return cls(tuple(layers), tuple(eqx.nn.LayerNorm(size) for size in sizes[1:-1]))
 
     def __call__(self, inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:

@@ -1,6 +1,6 @@
 """One update: a window in every environment, a step of the policy, a fit of the value function."""
 
-import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,8 +36,7 @@ def update(
     critic, target, critic_moments, critic_loss = learner.critic, learner.target, learner.critic_moments, jnp.zeros(())
     if not settings.is_episodic:
         critic, critic_moments, critic_loss = _fit_critic(learner, window, critic_key, settings, num_updates)
-        follow = functools.partial(optax.incremental_update, step_size=settings.target_rate)
-        target = follow(critic, learner.target)
+        target = jax.tree.map(lambda old, new: old + settings.target_rate * (new - old), learner.target, critic)
     so_far = jnp.zeros_like(learner.episode_return) if settings.is_episodic else learner.episode_return
     episode_return, ended = _episodes(window, so_far)
     following = Learner(
@@ -100,8 +99,7 @@ def _improve(
     norm = optax.tree.norm(gradient)
     is_finite = jnp.isfinite(norm)
     optimiser, _ = optimisers(settings, num_updates)
-    changes, moments = optimiser.update(gradient, learner.actor_moments, policy.actor)
-    new = (optax.apply_updates(policy.actor, changes), moments)
+    new = _stepped(optimiser, gradient, learner.actor_moments, policy.actor)
     actor, moments = jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), new, (policy.actor, learner.actor_moments))
     found = {
         "alpha": weights.alpha.mean(),
@@ -134,8 +132,7 @@ def _fit_critic(
     def fit(carry: tuple[Network, optax.OptState], rows: Array):
         critic, moments = carry
         value, gradient = jax.value_and_grad(loss)(critic, seen[rows], wanted[rows])
-        changes, moments = optimiser.update(gradient, moments, critic)
-        return (optax.apply_updates(critic, changes), moments), value
+        return _stepped(optimiser, gradient, moments, critic), value
 
     orders = jax.vmap(lambda k: jax.random.permutation(k, len(wanted)))(
         jax.random.split(key, settings.critic_iterations)
@@ -143,6 +140,13 @@ def _fit_critic(
     rows = orders.reshape(settings.critic_iterations * settings.critic_batches, -1)
     (critic, moments), losses = jax.lax.scan(fit, (learner.critic, learner.critic_moments), rows)
     return critic, moments, losses[-settings.critic_batches :].mean()
+
+
+def _stepped(
+    optimiser: optax.GradientTransformation, gradient: Any, moments: optax.OptState, network: Network
+) -> tuple[Network, optax.OptState]:
+    changes, moments = optimiser.update(gradient, moments)
+    return eqx.apply_updates(network, changes), moments
 
 
 def _episodes(window: Window, so_far: Float[Array, " environments"]) -> tuple[Float[Array, " environments"], Metrics]:

@@ -7,7 +7,7 @@ observation if only its time was up. Two gradients by $u_t$:
 - first order, $\lambda_t = dJ/du_t$ through physics, policy and value function, by one reverse pass;
 - zeroth order, $z_t = \gamma^t A_t\, w_t/\sigma$ with the advantage $A_t = \sum_{k \ge t} \gamma^{k-t} r_k + \ldots - V(o_t)$.
 
-Both have the mean of $J$'s gradient where nothing jumps, the second one everywhere. Either goes to the parameters by one pull-back,
+Both are $J$'s gradient in the mean where nothing jumps, the second everywhere. Either goes to the parameters by one pull-back,
 $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the observations as they were. So they can be compared, and mixed, by
 step and action, and a derivative that is not finite is seen where it arises.
 

@@ -157,7 +157,8 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
     try:
-        mjx_model = mjx.put_model(model, impl="jax")
+        # Of several processes each has its own; MJX would take the first of all.
+        mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         return mjx_model, _make_data(model, mjx_model, max_contacts)
     except NotImplementedError as error:
         raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
@@ -166,7 +167,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
     """Data of MJX with room for so many contacts, also for frictionless ones beside elliptic ones, which MJX refuses."""
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    data = mjx.make_data(model, impl="jax")
+    data = mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
     model.opt.cone = cone
     dims = np.asarray(data._impl.contact.dim)
     of_dim = [np.flatnonzero(dims == dim)[:max_contacts] for dim in np.unique(dims)]

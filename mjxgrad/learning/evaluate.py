@@ -1,0 +1,71 @@
+"""What a policy is worth, judged in C MuJoCo rather than in the simulator that it was trained in."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from mjxgrad._rollout import Engine
+from mjxgrad.envs import Environment, EnvState
+
+
+class Evaluation(eqx.Module):
+    """Some episodes without noise on the actions, each from a start of its own.
+
+    Attributes:
+        returns: sum of the rewards.
+        lengths: actions until the end.
+        terminated: whether an episode ended before its time.
+        qpos: positions at each action and after the last; from an end on they stay.
+        obs: likewise, what the policy saw.
+    """
+
+    returns: Float[Array, " episodes"]
+    lengths: Int[Array, " episodes"]
+    terminated: Bool[Array, " episodes"]
+    qpos: Float[Array, "episodes states nq"]
+    obs: Float[Array, "episodes states obs"]
+
+
+def evaluate(
+    environment: Environment,
+    policy: Callable[[Float[Array, " obs"]], Float[Array, " nu"]],
+    key: PRNGKeyArray,
+    *,
+    num_episodes: int,
+    engine: Engine = "mujoco",
+) -> Evaluation:
+    """Run a policy for whole episodes.
+
+    Args:
+        environment: its model as it is, without randomisation.
+        policy: from what is seen to an action.
+        key: for the starts; consumed here.
+        num_episodes: at least 1.
+        engine: "mujoco" for C MuJoCo and its own contact, "mjx" for the step that the environment has.
+
+    Raises:
+        ValueError: if there are no episodes, or no such engine.
+    """
+    if num_episodes < 1:
+        raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
+    judge = environment if engine == "mjx" else environment.with_engine(engine)
+
+    def one(key: PRNGKeyArray) -> Evaluation:
+        start = judge.reset(key)
+
+        def advance(carry: tuple[EnvState, Array, Array], _):
+            state, total, length = carry
+            stepped = judge.step(state, policy(state.obs))
+            following = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, stepped)
+            total = total + jnp.where(state.done, 0.0, stepped.reward)
+            return (following, total, length + ~state.done), (following.physics.qpos, following.obs)
+
+        first = (start, jnp.zeros_like(start.reward), jnp.zeros((), jnp.int32))
+        (final, total, length), (qpos, obs) = jax.lax.scan(advance, first, length=judge.episode_length)
+        qpos = jnp.concatenate([start.physics.qpos[None], qpos])
+        return Evaluation(total, length, final.terminated, qpos, jnp.concatenate([start.obs[None], obs]))
+
+    return jax.jit(jax.vmap(one))(jax.random.split(key, num_episodes))
