@@ -60,5 +60,7 @@ def test_one_device_is_vmap():
 
 def test_arguments_without_a_common_batch_are_refused():
     function = mg.over_devices(lambda x, y: x + y, jax.devices()[:1] * 2)
-    with pytest.raises(ValueError, match="all arguments must have the batch as leading axis, of one size"):
+    with pytest.raises(
+        ValueError, match="all arguments that are not shared must have the batch as leading axis, of one size"
+    ):
         function(jnp.ones(4), jnp.ones(3))

@@ -22,11 +22,11 @@ class Evaluation(eqx.Module):
         obs: likewise, what the policy saw.
     """
 
-    returns: Float[Array, " episodes"]
-    lengths: Int[Array, " episodes"]
-    terminated: Bool[Array, " episodes"]
-    qpos: Float[Array, "episodes states nq"]
-    obs: Float[Array, "episodes states obs"]
+    returns: Float[Array, "*episodes"]
+    lengths: Int[Array, "*episodes"]
+    terminated: Bool[Array, "*episodes"]
+    qpos: Float[Array, "*episodes states nq"]
+    obs: Float[Array, "*episodes states obs"]
 
 
 def evaluate(

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.estimators.rules import Consistent, Rule
@@ -105,7 +105,7 @@ class Learner(eqx.Module):
     actor_moments: optax.OptState
     critic_moments: optax.OptState
     environments: EnvState
-    model_keys: PRNGKeyArray
+    model_keys: Key[Array, " environments"]
     episode_return: Float[Array, " environments"]
     num_updates: Int[Array, ""]
     key: PRNGKeyArray
@@ -137,7 +137,7 @@ def begin(environment: Environment, key: PRNGKeyArray, *, settings: Settings, nu
     )
 
 
-def starts(environment: Environment, model_keys: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:
+def starts(environment: Environment, model_keys: Key[Array, " environments"], key: PRNGKeyArray) -> EnvState:
     """Begin an episode in each copy."""
 
     def start(model_key: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:

@@ -32,7 +32,7 @@ Value = Callable[[Float[Array, " obs"]], Float[Array, ""]]
 
 
 class Window(eqx.Module):
-    """What happened in one environment, step by step; under `jax.vmap` every field gains leading axes.
+    """What happened in one environment, step by step (of one step there is no axis); under `jax.vmap` fields gain leading axes.
 
     Attributes:
         obs: in which an action was chosen.
@@ -43,24 +43,24 @@ class Window(eqx.Module):
         metrics: the terms of the rewards, and `diverged`.
     """
 
-    obs: Float[Array, "steps obs"]
-    next_obs: Float[Array, "steps obs"]
-    rewards: Float[Array, " steps"]
-    terminated: Bool[Array, " steps"]
-    truncated: Bool[Array, " steps"]
-    metrics: dict[str, Float[Array, " steps"]]
+    obs: Float[Array, "*steps obs"]
+    next_obs: Float[Array, "*steps obs"]
+    rewards: Float[Array, "*steps"]
+    terminated: Bool[Array, "*steps"]
+    truncated: Bool[Array, "*steps"]
+    metrics: dict[str, Float[Array, "*steps"]]
 
     def next_values(self, value: Value) -> Float[Array, " steps"]:
         """Return the values after each step; an episode that ended for good has none."""
         return jnp.where(self.terminated, 0.0, jax.vmap(value)(self.next_obs))
 
     @property
-    def done(self) -> Bool[Array, "*batch steps"]:
+    def done(self) -> Bool[Array, "*steps"]:
         return self.terminated | self.truncated
 
 
 class Gradients(eqx.Module):
-    """Both gradients of the windows' returns, by step and action before squashing; the first leading axis is the environment's.
+    """Both gradients of what a window returns, by step and action before squashing; under `jax.vmap` of many.
 
     Attributes:
         first: of first order.
@@ -68,9 +68,9 @@ class Gradients(eqx.Module):
         is_finite: whether the first-order one is a number, for all actions of a step.
     """
 
-    first: Float[Array, "environments steps nu"]
-    zeroth: Float[Array, "environments steps nu"]
-    is_finite: Bool[Array, "environments steps"]
+    first: Float[Array, "*environments steps nu"]
+    zeroth: Float[Array, "*environments steps nu"]
+    is_finite: Bool[Array, "*environments steps"]
 
 
 def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:

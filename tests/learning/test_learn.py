@@ -1,0 +1,227 @@
+"""The loop: it goes on to the bit, says what it left out, and ends with a policy that does the job in C MuJoCo."""
+
+import functools
+import os
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from mjxgrad import envs, learning
+from mjxgrad.envs.diffrl import CartPole
+from mjxgrad.estimators.rules import FixedAlpha
+from mjxgrad.learning.logs import to_all, to_csv, to_tracker
+
+SMALL = learning.Settings(num_environments=4, window=3, actor_layers=(6,), critic_layers=(6,), critic_iterations=2)
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    return envs.load("diffrl_cartpole")
+
+
+def same(a, b):
+    as_numbers = functools.partial(jax.tree.map, lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x))
+    return jax.tree.all(jax.tree.map(np.array_equal, as_numbers(a), as_numbers(b)))
+
+
+def _is_key(x):
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
+    learn = functools.partial(learning.learn, cartpole, key, num_updates=2, log_every=1, settings=SMALL)
+    whole = learn()
+
+    def stop(update, metrics):
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        learn(checkpoint=tmp_path / "run", log=stop)
+    resumed = learn(checkpoint=tmp_path / "run")
+    assert same(resumed.learner, whole.learner)
+    assert all(np.array_equal(resumed.history[name], whole.history[name], equal_nan=True) for name in whole.history)
+    assert not same(resumed.policy.actor, learning.learn(cartpole, key, num_updates=1, settings=SMALL).policy.actor)
+    other = learning.Settings(num_environments=4, window=3, discount=0.9)
+    with pytest.raises(ValueError, match=r"of the same run, got .* settings was Settings"):
+        learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
+
+
+class Cornered(CartPole):
+    """Its reward has an infinite slope where the action is zero, which the first window's first environment begins with."""
+
+    def rewards(self, before, action, after, memory):
+        terms = super().rewards(before, action, after, memory)
+        return {**terms, "corner": jnp.sqrt(jnp.where(after.qpos[0] > 0, 0.0 * action[0], 1.0))}
+
+
+def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key):
+    """Where the cart is to the right the derivative of √0 makes NaN of that window's, up to there."""
+    cornered = Cornered(cartpole.scene, frame_skip=2)
+    run = learning.learn(cornered, key, num_updates=1, log_every=1, settings=SMALL)
+    assert 0 < run.history["not_finite"][0] < 1
+    assert run.history["skipped"][0] == 0
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(run.policy.actor))
+
+
+class Lost(CartPole):
+    """A reward that is no number."""
+
+    def rewards(self, before, action, after, memory):
+        return {"lost": after.qpos[0] * jnp.nan}
+
+
+def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
+    start = learning.learner.begin(Lost(cartpole.scene), key, settings=SMALL, num_updates=1)
+    run = learning.learn(Lost(cartpole.scene), key, num_updates=1, settings=SMALL)
+    assert run.history["skipped"][0] == 1
+    assert same(run.policy.actor, start.policy.actor)
+
+
+def test_a_policy_is_judged_by_mujoco_itself(cartpole, key):
+    """Against a loop around mj_step, from the same start, by a policy that pushes by the pole's lean; 20 actions of two steps."""
+    short = CartPole(cartpole.scene, frame_skip=2, episode_length=20)
+
+    def policy(obs):
+        return 0.8 * obs[2:3] - 0.1 * obs[1:2]
+
+    found = learning.evaluate(short, policy, key, num_episodes=1)
+    start = short.reset(jax.random.split(key, 1)[0])
+    model = cartpole.scene.to_mujoco()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = start.physics.qpos, start.physics.qvel
+    total = 0.0
+    for _ in range(20):
+        place, angle, speed, rate = *data.qpos, *data.qvel
+        data.ctrl[:] = 0.8 * np.sin(angle) - 0.1 * speed
+        mujoco.mj_step(model, data, 2)
+        place, angle, speed, rate = *data.qpos, *data.qvel
+        upward = np.arctan2(np.sin(angle), np.cos(angle))
+        total -= upward**2 + 0.1 * rate**2 + 0.05 * place**2 + 0.1 * speed**2
+    assert_allclose(found.returns[0], total, rtol=1e-9)
+    assert_allclose(found.qpos[0, -1], data.qpos, rtol=1e-9)
+
+
+class Falls(CartPole):
+    """Over as soon as the pole has turned by a quarter from where it hung."""
+
+    def start(self, key):
+        return self.reset_at(jnp.array([0.0, 1.0]))
+
+    def reset_at(self, qpos):
+        from mjxgrad import initial_state
+
+        return initial_state(self.scene, qpos)
+
+    def is_over(self, state):
+        return state.qpos[1] > 2.0
+
+
+def test_an_evaluation_ends_with_the_episode(cartpole, key):
+    """The pole falls from 1 rad; what would follow 2 rad is not counted."""
+    falls = Falls(cartpole.scene, frame_skip=2, episode_length=60)
+    found = learning.evaluate(falls, lambda obs: jnp.zeros(1), key, num_episodes=1)
+    length = int(found.lengths[0])
+    assert bool(found.terminated[0])
+    assert 1 < length < 60
+    angles = np.asarray(found.qpos[0, :, 1])
+    assert angles[length - 1] <= 2.0 < angles[length]
+    assert_allclose(angles[length:], angles[length])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"discount": 1.5}, "discount must be from 0 to 1, got 1.5"),
+        ({"stddev": (0.1, 0.0)}, "stddev must be positive"),
+        ({"critic_batches": 5}, "critic_batches must divide the 2048 states of an update, got 5"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        learning.Settings(**change)
+
+
+def test_logs_reach_a_file_and_a_tracker(tmp_path):
+    class Run:
+        def __init__(self):
+            self.calls = []
+
+        def log(self, metrics, step):
+            self.calls.append((step, metrics))
+
+    run = Run()
+    log = to_all(to_csv(tmp_path / "run.csv"), to_tracker(run))
+    log(10, {"reward": 1.5, "alpha": 1.0})
+    log(20, {"reward": 2.5, "alpha": 0.5})
+    assert (tmp_path / "run.csv").read_text().splitlines() == ["step,reward,alpha", "10,1.5,1.0", "20,2.5,0.5"]
+    assert run.calls == [(10, {"reward": 1.5, "alpha": 1.0}), (20, {"reward": 2.5, "alpha": 0.5})]
+    with pytest.raises(ValueError, match="must have the columns step, cost"):
+        to_csv(tmp_path / "run.csv")(30, {"cost": 1.0})
+
+
+_PROGRAM = """
+    import sys
+
+    import jax
+    import numpy as np
+
+    jax.config.update("jax_enable_x64", True)
+    kind, path, index, port = sys.argv[1:]
+    if kind == "devices":
+        jax.config.update("jax_num_cpu_devices", 4)
+    elif kind == "processes":
+        jax.distributed.initialize(f"localhost:{port}", 2, int(index))
+    from mjxgrad import envs, learning
+
+    small = learning.Settings(num_environments=8, window=3, actor_layers=(6,), critic_layers=(6,))
+    run = learning.learn(envs.load("diffrl_cartpole"), jax.random.key(0), num_updates=2, settings=small, checkpoint=path)
+    assert jax.device_count() == {"one": 1, "devices": 4, "processes": 2}[kind]
+    if jax.process_index() == 0:
+        np.savez(path + ".npz", *map(np.asarray, jax.tree.leaves(run.policy)))
+"""
+
+
+def _numbers(kind, folder, count=1):
+    """Learn in so many processes and return the policy's numbers."""
+    path = str(folder / kind)
+    arguments = [sys.executable, "-c", textwrap.dedent(_PROGRAM), kind, path]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    runs = [
+        subprocess.Popen([*arguments, str(i), "29417"], env=environment, stderr=subprocess.PIPE, text=True)
+        for i in range(count)
+    ]
+    for run in runs:
+        _, errors = run.communicate(timeout=600)
+        assert run.returncode == 0, errors
+    with np.load(f"{path}.npz") as archive:
+        return [archive[name] for name in archive.files]
+
+
+@pytest.mark.slow
+def test_several_devices_and_processes_learn_the_same(tmp_path):
+    """Sums over environments are done in another order: some digits of the last places, times two updates of Adam."""
+    one = _numbers("one", tmp_path)
+    for kind, count in (("devices", 1), ("processes", 2)):
+        for mine, theirs in zip(one, _numbers(kind, tmp_path, count), strict=True):
+            assert_allclose(mine, theirs, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_swing_up_is_learned_in_minutes(cartpole):
+    """Upright, within 0.2 rad, in the last second in C MuJoCo, from nine of ten starts."""
+    settings = learning.Settings(rule=FixedAlpha(1.0))
+    run = learning.learn(cartpole, jax.random.key(0), num_updates=400, settings=settings)
+    judged = learning.evaluate(cartpole, run.policy, jax.random.key(1), num_episodes=20)
+    assert np.mean(np.all(np.cos(judged.qpos[:, -60:, 1]) > np.cos(0.2), axis=1)) >= 0.9

@@ -1,0 +1,50 @@
+"""Networks and the moments of what they see."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.testing import assert_allclose
+
+from mjxgrad.learning.networks import Network, Normaliser, make_actor
+
+
+def test_moments_are_those_of_all_batches_together(key):
+    batches = [
+        3.0 + 2 * jax.random.normal(k, (n, 4)) for k, n in zip(jax.random.split(key, 3), (5, 17, 40), strict=True)
+    ]
+    normaliser = Normaliser.make(4)
+    for batch in batches:
+        normaliser = normaliser.with_more(batch)
+    everything = np.concatenate(batches)
+    mean, spread = everything.mean(axis=0), everything.std(axis=0)
+    assert_allclose(normaliser.mean, mean, rtol=1e-12)
+    assert_allclose(normaliser(jnp.asarray(everything[0])), (everything[0] - mean) / spread, rtol=1e-9)
+
+
+def test_observations_that_are_no_numbers_are_left_out():
+    rows = jnp.array([[1.0, 2.0], [jnp.nan, 0.0], [3.0, 6.0]])
+    assert_allclose(Normaliser.make(2).with_more(rows).mean, [2.0, 4.0])
+
+
+def test_a_number_that_never_changes_stays_finite():
+    normaliser = Normaliser.make(1).with_more(jnp.full((10, 1), 7.0))
+    assert_allclose(normaliser(jnp.array([8.0])), [1.0])
+
+
+def test_before_it_has_seen_anything_it_changes_nothing():
+    assert_allclose(Normaliser.make(2)(jnp.array([3.0, -1.0])), [3.0, -1.0])
+
+
+def test_a_network_is_its_formula(key):
+    """One hidden layer: W₂ n(elu(W₁ x + b₁)) + b₂, n of mean zero and variance one."""
+    network = Network.make([3, 5, 2], key)
+    x = np.array([0.3, -1.0, 2.0])
+    first, last = network.layers
+    hidden = np.asarray(first.weight) @ x + np.asarray(first.bias)
+    hidden = np.where(hidden > 0, hidden, np.expm1(hidden))
+    hidden = (hidden - hidden.mean()) / np.sqrt(hidden.var() + 1e-5)  # equinox's default for what keeps it from zero
+    assert_allclose(network(jnp.asarray(x)), np.asarray(last.weight) @ hidden + np.asarray(last.bias), rtol=1e-12)
+
+
+def test_a_new_actor_hardly_moves(key):
+    assert np.abs(make_actor(4, 2, (8, 8), key)(jnp.ones(4))).max() < 0.05

@@ -1,0 +1,187 @@
+"""Windows: what they return, both of its gradients, and how these are mixed."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from mjxgrad import envs
+from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
+from mjxgrad.learning import update as updates
+from mjxgrad.learning.networks import Normaliser, make_actor, make_critic
+from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, returned, run_window, window_gradients
+
+STEPS, STDDEV, DISCOUNT = 3, 0.3, 0.9  # of the windows that are run
+
+
+def window_of(rewards, terminated=(), truncated=()):
+    """A window whose next observations are 10, 20, ...: the value function below gives them back."""
+    count = len(rewards)
+    at = np.arange(count)
+    column = 10.0 * (at + 1)[:, None]
+    flags = [jnp.asarray(np.isin(at, steps)) for steps in (terminated, truncated)]
+    return Window(jnp.asarray(column - 10), jnp.asarray(column), jnp.asarray(rewards, float), *flags, {})
+
+
+def first_number(obs):
+    return obs[0]
+
+
+def test_a_window_returns_discounted_rewards_and_the_value_of_where_it_ends():
+    """1 + 0.9·2 + 0.81·3 + 0.729·30."""
+    assert_allclose(returned(window_of([1, 2, 3]), first_number, 0.9), 1 + 1.8 + 2.43 + 0.729 * 30)
+
+
+def test_an_end_for_good_has_no_value_and_what_follows_counts_anew():
+    """(1) then (2 + 0.9·3 + 0.81·30)."""
+    assert_allclose(returned(window_of([1, 2, 3], terminated=[0]), first_number, 0.9), 1 + 2 + 2.7 + 0.81 * 30)
+
+
+def test_an_end_of_time_has_the_value_of_its_last_observation():
+    """(1 + 0.9·10) then (2 + 0.9·3 + 0.81·30)."""
+    assert_allclose(returned(window_of([1, 2, 3], truncated=[0]), first_number, 0.9), 1 + 9 + 2 + 2.7 + 0.81 * 30)
+
+
+def test_targets_mix_sums_of_all_lengths():
+    """G_t = Σ_n (1 − λ)λ^{n−1} G_t^{(n)}, the last sum with weight λ^{n−1}; Sutton and Barto, equation 12.18."""
+    rewards, values, discount, trace = [1.0, 2.0, 3.0], [10.0, 20.0, 30.0], 0.9, 0.7
+    sums = [sum(discount**k * rewards[k] for k in range(n)) + discount**n * values[n - 1] for n in (1, 2, 3)]
+    expected = (1 - trace) * sums[0] + (1 - trace) * trace * sums[1] + trace**2 * sums[2]
+    assert_allclose(lambda_returns(window_of(rewards), first_number, discount, trace)[0], expected)
+
+
+def test_targets_do_not_look_across_an_end():
+    found = lambda_returns(window_of([1, 2, 3], terminated=[1]), first_number, 0.9, 1.0)
+    assert_allclose(found, [1 + 0.9 * 2, 2, 3 + 0.9 * 30])
+
+
+def test_episodes_are_added_up_across_windows():
+    """Two environments; the first ends after its second step, having returned 5 before."""
+    windows = jax.tree.map(lambda x, y: jnp.stack([x, y]), window_of([1, 2, 3], terminated=[1]), window_of([1, 1, 1]))
+    so_far, found = updates._episodes(windows, jnp.array([5.0, 7.0]))
+    assert_allclose(so_far, [3, 10])
+    assert_allclose(found["return"], 5 + 1 + 2)
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    return envs.load("diffrl_cartpole")
+
+
+@pytest.fixture(scope="module")
+def networks():
+    """Values large and curved enough that their part of the derivative is seen."""
+    actor_key, critic_key = jax.random.split(jax.random.key(3))
+    actor = make_actor(5, 1, (6,), actor_key)
+    actor = eqx.tree_at(lambda a: a.layers[-1].weight, actor, 50 * actor.layers[-1].weight)
+    critic = make_critic(5, (6,), critic_key, final_scale=5.0)
+    return actor, critic, Normaliser.make(5).with_more(jax.random.normal(jax.random.key(4), (20, 5)))
+
+
+@pytest.fixture(scope="module")
+def gradients_at(cartpole, networks):
+    """From a start and noise to windows and gradients, for a batch."""
+    actor, critic, normaliser = networks
+
+    @jax.jit
+    def run(states, noise):
+        keys = jax.random.split(jax.random.key(0), len(noise))
+        one = functools.partial(
+            window_gradients,
+            cartpole,
+            actor=actor,
+            critic=critic,
+            normaliser=normaliser,
+            stddev=jnp.asarray(STDDEV),
+            discount=DISCOUNT,
+        )
+        return jax.vmap(lambda state, key, noise: one(state, key, noise))(states, keys, noise)
+
+    return run
+
+
+def gain(cartpole, networks, state, added):
+    actor, critic, normaliser = networks
+    window, _ = run_window(cartpole, state, actor, normaliser, added)
+    return returned(window, lambda obs: critic(normaliser(obs))[0], DISCOUNT)
+
+
+def test_the_first_order_gradient_is_the_slope_of_the_return(cartpole, networks, gradients_at, key):
+    """Central differences of 1e-5 are off by their square times a third derivative of some hundred: 1e-8."""
+    start = cartpole.reset(key)
+    noise = jnp.array([[0.4], [-1.2], [0.7]])
+    states = jax.tree.map(lambda x: x[None], start)
+    _, _, found = gradients_at(states, noise[None])
+    value = jax.jit(lambda added: gain(cartpole, networks, start, added))
+    for t in range(STEPS):
+        change = jnp.zeros_like(noise).at[t].set(1e-5)
+        slope = (value(STDDEV * noise + change) - value(STDDEV * noise - change)) / 2e-5
+        assert_allclose(found.first[0, t, 0], slope, rtol=1e-6)
+
+
+def test_pulled_back_it_is_the_derivative_by_the_parameters(cartpole, networks, gradients_at, key):
+    """Through physics and policy at once, by plain differentiation."""
+    actor, critic, normaliser = networks
+    start = cartpole.reset(key)
+    noise = jnp.array([[0.4], [-1.2], [0.7]])
+    window, _, found = gradients_at(jax.tree.map(lambda x: x[None], start), noise[None])
+    whole = jax.jit(jax.grad(lambda a: gain(cartpole, (a, critic, normaliser), start, STDDEV * noise)))(actor)
+    _, pull_back = jax.vjp(lambda a: jax.vmap(lambda obs: a(normaliser(obs)))(window.obs[0]), actor)
+    (pulled,) = pull_back(found.first[0])
+    jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=1e-9, atol=1e-12), pulled, whole)
+
+
+def test_both_gradients_have_the_same_mean(cartpole, gradients_at, key):
+    """Nothing jumps, so both are unbiased for the smoothed return; opposite noise takes out what the values have wrong."""
+    start, count = cartpole.reset(key), 8192
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (2 * count, *x.shape)), start)
+    noise = jax.random.normal(jax.random.key(5), (count, STEPS, 1))
+    _, _, found = gradients_at(states, jnp.concatenate([noise, -noise]))
+    difference = (found.zeroth - found.first)[..., 0].reshape(2, count, STEPS).mean(axis=0)
+    error = difference.std(axis=0) / count**0.5
+    assert np.all(np.abs(difference.mean(axis=0)) < 4 * error)
+    # A missing discount, a tenth or more from the second step on, is seen.
+    assert np.all(error < 0.025 * np.abs(found.first[..., 0].mean(axis=0)))
+
+
+def random_gradients(*, bad=()):
+    random = np.random.default_rng(0)
+    first, zeroth = random.normal(1, 1, (40, 2, 1)), random.normal(1, 3, (40, 2, 1))
+    is_finite = np.ones((40, 2), bool)
+    for environment, step in bad:
+        first[environment, step] = np.nan
+        is_finite[environment, step] = False
+    return Gradients(jnp.asarray(first), jnp.asarray(zeroth), jnp.asarray(is_finite))
+
+
+def test_fixed_weights_give_either_gradient():
+    both = random_gradients()
+    assert_allclose(mix(both, FixedAlpha(1.0))[0], both.first)
+    assert_allclose(mix(both, FixedAlpha(0.0))[0], both.zeroth)
+
+
+def test_inverse_variance_is_by_step():
+    both = random_gradients()
+    _, weights, _ = mix(both, InverseVariance())
+    first, zeroth = (np.var(x, axis=0, ddof=1) for x in (both.first, both.zeroth))
+    assert_allclose(weights.alpha, zeroth / (zeroth + first))
+
+
+def test_a_bias_moves_the_weight_from_the_first_order():
+    """Ten standard errors of the difference apart."""
+    both = random_gradients()
+    biased = Gradients(both.first + 5.0, both.zeroth, both.is_finite)
+    assert np.all(mix(biased, Consistent())[1].alpha < 0.5 * mix(both, Consistent())[1].alpha)
+
+
+def test_the_zeroth_order_stands_in_for_what_is_no_number():
+    both = random_gradients(bad=[(3, 1)])
+    mixture, weights, _ = mix(both, FixedAlpha(1.0))
+    assert_allclose(mixture[3, 1], both.zeroth[3, 1])
+    assert_allclose(mixture[3, 0], both.first[3, 0])
+    assert np.isfinite(mix(both, InverseVariance())[0]).all()
+    assert np.isfinite(weights.alpha).all()
