@@ -80,6 +80,20 @@ def _toml_lines(table: Mapping[str, Any], prefix: str = "") -> list[str]:
     return lines
 
 
+def keeping(folder: Path, fingerprint: str) -> Path:
+    """Return a folder beside an output folder for what is finished of a run, by all that decides its result."""
+    kept = folder.with_name(f".{folder.name}.kept-{fingerprint[:16]}")
+    with writing(folder):
+        kept.mkdir(parents=True, exist_ok=True)
+    return kept
+
+
+def forget(folder: Path) -> None:
+    """Remove what was kept of interrupted runs, once one has come to its end."""
+    for kept in folder.parent.glob(f".{folder.name}.kept-*"):
+        shutil.rmtree(kept, ignore_errors=True)
+
+
 def _recover(folder: Path, previous: Path) -> None:
     """Clear up after a run that was killed: its remains go, and a result it had set aside comes back."""
     if previous.exists() and not folder.exists():

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.config import Run, flatten, load_runs, part
-from experiments.output import building, write_csv, write_text, write_toml, writing
+from experiments.output import building, forget, keeping, write_csv, write_text, write_toml, writing
 from experiments.parallel import num_cores
 from experiments.report import Report, overview, page
 from experiments.workspace import CompileClock, Workspace
@@ -62,7 +62,8 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     with building(folder) as partial:
         _set_up_jax(run.settings.precision)
         print(f"{folder}: {run.question}", file=sys.stderr)
-        workspace, started, compiling = Workspace(partial), time.perf_counter(), CompileClock()
+        kept = keeping(folder, fingerprint)
+        workspace, started, compiling = Workspace(partial, kept), time.perf_counter(), CompileClock()
         report = _call(run, workspace)
         head, is_dirty = _commit()
         facts = {
@@ -82,6 +83,7 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
         }
         with writing(folder):
             _write(run, report, partial, facts)
+    forget(folder)
     print(f"{report.verdict}\n{folder / 'report.html'}")
 
 

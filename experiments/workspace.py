@@ -15,10 +15,14 @@ if TYPE_CHECKING:
 
 
 class Workspace:
-    """An output folder under construction, with the time of its stages and what a reader must know of its scenes."""
+    """An output folder under construction, with the time of its stages and what a reader must know of its scenes.
 
-    def __init__(self, folder: Path):
+    What is written under `kept` outlives an interruption, and is there again when the same run is begun anew.
+    """
+
+    def __init__(self, folder: Path, kept: Path | None = None):
         self.folder = folder
+        self.kept = folder / "kept" if kept is None else kept
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from mjxgrad.envs import diffrl
+from mjxgrad.envs.bundle import Bundle
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
@@ -23,6 +24,7 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
 
 __all__ = [
     "ENVIRONMENTS",
+    "Bundle",
     "EnvState",
     "Environment",
     "ant",

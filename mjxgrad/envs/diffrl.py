@@ -18,7 +18,7 @@ from mjxgrad._rollout import State, initial_state
 from mjxgrad.dynamics.spatial import exponential, multiply, rotation_matrix
 from mjxgrad.envs.environment import Environment
 from mjxgrad.envs.gymnasium_robots import robot_scene
-from mjxgrad.scene import load_scene
+from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import scene_path
 
 Memory = dict[str, Float[Array, "..."]]
@@ -153,25 +153,33 @@ def cartpole() -> CartPole:
     return CartPole(load_scene(scene_path("cartpole")), frame_skip=2, episode_length=240)
 
 
-def hopper() -> Planar:
-    """Return the hopper, which is over when its torso is 0.45 m lower."""
-    return Planar(robot_scene("hopper", timestep=1 / 240), frame_skip=4, fallen=-0.45)
+def hopper(*, num_substeps: int = 4) -> Planar:
+    """Return the hopper, which is over when its torso is 0.45 m lower.
+
+    Args:
+        num_substeps: time steps per action, of 1/60 s together; stiffer contact needs more.
+    """
+    return Planar(_scene("hopper", num_substeps), frame_skip=num_substeps, fallen=-0.45)
 
 
-def half_cheetah() -> Planar:
-    """Return the cheetah, which is never over."""
-    return Planar(robot_scene("half_cheetah", timestep=1 / 120), frame_skip=2)
+def half_cheetah(*, num_substeps: int = 2) -> Planar:
+    """Return the cheetah, which is never over; `num_substeps` as for `hopper`."""
+    return Planar(_scene("half_cheetah", num_substeps), frame_skip=num_substeps)
 
 
-def ant() -> Walker:
-    """Return the ant, which is over when its torso is below 0.27 m."""
-    return Walker(robot_scene("ant", timestep=1 / 120, max_contacts=8), frame_skip=2, fallen=0.27)
+def ant(*, num_substeps: int = 2) -> Walker:
+    """Return the ant, which is over when its torso is below 0.27 m; `num_substeps` as for `hopper`."""
+    return Walker(_scene("ant", num_substeps, max_contacts=8), frame_skip=num_substeps, fallen=0.27)
 
 
-def humanoid() -> Walker:
-    """Return the humanoid, which is over when its torso is below 0.74 m."""
-    scene = robot_scene("humanoid", timestep=1 / 240, max_contacts=12)
-    return Walker(scene, frame_skip=4, fallen=0.74, action_weight=0.002, rise_scale=10.0)
+def humanoid(*, num_substeps: int = 4) -> Walker:
+    """Return the humanoid, which is over when its torso is below 0.74 m; `num_substeps` as for `hopper`."""
+    scene = _scene("humanoid", num_substeps, max_contacts=12)
+    return Walker(scene, frame_skip=num_substeps, fallen=0.74, action_weight=0.002, rise_scale=10.0)
+
+
+def _scene(name: str, num_substeps: int, *, max_contacts: int | None = None) -> Scene:
+    return robot_scene(name, timestep=1 / (60 * num_substeps), max_contacts=max_contacts)
 
 
 def _posture(state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:

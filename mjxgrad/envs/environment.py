@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._rollout import State, initial_state, rollout
+from mjxgrad._rollout import State, Trajectory, initial_state, rollout
+from mjxgrad.envs.bundle import Bundle
 from mjxgrad.scene import Scene
 from mjxgrad.task import InEngine, optional_pytree
 
@@ -62,11 +63,13 @@ class Environment(InEngine):
     Attributes:
         frame_skip: time steps per action.
         episode_length: actions after which time is up.
+        bundle: averages the derivative of every step over perturbed starts; None is the derivative as it is.
         randomisation: from a key and the scene to the scene of one copy; see `randomised`.
     """
 
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
+    bundle: Bundle | None = eqx.field(default=None, kw_only=True)
     randomisation: Randomisation | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
@@ -153,18 +156,13 @@ class Environment(InEngine):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
         action = jnp.clip(action, -1, 1)
-        course = rollout(
-            self.scene,
-            state.physics,
-            jnp.broadcast_to(self.control(action), (self.frame_skip, self.num_actions)),
-            gradient=self.gradient,
-            onset=self.onset,
-            smoothing=self.smoothing,
-            engine=self.engine,
-        )
+        key, memory_key, bundle_key = jax.random.split(state.key, 3)
+        ctrl = self.control(action)
+        course = self._move(state.physics, ctrl)
         after = course.final
+        if self.bundle is not None:
+            after = self.bundle.average(lambda *at: self._move(*at).final, self.scene, state.physics, ctrl, bundle_key)
         terms = self.rewards(state.physics, action, after, state.memory)
-        key, memory_key = jax.random.split(state.key)
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1
         obs = self.observe(after, memory)
@@ -178,6 +176,17 @@ class Environment(InEngine):
             num_steps=num_steps,
             memory=memory,
             key=key,
+        )
+
+    def _move(self, physics: State, ctrl: Float[Array, " nu"]) -> Trajectory:
+        return rollout(
+            self.scene,
+            physics,
+            jnp.broadcast_to(ctrl, (self.frame_skip, self.num_actions)),
+            gradient=self.gradient,
+            onset=self.onset,
+            smoothing=self.smoothing,
+            engine=self.engine,
         )
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:

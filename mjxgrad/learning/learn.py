@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, UInt32
 
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import Learner, Policy, Settings, begin
@@ -47,13 +47,13 @@ class Learned(eqx.Module):
     """
 
     policy: Policy
-    history: dict[str, Float[Array, " updates"]]
+    history: dict[str, Float[Array, "updates *seeds"]]
     learner: Learner
 
 
 def learn(
     environment: Environment,
-    key: PRNGKeyArray,
+    key: Key[Array, "*seeds"] | UInt32[Array, "*seeds 2"],
     *,
     num_updates: int,
     settings: Settings | None = None,
@@ -76,7 +76,7 @@ def learn(
 
     Args:
         environment: to learn in.
-        key: consumed here.
+        key: consumed here; an array of several learns as many policies side by side, and what is returned gets an axis for them.
         num_updates: in all, those before a checkpoint included.
         settings: how; None are the defaults.
         log: called as `log(update, metrics)` after every `log_every` updates with their means.
@@ -91,13 +91,16 @@ def learn(
     for name, number in (("num_updates", num_updates), ("log_every", log_every)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.wrap_key_data(key)
     place, jit = _on_all_devices()
-    start = functools.partial(begin, environment, settings=settings, num_updates=num_updates)
-    step = functools.partial(update, environment, settings=settings, num_updates=num_updates)
+    one_start = functools.partial(begin, environment, settings=settings, num_updates=num_updates)
+    one_step = functools.partial(update, environment, settings=settings, num_updates=num_updates)
+    start, step = (jax.vmap(one_start), jax.vmap(one_step)) if key.ndim else (one_start, one_step)
     # As numbers on the host, a key is the same in all processes.
     numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
     learner = jit(lambda numbers: start(jax.random.wrap_key_data(numbers, impl=kind)))(numbers)
-    history = {name: np.zeros(0, x.dtype) for name, x in jax.eval_shape(step, learner)[1].items()}
+    history = {name: np.zeros((0, *x.shape), x.dtype) for name, x in jax.eval_shape(step, learner)[1].items()}
     path = None if checkpoint is None else Path(checkpoint)
     fingerprint = _fingerprint(environment, settings, num_updates, key)
     if path is not None and path.is_file():
@@ -109,14 +112,14 @@ def learn(
         return jit(lambda learner: jax.lax.scan(lambda now, _: step(now), learner, length=count))
 
     is_first = jax.process_index() == 0
-    while (done := int(learner.num_updates)) < num_updates:
+    while (done := int(learner.num_updates.max())) < num_updates:
         learner, found = several(min(log_every, num_updates - done))(learner)
         found = {name: np.asarray(values) for name, values in found.items()}
         history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
         if path is not None and is_first:
             checkpoints.save(path, (learner, history), fingerprint)
         if log is not None and is_first:
-            log(int(learner.num_updates), {name: _mean(values) for name, values in found.items()})
+            log(int(learner.num_updates.max()), {name: _mean(values) for name, values in found.items()})
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
 
 
@@ -138,7 +141,9 @@ def _mean(values: np.ndarray) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
-def _fingerprint(environment: Environment, settings: Settings, num_updates: int, key: PRNGKeyArray) -> dict[str, Any]:
+def _fingerprint(
+    environment: Environment, settings: Settings, num_updates: int, key: Key[Array, "*seeds"]
+) -> dict[str, Any]:
     """Return what must agree between a checkpoint and the run that goes on from it."""
     return {
         "settings": repr(settings),

@@ -1,0 +1,391 @@
+"""Policies through contact: which gradient learns soonest, how good it is meanwhile, and what it is worth in C MuJoCo."""
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+import mjxgrad as mg
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings, VideoSettings
+from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
+from experiments.video import film, shown_speed
+from experiments.words import capitalised, joined, quantity
+from experiments.workspace import Workspace
+from mjxgrad import envs, learning
+from mjxgrad.envs import Environment
+from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
+
+Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth"]
+NAMES = {
+    "onset": "first order, contact with an onset",
+    "discrete": "first order, MuJoCo's contact",
+    "event": "first order, event gradient",
+    "bundled": "first order, bundled",
+    "alpha": "α-order",
+    "inverse_variance": "weighed by variance",
+    "zeroth": "zeroth order",
+}
+_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH), strict=True))
+Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped"]
+_LOADERS = {
+    "cartpole": lambda _: envs.diffrl.cartpole(),
+    "quadruped": lambda _: envs.quadruped(),
+    **{name: getattr(envs.diffrl, name) for name in ("hopper", "half_cheetah", "ant", "humanoid")},
+}
+_CAMERAS = {"cartpole": "side", "hopper": "track", "half_cheetah": "track", "ant": "track", "humanoid": "track"}
+
+
+class Settings(RunSettings):
+    """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
+
+    environment: Name
+    """What is learned: DiffRL's tasks, or a quadruped that follows commands."""
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)]
+    """Which gradients learn."""
+    stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
+    """By which contact is stiffer than in the scene."""
+    num_substeps: Annotated[int, Field(ge=1)] | None = None
+    """Time steps per action of 1/60 s; stiffer contact needs more. The cart-pole and the quadruped have their own."""
+    num_seeds: Annotated[int, Field(ge=1)] = 3
+    """Policies per method, learned side by side."""
+    num_updates: Annotated[int, Field(ge=2)]
+    """Of each policy."""
+    num_environments: Annotated[int, Field(ge=2)] = 64
+    """Of each policy."""
+    window: Annotated[int, Field(ge=1)] = 32
+    """Steps of each environment per update."""
+    actor_rate: Positive = 2e-3
+    """Learning rate of the policy."""
+    critic_rate: Positive = 2e-3
+    """Learning rate of the value function."""
+    num_episodes: Annotated[int, Field(ge=1)] = 16
+    """Of each policy in C MuJoCo, by which it is judged."""
+    video: VideoSettings | None = None
+    """Of the best policy."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What one method did at one stiffness, for all seeds."""
+
+    method: str
+    stiffness: float
+    history: dict[str, Float[np.ndarray, "updates seeds"]]
+    seconds: float  # of an update of all seeds, without compilation
+    returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
+    qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
+    num_states: int  # of it
+
+    @property
+    def judged(self) -> Float[np.ndarray, " seeds"]:
+        """Mean return of each policy in C MuJoCo."""
+        return self.returns.mean(axis=1)
+
+    @property
+    def reward(self) -> Float[np.ndarray, "updates seeds"]:
+        """Mean reward per step while learning, over ten updates."""
+        return _smooth(self.history["reward"])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All courses."""
+
+    settings: Settings
+    courses: list[Course]
+    environment: Environment
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per course, seed and update, for metrics.csv."""
+        return [
+            {"method": course.method, "stiffness": course.stiffness, "seed": seed, "update": update + 1}
+            | {name: float(values[update, seed]) for name, values in course.history.items()}
+            for course in self.courses
+            for seed, update in itertools.product(
+                range(self.settings.num_seeds), range(0, self.settings.num_updates, _every(self.settings))
+            )
+        ]
+
+    @property
+    def best(self) -> Course:
+        """The course whose policies are best in C MuJoCo, among those with contact as it comes if there are any."""
+        plain = [course for course in self.courses if course.stiffness == self.settings.stiffness[0]]
+        return max(plain, key=lambda course: course.judged.mean())
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Learn by every method at every stiffness."""
+    environment = _environment(settings)
+    workspace.check(environment.scene)
+    courses = []
+    cases = list(itertools.product(settings.stiffness, settings.methods))
+    with workspace.stage("learning", "updates", len(cases) * settings.num_updates) as advance_to:
+        for number, (stiffness, method) in enumerate(cases):
+            before = number * settings.num_updates
+            courses.append(
+                _course(settings, workspace, environment, method, stiffness, lambda n, b=before: advance_to(b + n))
+            )
+    return Outcome(settings, courses, environment)
+
+
+def _environment(settings: Settings) -> Environment:
+    loader = _LOADERS[settings.environment]
+    if settings.environment in ("cartpole", "quadruped"):
+        return loader(None)
+    return loader() if settings.num_substeps is None else loader(num_substeps=settings.num_substeps)
+
+
+def _course(
+    settings: Settings, workspace: Workspace, environment: Environment, method: Method, stiffness: float, advance_to
+) -> Course:
+    key = jax.random.key(settings.seed)
+    stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
+    rules = {"alpha": Consistent(), "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
+    how = learning.Settings(
+        num_environments=settings.num_environments,
+        window=settings.window,
+        actor_rate=settings.actor_rate,
+        critic_rate=settings.critic_rate,
+        rule=rules.get(method, FixedAlpha(1.0)),
+    )
+    marks = [(0, time.perf_counter())]
+
+    def log(done: int, _: dict[str, float]) -> None:
+        marks.append((done, time.perf_counter()))
+        advance_to(done)
+
+    learned = learning.learn(
+        _stepped(stiffer, method),
+        jax.random.split(key, settings.num_seeds),
+        num_updates=settings.num_updates,
+        settings=how,
+        log=log,
+        log_every=_every(settings),
+        checkpoint=workspace.kept / f"{method}-{stiffness:g}",
+    )
+    judge = jax.vmap(
+        lambda policy, key: learning.evaluate(stiffer, policy, key, num_episodes=settings.num_episodes),
+        in_axes=(0, None),
+    )
+    found = jax.tree.map(np.asarray, judge(learned.policy, jax.random.key(settings.seed + 1)))
+    best = int(found.returns.mean(axis=1).argmax())
+    history = {name: np.asarray(values) for name, values in learned.history.items()}
+    return Course(
+        method=method,
+        stiffness=stiffness,
+        history=history,
+        seconds=_seconds_per_update(marks),
+        returns=found.returns,
+        qpos=found.qpos[best, 0],
+        num_states=int(found.lengths[best, 0]) + 1,
+    )
+
+
+def _every(settings: Settings) -> int:
+    """Updates in one program: twenty of them in a run, so that its course is seen, and few enough to lose little."""
+    return max(1, settings.num_updates // 20)
+
+
+def _seconds_per_update(marks: Sequence[tuple[int, float]]) -> float:
+    """Return the median over programs but the first, which compiles; NaN of a run that went on near its end."""
+    times = [(later - t) / (n - m) for (m, t), (n, later) in itertools.pairwise(marks)][1:]
+    return float(np.median(times)) if times else float("nan")
+
+
+def _stepped(environment: Environment, method: Method) -> Environment:
+    """Return the environment whose derivative is the method's."""
+    if method in ("discrete", "event"):
+        return environment.with_gradient(method)
+    if method == "bundled":
+        return dataclasses.replace(environment.with_onset(None), bundle=envs.Bundle())
+    return environment
+
+
+def _stiffer(environment: Environment, factor: float) -> mg.Softness:
+    """Return contact that is stiffer, with the same damping ratio."""
+    parameters = environment.scene.contact_parameters()
+    return mg.Softness(
+        stiffness=factor * float(np.median(parameters.stiffness)),
+        damping_ratio=float(np.median(parameters.damping_ratio)),
+    )
+
+
+def _smooth(values: Float[np.ndarray, "updates seeds"]) -> Float[np.ndarray, "updates seeds"]:
+    width = min(10, len(values))
+    sums = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - width, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)[:, None]
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say which gradient is worth most in C MuJoCo, and how far the next one is."""
+    settings, best = outcome.settings, outcome.best
+    shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
+    others = sorted((course for course in shown if course is not best), key=lambda course: -course.judged.mean())
+    steps = settings.num_updates * settings.num_environments * settings.window
+    text = f"{NAMES[best.method].capitalize()} returns {_judged(best)} in C MuJoCo after {steps:,} steps".replace(
+        ",", " "
+    )
+    if others:
+        text += "; " + joined(f"{NAMES[course.method]} {_judged(course)}" for course in others)
+    return text + "."
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say how good the gradients were, and what was left out."""
+    sentences = []
+    for course in outcome.courses:
+        lost = float(course.history["not_finite"].mean())
+        skipped, diverged = int(course.history["skipped"].sum()), int(course.history["diverged"].sum())
+        if lost or skipped or diverged:
+            sentences.append(
+                f"{_label(course, outcome)}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
+                f"{skipped} updates were skipped."
+            )
+    if not sentences:
+        sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")
+    ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in outcome.courses]
+    sentences.append(
+        f"The variance of the zeroth-order gradient is {min(ratio):.2g} to {max(ratio):.2g} times that of the first order, "
+        "by actions, in the median over updates."
+    )
+    return sentences
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate every course."""
+    rows = [
+        [
+            _label(course, outcome),
+            _judged(course),
+            quantity(float(course.reward[-1].mean()), _spread(course.reward[-1])),
+            quantity(float(course.history["alpha"].mean())),
+            quantity(float(np.median(course.history["zeroth_variance"] / course.history["first_variance"]))),
+            quantity(course.seconds * outcome.settings.num_updates),
+        ]
+        for course in outcome.courses
+    ]
+    heads = ("gradient", "return in C MuJoCo", "reward per step", "α", "variance, zeroth over first", "seconds")
+    caption = (
+        "Mean over seeds with their standard deviation. Reward per step: while learning, of the last updates. α: weight of the "
+        "first order. Seconds: of all seeds together, without compilation."
+    )
+    return [Table(heads, rows, caption)]
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures in order of reading."""
+    found: dict[str, Any] = {"course": course_of_learning}
+    if len(outcome.settings.stiffness) > 1:
+        found["stiffness"] = by_stiffness
+    return found | {"variance": quality}
+
+
+def course_of_learning(outcome: Outcome):
+    """Reward against steps and against seconds, a line per method, thin ones per seed."""
+    settings = outcome.settings
+    shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
+    figure, axes = subplots(1, 2, height=3.8, sharey=True)
+    updates = np.arange(1, settings.num_updates + 1)
+    for course in shown:
+        look, label = {"color": _COLOURS[course.method]}, NAMES[course.method]
+        scales = (settings.num_environments * settings.window, course.seconds)
+        for axis, scale in zip(axes[0], scales, strict=True):
+            axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
+            axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
+    axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
+    axes[0, 1].set(title="By time", xlabel=f"seconds for {settings.num_seeds} policies, without compilation")
+    for axis in axes[0]:
+        plain(axis.yaxis)
+        axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value < 1e4 else f"{value / 1e6:g} M")
+    # The first updates of a fall would hide all that follows.
+    ends = np.concatenate([course.reward[len(updates) // 20 :].ravel() for course in shown])
+    axes[0, 0].set_ylim(np.quantile(ends, 0.01) - 0.1 * np.ptp(ends), ends.max() + 0.05 * np.ptp(ends))
+    legend_below(figure, axes[0, 0], 3)
+    caption = f"Mean reward per step over ten updates; thin, each of {settings.num_seeds} seeds, thick their mean."
+    return figure, "Learning", caption
+
+
+def by_stiffness(outcome: Outcome):
+    """Return in C MuJoCo against stiffness, a line per method."""
+    figure, axes = subplots(1, 1, height=3.8)
+    for method in outcome.settings.methods:
+        courses = [course for course in outcome.courses if course.method == method]
+        factors = [course.stiffness for course in courses]
+        means = [course.judged.mean() for course in courses]
+        spread = [_spread(course.judged) or 0 for course in courses]
+        axes[0, 0].errorbar(factors, means, spread, color=_COLOURS[method], marker="o", capsize=3, label=NAMES[method])
+    axes[0, 0].set(xscale="log", xlabel="stiffness of contact, over the scene's", ylabel="return in C MuJoCo")
+    plain(axes[0, 0].xaxis)
+    plain(axes[0, 0].yaxis)
+    legend_below(figure, axes[0, 0], 3)
+    return figure, "Return against stiffness", "Mean over seeds, bars are their standard deviation."
+
+
+def quality(outcome: Outcome):
+    """Variance of both gradients, bias of the first, and α, against updates."""
+    settings = outcome.settings
+    shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
+    figure, axes = subplots(1, 3, height=3.4)
+    updates = np.arange(1, settings.num_updates + 1)
+    for course in shown:
+        look = {"color": _COLOURS[course.method], "lw": 1.8}
+        history = {name: _smooth(values).mean(axis=1) for name, values in course.history.items()}
+        axes[0, 0].plot(updates, history["first_variance"], label=NAMES[course.method], **look)
+        axes[0, 1].plot(updates, history["zeroth_variance"], **look)
+        axes[0, 2].plot(updates, history["alpha"], **look)
+    titles = ("Variance of the first order", "Variance of the zeroth order", "Weight of the first order")
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set(title=title, xlabel="update")
+    low, high = min(axes[0, i].get_ylim()[0] for i in (0, 1)), max(axes[0, i].get_ylim()[1] for i in (0, 1))
+    for axis in axes[0, :2]:
+        axis.set_yscale("log")
+        axis.set_ylim(max(low, 1e-6 * high), high)
+    axes[0, 2].set_ylim(-0.05, 1.05)
+    legend_below(figure, axes[0, 0], 3)
+    caption = (
+        "Left and middle, variance of one environment's gradient by its actions, summed over them, both from the same windows. "
+        "Right, mean weight of the first order. Means over seeds and ten updates."
+    )
+    return figure, "Quality of the gradients", caption
+
+
+def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[str | None, str]:
+    """Film the best policy in C MuJoCo."""
+    best, environment = outcome.best, outcome.environment
+    caption = f"The best policy by {NAMES[best.method]}, in C MuJoCo, {shown_speed(look.speed)}."
+    return film(
+        workspace,
+        [(environment.scene.to_mujoco(), best.qpos[: best.num_states])],
+        look,
+        camera=_CAMERAS.get(outcome.settings.environment, ""),
+        caption=caption,
+        timestep=float(environment.interval),
+    )
+
+
+def _label(course: Course, outcome: Outcome) -> str:
+    text = NAMES[course.method]
+    return text if len(outcome.settings.stiffness) == 1 else f"{text}, {course.stiffness:g} times as stiff"
+
+
+def _judged(course: Course) -> str:
+    return quantity(float(course.judged.mean()), _spread(course.judged))
+
+
+def _spread(values: Float[np.ndarray, " seeds"]) -> float | None:
+    return float(values.std(ddof=1)) if len(values) > 1 else None
+
+
+def headline(outcome: Outcome) -> dict[str, str]:
+    """Give the best return, for the page over a sweep."""
+    return {"return in C MuJoCo": _judged(outcome.best)}
