@@ -14,10 +14,10 @@ from pydantic import Field
 
 import mjxgrad as mg
 from experiments.report import Table
-from experiments.settings import Positive, RunSettings, VideoSettings
+from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed
-from experiments.words import capitalised, joined, quantity
+from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
@@ -25,7 +25,7 @@ from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
 
 Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth"]
 NAMES = {
-    "onset": "first order, contact with an onset",
+    "onset": "first order",
     "discrete": "first order, MuJoCo's contact",
     "event": "first order, event gradient",
     "bundled": "first order, bundled",
@@ -43,6 +43,19 @@ _LOADERS = {
 _CAMERAS = {"cartpole": "side", "hopper": "track", "half_cheetah": "track", "ant": "track", "humanoid": "track"}
 
 
+class Sizes(SettingsTable):
+    """How much is spent."""
+
+    num_seeds: Annotated[int, Field(ge=1)]
+    """Policies per method, learned side by side."""
+    num_updates: Annotated[int, Field(ge=2)]
+    """Of each policy."""
+    num_environments: Annotated[int, Field(ge=2)] = 64
+    """Of each policy."""
+    num_episodes: Annotated[int, Field(ge=1)] = 16
+    """Of each policy in C MuJoCo, by which it is judged."""
+
+
 class Settings(RunSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
@@ -54,22 +67,23 @@ class Settings(RunSettings):
     """By which contact is stiffer than in the scene."""
     num_substeps: Annotated[int, Field(ge=1)] | None = None
     """Time steps per action of 1/60 s; stiffer contact needs more. The cart-pole and the quadruped have their own."""
-    num_seeds: Annotated[int, Field(ge=1)] = 3
-    """Policies per method, learned side by side."""
-    num_updates: Annotated[int, Field(ge=2)]
-    """Of each policy."""
-    num_environments: Annotated[int, Field(ge=2)] = 64
-    """Of each policy."""
     window: Annotated[int, Field(ge=1)] = 32
     """Steps of each environment per update."""
     actor_rate: Positive = 2e-3
     """Learning rate of the policy."""
     critic_rate: Positive = 2e-3
     """Learning rate of the value function."""
-    num_episodes: Annotated[int, Field(ge=1)] = 16
-    """Of each policy in C MuJoCo, by which it is judged."""
+    size: Literal["quick", "default", "full"] = "default"
+    """How much is spent."""
+    sizes: Sizes
+    """The numbers that go with the size: those of the file's table of that name."""
     video: VideoSettings | None = None
     """Of the best policy."""
+
+    @property
+    def num_steps(self) -> int:
+        """Steps that a policy learns from in one update."""
+        return self.sizes.num_environments * self.window
 
 
 @dataclass(frozen=True)
@@ -110,7 +124,7 @@ class Outcome:
             | {name: float(values[update, seed]) for name, values in course.history.items()}
             for course in self.courses
             for seed, update in itertools.product(
-                range(self.settings.num_seeds), range(0, self.settings.num_updates, _every(self.settings))
+                range(self.settings.sizes.num_seeds), range(0, self.settings.sizes.num_updates, _every(self.settings))
             )
         ]
 
@@ -127,9 +141,9 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     workspace.check(environment.scene)
     courses = []
     cases = list(itertools.product(settings.stiffness, settings.methods))
-    with workspace.stage("learning", "updates", len(cases) * settings.num_updates) as advance_to:
+    with workspace.stage("learning", "updates", len(cases) * settings.sizes.num_updates) as advance_to:
         for number, (stiffness, method) in enumerate(cases):
-            before = number * settings.num_updates
+            before = number * settings.sizes.num_updates
             courses.append(
                 _course(settings, workspace, environment, method, stiffness, lambda n, b=before: advance_to(b + n))
             )
@@ -150,7 +164,7 @@ def _course(
     stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
     rules = {"alpha": Consistent(), "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
     how = learning.Settings(
-        num_environments=settings.num_environments,
+        num_environments=settings.sizes.num_environments,
         window=settings.window,
         actor_rate=settings.actor_rate,
         critic_rate=settings.critic_rate,
@@ -164,15 +178,15 @@ def _course(
 
     learned = learning.learn(
         _stepped(stiffer, method),
-        jax.random.split(key, settings.num_seeds),
-        num_updates=settings.num_updates,
+        jax.random.split(key, settings.sizes.num_seeds),
+        num_updates=settings.sizes.num_updates,
         settings=how,
         log=log,
         log_every=_every(settings),
         checkpoint=workspace.kept / f"{method}-{stiffness:g}",
     )
     judge = jax.vmap(
-        lambda policy, key: learning.evaluate(stiffer, policy, key, num_episodes=settings.num_episodes),
+        lambda policy, key: learning.evaluate(stiffer, policy, key, num_episodes=settings.sizes.num_episodes),
         in_axes=(0, None),
     )
     found = jax.tree.map(np.asarray, judge(learned.policy, jax.random.key(settings.seed + 1)))
@@ -191,7 +205,7 @@ def _course(
 
 def _every(settings: Settings) -> int:
     """Updates in one program: twenty of them in a run, so that its course is seen, and few enough to lose little."""
-    return max(1, settings.num_updates // 20)
+    return max(1, settings.sizes.num_updates // 20)
 
 
 def _seconds_per_update(marks: Sequence[tuple[int, float]]) -> float:
@@ -231,7 +245,7 @@ def verdict(outcome: Outcome) -> str:
     settings, best = outcome.settings, outcome.best
     shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
     others = sorted((course for course in shown if course is not best), key=lambda course: -course.judged.mean())
-    steps = settings.num_updates * settings.num_environments * settings.window
+    steps = settings.sizes.num_updates * settings.num_steps
     text = f"{NAMES[best.method].capitalize()} returns {_judged(best)} in C MuJoCo after {steps:,} steps".replace(
         ",", " "
     )
@@ -270,7 +284,7 @@ def tables(outcome: Outcome) -> list[Table]:
             quantity(float(course.reward[-1].mean()), _spread(course.reward[-1])),
             quantity(float(course.history["alpha"].mean())),
             quantity(float(np.median(course.history["zeroth_variance"] / course.history["first_variance"]))),
-            quantity(course.seconds * outcome.settings.num_updates),
+            quantity(course.seconds * outcome.settings.sizes.num_updates),
         ]
         for course in outcome.courses
     ]
@@ -295,15 +309,15 @@ def course_of_learning(outcome: Outcome):
     settings = outcome.settings
     shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
     figure, axes = subplots(1, 2, height=3.8, sharey=True)
-    updates = np.arange(1, settings.num_updates + 1)
+    updates = np.arange(1, settings.sizes.num_updates + 1)
     for course in shown:
         look, label = {"color": _COLOURS[course.method]}, NAMES[course.method]
-        scales = (settings.num_environments * settings.window, course.seconds)
+        scales = (settings.num_steps, course.seconds)
         for axis, scale in zip(axes[0], scales, strict=True):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
     axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
-    axes[0, 1].set(title="By time", xlabel=f"seconds for {settings.num_seeds} policies, without compilation")
+    axes[0, 1].set(title="By time", xlabel=f"seconds for {settings.sizes.num_seeds} policies, without compilation")
     for axis in axes[0]:
         plain(axis.yaxis)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value < 1e4 else f"{value / 1e6:g} M")
@@ -311,7 +325,9 @@ def course_of_learning(outcome: Outcome):
     ends = np.concatenate([course.reward[len(updates) // 20 :].ravel() for course in shown])
     axes[0, 0].set_ylim(np.quantile(ends, 0.01) - 0.1 * np.ptp(ends), ends.max() + 0.05 * np.ptp(ends))
     legend_below(figure, axes[0, 0], 3)
-    caption = f"Mean reward per step over ten updates; thin, each of {settings.num_seeds} seeds, thick their mean."
+    caption = (
+        f"Mean reward per step over ten updates; thin, each of {settings.sizes.num_seeds} seeds, thick their mean."
+    )
     return figure, "Learning", caption
 
 
@@ -336,7 +352,7 @@ def quality(outcome: Outcome):
     settings = outcome.settings
     shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
     figure, axes = subplots(1, 3, height=3.4)
-    updates = np.arange(1, settings.num_updates + 1)
+    updates = np.arange(1, settings.sizes.num_updates + 1)
     for course in shown:
         look = {"color": _COLOURS[course.method], "lw": 1.8}
         history = {name: _smooth(values).mean(axis=1) for name, values in course.history.items()}

@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, envs, estimators, integration, planning, render, tasks
+from mjxgrad import baselines, diagnostics, envs, estimators, integration, learning, planning, render, tasks
 from mjxgrad._rollout import (
     DivergedError,
     State,
@@ -58,6 +58,7 @@ __all__ = [
     "forward",
     "initial_state",
     "integration",
+    "learning",
     "linear_policy",
     "load_scene",
     "mlp_policy",
