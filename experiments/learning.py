@@ -17,11 +17,11 @@ from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed
-from experiments.words import joined, quantity
+from experiments.words import capitalised, joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
-from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
+from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
 
 Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth"]
 NAMES = {
@@ -162,7 +162,7 @@ def _course(
 ) -> Course:
     key = jax.random.key(settings.seed)
     stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
-    rules = {"alpha": Consistent(), "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
+    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
     how = learning.Settings(
         num_environments=settings.sizes.num_environments,
         window=settings.window,
@@ -245,10 +245,8 @@ def verdict(outcome: Outcome) -> str:
     settings, best = outcome.settings, outcome.best
     shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
     others = sorted((course for course in shown if course is not best), key=lambda course: -course.judged.mean())
-    steps = settings.sizes.num_updates * settings.num_steps
-    text = f"{NAMES[best.method].capitalize()} returns {_judged(best)} in C MuJoCo after {steps:,} steps".replace(
-        ",", " "
-    )
+    steps = f"{settings.sizes.num_updates * settings.num_steps:,}".replace(",", " ")
+    text = f"{capitalised(NAMES[best.method])} returns {_judged(best)} in C MuJoCo after {steps} steps"
     if others:
         text += "; " + joined(f"{NAMES[course.method]} {_judged(course)}" for course in others)
     return text + "."
@@ -261,9 +259,9 @@ def findings(outcome: Outcome) -> list[str]:
         lost = float(course.history["not_finite"].mean())
         skipped, diverged = int(course.history["skipped"].sum()), int(course.history["diverged"].sum())
         if lost or skipped or diverged:
+            named = capitalised(_label(course, outcome))
             sentences.append(
-                f"{_label(course, outcome)}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
-                f"{skipped} updates were skipped."
+                f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, {skipped} updates were skipped."
             )
     if not sentences:
         sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")

@@ -34,8 +34,9 @@ def _finds_the_factors(names):
 
 
 def _stands(names):
-    """From up to 0.3 rad at a mean cost of a pole that is held, not of one that falls (0.5)."""
-    assert names["result"].history.cost[-10:].mean() < 0.04
+    """All 100 actions upright and near the origin earn 100 less a few; a pole that falls ends its episode before."""
+    assert names["judged"].returns.mean() > 90
+    assert Path("balance.mp4").stat().st_size > 1000
 
 
 def _pushes_the_ball_to_its_place(names):

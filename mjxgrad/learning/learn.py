@@ -9,7 +9,7 @@ difference between methods:
 | `rules.FixedAlpha(1)` | first order: SHAC |
 | `rules.FixedAlpha(0)` | zeroth order: REINFORCE with a value function |
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
-| `rules.Consistent()` | the same with an eye for bias: α-order, the default |
+| `rules.Consistent(failure_probability=1e-3)` | the same with an eye for bias: α-order, the default |
 
 With `is_episodic=True` every window begins anew and there is no value function: analytic policy gradients (APG).
 

@@ -1,0 +1,91 @@
+"""The experiment on policies: what it says is what was measured, and an interruption costs only what was not finished."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from experiments import learning
+from experiments.__main__ import main
+from experiments.learning import Course, Outcome, Settings, Sizes, findings, verdict
+
+QUICK = Settings(
+    experiment="learning",
+    environment="cartpole",
+    methods=("onset", "zeroth"),
+    size="quick",
+    sizes=Sizes(num_seeds=2, num_updates=4, num_environments=2, num_episodes=2),
+    num_substeps=None,
+)
+
+
+def course(method, returns, **history):
+    names = ("reward", "alpha", "first_variance", "zeroth_variance", "not_finite", "skipped", "diverged")
+    values = {name: np.ones((4, 2)) if "variance" in name else np.zeros((4, 2)) for name in names}
+    values |= {name: np.asarray(value, float) for name, value in history.items()}
+    return Course(method, 1.0, values, 0.1, np.asarray(returns, float), np.zeros((3, 2)), 3)
+
+
+def test_the_verdict_names_the_best_in_mujoco():
+    """Means over episodes 3 and 5, so 4 ± √2 over seeds; 256 steps are 4 updates of 2 environments of 32."""
+    outcome = Outcome(QUICK, [course("zeroth", [[1, 1], [1, 1]]), course("onset", [[2, 4], [4, 6]])], None)
+    assert verdict(outcome) == "First order returns 4.0 ± 1.4 in C MuJoCo after 256 steps; zeroth order 1.00."
+
+
+def test_what_was_left_out_is_said():
+    """A share of a quarter in the last of four updates of both seeds."""
+    lost = course("onset", [[1, 1], [1, 1]], not_finite=[[0, 0], [0, 0], [0, 0], [0.25, 0.25]], skipped=np.eye(4, 2))
+    sentences = findings(Outcome(QUICK, [lost], None))
+    assert sentences[0] == (
+        "First order: 0.062 of the derivatives were no numbers, 0 steps diverged, 2 updates were skipped."
+    )
+    assert findings(Outcome(QUICK, [course("onset", [[1, 1], [1, 1]])], None))[0].startswith(
+        "Every derivative was a number"
+    )
+
+
+def test_curves_are_means_of_the_last_ten():
+    values = np.arange(24.0).reshape(12, 2)
+    smooth = learning._smooth(values)
+    assert_allclose(smooth[0], values[0])
+    assert_allclose(smooth[4], values[:5].mean(axis=0))
+    assert_allclose(smooth[11], values[2:].mean(axis=0))
+
+
+COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["onset"]', "precision=float64"]
+
+
+def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
+    assert main([*COMMAND, "video.width=64", "--output", str(tmp_path)]) == 0
+    folder = tmp_path / "learn_cartpole"
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["update"] for row in rows] == ["1", "2"]
+    assert "in C MuJoCo" in json.loads((folder / "summary.json").read_text())["verdict"]
+    assert not list(tmp_path.glob(".learn_cartpole.kept-*"))
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_keeps_what_was_learned(tmp_path, monkeypatch):
+    """It is cut off where the policies are judged; begun anew, nothing is learned twice."""
+    command = [*COMMAND, "video.width=64", "--output", str(tmp_path)]
+    evaluate = learning.learning.evaluate
+
+    def cut_off(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(learning.learning, "evaluate", cut_off)
+    assert main(command) == 130
+    assert not (tmp_path / "learn_cartpole").exists()
+    (kept,) = tmp_path.glob(".learn_cartpole.kept-*")
+    assert (kept / "onset-1").is_file()
+    monkeypatch.setattr(learning.learning, "evaluate", evaluate)
+
+    def written(*args):
+        raise AssertionError("what is finished is learned again")
+
+    monkeypatch.setattr("mjxgrad.optimiser.checkpoint.save", written)
+    assert main(command) == 0
+    assert (tmp_path / "learn_cartpole" / "report.html").is_file()
