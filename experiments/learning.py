@@ -261,7 +261,8 @@ def findings(outcome: Outcome) -> list[str]:
         if lost or skipped or diverged:
             named = capitalised(_label(course, outcome))
             sentences.append(
-                f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, {skipped} updates were skipped."
+                f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
+                f"{skipped} updates were skipped."
             )
     if not sentences:
         sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")
