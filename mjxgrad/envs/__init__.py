@@ -6,6 +6,7 @@ from mjxgrad.envs import diffrl
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
+from mjxgrad.envs.task_environment import TaskEnvironment, from_task
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "ant": ant,
@@ -25,8 +26,10 @@ __all__ = [
     "ENVIRONMENTS",
     "EnvState",
     "Environment",
+    "TaskEnvironment",
     "ant",
     "diffrl",
+    "from_task",
     "half_cheetah",
     "hopper",
     "humanoid",

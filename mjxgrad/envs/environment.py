@@ -115,6 +115,11 @@ class Environment(InScene):
         return middle + half * action
 
     @property
+    def action_limit(self) -> Float[Array, " nu"]:
+        """What actions are clipped to, on both sides."""
+        return jnp.ones(self.num_actions)
+
+    @property
     def num_actions(self) -> int:
         return self.scene.model.nu
 
@@ -152,7 +157,7 @@ class Environment(InScene):
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
-        action = jnp.clip(action, -1, 1)
+        action = jnp.clip(action, -self.action_limit, self.action_limit)
         course = rollout(
             self.scene,
             state.physics,
@@ -167,12 +172,13 @@ class Environment(InScene):
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1
         obs = self.observe(after, memory)
+        terminated = self.is_over(after) | course.diverged
         return EnvState(
             physics=after,
             obs=obs,
             reward=jnp.asarray(sum(terms.values()), obs.dtype),
-            terminated=self.is_over(after) | course.diverged,
-            truncated=num_steps >= self.episode_length,
+            terminated=terminated,
+            truncated=(num_steps >= self.episode_length) & ~terminated,
             metrics={**terms, "diverged": course.diverged.astype(obs.dtype)},
             num_steps=num_steps,
             memory=memory,
@@ -197,3 +203,17 @@ class Environment(InScene):
         if self.randomisation is None:
             return self
         return dataclasses.replace(self, scene=self.randomisation(key, self.scene))
+
+    def changes(self, key: PRNGKeyArray) -> PyTree:
+        """Draw what sets one copy apart, see `randomised`; in a batch of them the copies share all else.
+
+        Returns:
+            Its own numbers, for `with_changes`.
+        """
+        pairs = zip(jax.tree.leaves(self.randomised(key)), jax.tree.leaves(self), strict=True)
+        return [None if copied is own else copied for copied, own in pairs]
+
+    def with_changes(self, changes: PyTree) -> "Environment":
+        """Return the copy whose own numbers `changes` drew."""
+        own, structure = jax.tree.flatten(self)
+        return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])
