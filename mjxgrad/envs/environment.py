@@ -1,7 +1,9 @@
 """Environments: a scene, where episodes start and end, what is seen and what it is worth, as pure functions.
 
 `reset(key)` and `step(state, action)` are those of brax and MuJoCo Playground: traceable, mapped over batches by `jax.vmap`,
-differentiated by `jax.grad`. An environment of one's own gives three or four methods and inherits the rest.
+differentiated by `jax.grad`, and compiled as `jax.jit(lambda state, action: env.step(state, action))`: a method of a pytree of
+arrays has no hash, which `jax.jit(env.step)` would need. An environment of one's own gives three or four methods and inherits
+the rest.
 """
 
 import dataclasses

@@ -26,10 +26,11 @@ def load(
     gradient: Gradient = "discrete",
     onset: Onset | None = None,
     smoothing: Smoothing | None = None,
+    iterations: int = 100,
 ) -> Any:
     """Load an environment of MuJoCo Playground, to be stepped by `mg.step`.
 
-    It is their own object, fit for their wrappers and randomisers. Its motion is theirs to the tolerance of the solver, unless
+    It is their own object, fit for their wrappers and randomisers. Its motion is theirs with a solver that has converged, unless
     an onset or smoothing changes it.
 
     Args:
@@ -39,6 +40,7 @@ def load(
         gradient: see `mg.step`.
         onset: lets contacts begin within the step; `mg.Onset()` for learning by derivatives.
         smoothing: averages contacts.
+        iterations: see `stepped_right`.
 
     Raises:
         ImportError: if playground is not installed.
@@ -53,7 +55,7 @@ def load(
     # A copy, for theirs is changed by the overrides.
     own = None if config is None else config.copy_and_resolve_references()
     environment = registry.load(name, own, overrides)
-    return stepped_right(environment, gradient=gradient, onset=onset, smoothing=smoothing)
+    return stepped_right(environment, gradient=gradient, onset=onset, smoothing=smoothing, iterations=iterations)
 
 
 def stepped_right(
@@ -62,6 +64,7 @@ def stepped_right(
     gradient: Gradient = "discrete",
     onset: Onset | None = None,
     smoothing: Smoothing | None = None,
+    iterations: int = 100,
 ) -> Foreign:
     """Have an object's `reset` and `step` run on `mg.step` wherever they call `mjx.step`.
 
@@ -71,6 +74,9 @@ def stepped_right(
         gradient: see `mg.step`.
         onset: lets contacts begin within the step; `mg.Onset()` for learning by derivatives.
         smoothing: averages contacts.
+        iterations: of the solver, if theirs are fewer; it stops at the model's tolerance. Many of theirs stop after 1 to 4, far
+            from it where feet hit the ground: the motion is then not the model's, and a derivative of the solve not that of
+            the motion.
 
     Returns:
         The same object.
@@ -79,33 +85,36 @@ def stepped_right(
         ValueError: if there is no such gradient, or it does not go with onset or smoothing.
     """
     check_gradient(gradient, onset, smoothing)
-    settings = {"gradient": gradient, "onset": onset, "smoothing": smoothing}
+    by_ours = functools.partial(_step, iterations, gradient=gradient, onset=onset, smoothing=smoothing)
     # On the object, not in a wrapper: those who randomise models go to the innermost environment and call its step.
     for name in ("reset", "step"):
-        setattr(environment, name, _within(getattr(environment, name), settings))
+        setattr(environment, name, _within(getattr(environment, name), by_ours))
     return environment
 
 
-def _within(method: Callable, settings: dict[str, Any]) -> Callable:
+def _step(iterations: int, model: mjx.Model, data: mjx.Data, **settings: Any) -> mjx.Data:
+    most = max(iterations, model.opt.iterations)
+    return step(model.replace(opt=model.opt.replace(iterations=most)), data, **settings)
+
+
+def _within(method: Callable, by_ours: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Callable:
     @functools.wraps(method)
     def call(*args: Any, **kwargs: Any) -> Any:
-        with _substituted(settings):
+        with _substituted(by_ours):
             return method(*args, **kwargs)
 
     return call
 
 
 @contextlib.contextmanager
-def _substituted(settings: dict[str, Any]) -> Iterator[None]:
+def _substituted(by_ours: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Iterator[None]:
     """Let `mjx.step` be ours within the block, in this thread."""
     # One thread at a time: two that took turns would put back each other's substitute.
     with _LOCK:
         original, thread = mujoco.mjx.step, threading.get_ident()
 
         def substitute(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-            if threading.get_ident() != thread:
-                return original(model, data)
-            return step(model, data, **settings)
+            return (by_ours if threading.get_ident() == thread else original)(model, data)
 
         mujoco.mjx.step = substitute
         try:

@@ -51,8 +51,8 @@ class TaskEnvironment(Environment):
         return {**course, "ctrl": _from(step, memory["ctrl"], self.control(action)), "step": step + 1}
 
     def observe(self, state: State, memory: Memory) -> Float[Array, " obs"]:
-        elapsed = memory["step"] / self.episode_length
-        return jnp.concatenate([state.qpos, state.qvel, state.act, elapsed[None].astype(state.qpos.dtype)])
+        elapsed = memory["step"][None].astype(state.qpos.dtype) / self.episode_length
+        return jnp.concatenate([state.qpos, state.qvel, state.act, elapsed])
 
     def rewards(
         self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
