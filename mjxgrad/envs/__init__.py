@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from mjxgrad.envs import diffrl
+from mjxgrad.envs import diffrl, playground
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
@@ -34,6 +34,7 @@ __all__ = [
     "hopper",
     "humanoid",
     "load",
+    "playground",
     "quadruped",
     "walker2d",
 ]

@@ -51,7 +51,9 @@ class GymEnv(gymnasium.Env):
         self.observation_space, self.action_space = _spaces(self.environment)
         self._view = view
         self._begin = jax.jit(lambda key: _begin(self.environment, key))
-        self._advance = jax.jit(lambda changes, state, action: self.environment.with_changes(changes).step(state, action))
+        self._advance = jax.jit(
+            lambda changes, state, action: self.environment.with_changes(changes).step(state, action)
+        )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
@@ -64,7 +66,11 @@ class GymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else _drawn(self.environment, self._state.physics.qpos[None], self._view)[0]
+        return (
+            None
+            if self.render_mode is None
+            else _drawn(self.environment, self._state.physics.qpos[None], self._view)[0]
+        )
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):
@@ -120,7 +126,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the present state of each copy, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else tuple(_drawn(self.environment, self._state.physics.qpos, self._view))
+        return (
+            None if self.render_mode is None else tuple(_drawn(self.environment, self._state.physics.qpos, self._view))
+        )
 
     def _info(self, state: EnvState) -> _Info:
         """Return the metrics as gymnasium lays them out: arrays, and beside each which copies have it."""

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad._rollout import State, Trajectory
 from mjxgrad.envs.environment import Environment, EnvState
@@ -41,7 +41,9 @@ class TaskEnvironment(Environment):
 
     def reset(self, key: PRNGKeyArray) -> EnvState:
         state = super().reset(key)
-        begun = {name: _repeated(getattr(state.physics, name), self.episode_length + 1) for name in ("qpos", "qvel", "act")}
+        begun = {
+            name: _repeated(getattr(state.physics, name), self.episode_length + 1) for name in ("qpos", "qvel", "act")
+        }
         return dataclasses.replace(state, memory={**state.memory, **begun})
 
     def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:

@@ -170,9 +170,9 @@ def test_pictures_show_the_present_state(one):
 
 @pytest.mark.parametrize("kind", [GymEnv, GymVectorEnv])
 def test_an_unknown_environment_or_render_mode_is_refused(cart, kind):
-    with pytest.raises(ValueError, match="name must be one of ant, .* got 'dog'"):
+    with pytest.raises(ValueError, match=r"name must be one of ant, .* got 'dog'"):
         kind("dog")
-    with pytest.raises(ValueError, match='render_mode must be "rgb_array" or None, got \'human\''):
+    with pytest.raises(ValueError, match="render_mode must be \"rgb_array\" or None, got 'human'"):
         kind(cart, render_mode="human")
 
 
@@ -191,12 +191,13 @@ def test_an_agent_of_skrl_learns_to_swing_the_pole_up(tmp_path):
     }
     ppo = {"class": "PPO", "rollouts": 32, "learning_epochs": 4, "mini_batches": 4, "learning_rate": 1e-3}
     quiet = {"directory": str(tmp_path), "write_interval": 0, "checkpoint_interval": 0}
+    unseen = {"disable_progressbar": True, "headless": True, "close_environment_at_exit": False}
     runner_settings = {
         "seed": 0,
         "models": models,
         "memory": {"class": "RandomMemory", "memory_size": -1},
         "agent": {**ppo, "experiment": quiet, "observation_preprocessor": "RunningStandardScaler"},
-        "trainer": {"class": "SequentialTrainer", "timesteps": 6400, "disable_progressbar": True, "close_environment_at_exit": False},
+        "trainer": {"class": "SequentialTrainer", "timesteps": 6400, **unseen},
     }
     with jax.enable_x64(False):
         copies = _Counting(gymnasium.make_vec("mjxgrad/DiffRLCartpole-v0", num_envs=64))

@@ -69,9 +69,15 @@ def both(request):
         then, now = initial_state(ours.scene, *before), initial_state(ours.scene, *after)
         return ours.observe(now, None), ours.rewards(then, action, now, None), ours.is_over(now)
 
-    stacked = (tuple(map(np.stack, zip(*before, strict=True))), np.stack(action), tuple(map(np.stack, zip(*after, strict=True))))
+    stacked = (
+        tuple(map(np.stack, zip(*before, strict=True))),
+        np.stack(action),
+        tuple(map(np.stack, zip(*after, strict=True))),
+    )
     told = jax.jit(jax.vmap(tell))(*jax.tree.map(jnp.asarray, stacked))
-    terms = {key: np.array([x.get(key, 0.0) for x in info]) for key in ("reward_forward", "reward_ctrl", "reward_survive")}
+    terms = {
+        key: np.array([x.get(key, 0.0) for x in info]) for key in ("reward_forward", "reward_ctrl", "reward_survive")
+    }
     return request.param, (np.stack(obs), np.array(reward), np.array(over), terms), told
 
 

@@ -138,5 +138,5 @@ def test_costs_of_observations_are_refused(task):
 
 
 def test_an_engine_without_derivatives_is_refused(task):
-    with pytest.raises(ValueError, match="task must be stepped by .mjx., got 'mujoco'"):
+    with pytest.raises(ValueError, match=r"task must be stepped by .mjx., got 'mujoco'"):
         from_task(task.with_engine("mujoco"))
