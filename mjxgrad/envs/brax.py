@@ -9,7 +9,7 @@ from mjxgrad.envs.environment import Environment, EnvState
 try:
     from brax.envs.base import Env, State
 except ImportError as error:
-    raise ImportError("mjxgrad.envs.brax needs brax: pip install brax") from error
+    raise ImportError("mjxgrad.envs.brax needs brax: pip install 'mjxgrad[playground]'") from error
 
 
 class BraxEnv(Env):
@@ -30,8 +30,8 @@ class BraxEnv(Env):
         return _told(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:
-        physics = self.environment.with_changes(state.info["changes"]).step(state.pipeline_state, action)
-        return _told(state, physics)
+        before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        return _told(state, self.environment.with_changes(state.info["changes"]).step(before, action))
 
     @property
     def observation_size(self) -> int:

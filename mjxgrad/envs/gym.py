@@ -138,7 +138,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def _ends(self, ended: EnvState, done: Bool[np.ndarray, " envs"]) -> _Info:
         obs, metrics = np.asarray(ended.obs), {name: np.asarray(x) for name, x in ended.metrics.items()}
         infos: _Info = {}
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             end = {"final_obs": obs[i], "final_info": {name: x[i] for name, x in metrics.items()}}
             infos = self._add_info(infos, end, i)
         return infos

@@ -50,7 +50,7 @@ def load(
     try:
         from mujoco_playground import registry
     except ImportError as error:
-        raise ImportError(f"{name} is MuJoCo Playground's, not installed: pip install playground") from error
+        raise ImportError(f"{name} is MuJoCo Playground's, not installed: pip install 'mjxgrad[playground]'") from error
     overrides = {**(config_overrides or {}), "impl": "jax"}
     # A copy, for theirs is changed by the overrides.
     own = None if config is None else config.copy_and_resolve_references()
