@@ -1,7 +1,6 @@
 """Environments in brax: its wrappers reset and time out, its learners learn."""
 
-import dataclasses
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,8 +50,7 @@ def wrapped(cart):
 def at_the_end(state, copy):
     """The same with one copy's cart beyond the rail."""
     qpos = state.pipeline_state.physics.qpos.at[copy, 0].set(RAIL + 0.1)
-    physics = dataclasses.replace(state.pipeline_state.physics, qpos=qpos)
-    return state.replace(pipeline_state=dataclasses.replace(state.pipeline_state, physics=physics))
+    return eqx.tree_at(lambda s: s.pipeline_state.physics.qpos, state, qpos)
 
 
 def copied(state):
@@ -120,16 +118,16 @@ def learning(monkeypatch):
     # brax 0.14.2 calls what jax 0.10 has removed.
     monkeypatch.setattr(jax, "device_put_replicated", _replicated, raising=False)
     returns = []
-    environment = load("diffrl_cartpole")
-    settings = {
-        "environment": BraxEnv(environment),
-        "episode_length": environment.episode_length,
-        "num_evals": 3,
-        "num_eval_envs": 16,
-        "normalize_observations": True,
-        "progress_fn": lambda step, metrics: returns.append(float(metrics["eval/episode_reward"])),
-    }
     with jax.enable_x64(False):
+        environment = load("diffrl_cartpole")
+        settings = {
+            "environment": BraxEnv(environment),
+            "episode_length": environment.episode_length,
+            "num_evals": 3,
+            "num_eval_envs": 16,
+            "normalize_observations": True,
+            "progress_fn": lambda step, metrics: returns.append(float(metrics["eval/episode_reward"])),
+        }
         yield settings, returns
 
 
