@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
-from mjxgrad.envs import diffrl
+from mjxgrad.envs import diffrl, playground
 from mjxgrad.envs.bundle import Bundle
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
+from mjxgrad.envs.task_environment import TaskEnvironment, from_task
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "ant": ant,
@@ -27,12 +28,15 @@ __all__ = [
     "Bundle",
     "EnvState",
     "Environment",
+    "TaskEnvironment",
     "ant",
     "diffrl",
+    "from_task",
     "half_cheetah",
     "hopper",
     "humanoid",
     "load",
+    "playground",
     "quadruped",
     "walker2d",
 ]

@@ -1,7 +1,9 @@
 """Environments: a scene, where episodes start and end, what is seen and what it is worth, as pure functions.
 
 `reset(key)` and `step(state, action)` are those of brax and MuJoCo Playground: traceable, mapped over batches by `jax.vmap`,
-differentiated by `jax.grad`. An environment of one's own gives three or four methods and inherits the rest.
+differentiated by `jax.grad`, and compiled as `jax.jit(lambda state, action: env.step(state, action))`: a method of a pytree of
+arrays has no hash, which `jax.jit(env.step)` would need. An environment of one's own gives three or four methods and inherits
+the rest.
 """
 
 import dataclasses
@@ -118,6 +120,11 @@ class Environment(InEngine):
         return middle + half * action
 
     @property
+    def action_limit(self) -> Float[Array, " nu"]:
+        """What actions are clipped to, on both sides."""
+        return jnp.ones(self.num_actions)
+
+    @property
     def num_actions(self) -> int:
         return self.scene.model.nu
 
@@ -155,7 +162,7 @@ class Environment(InEngine):
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
-        action = jnp.clip(action, -1, 1)
+        action = jnp.clip(action, -self.action_limit, self.action_limit)
         key, memory_key, bundle_key = jax.random.split(state.key, 3)
         ctrl = self.control(action)
         course = self._move(state.physics, ctrl)
@@ -166,12 +173,13 @@ class Environment(InEngine):
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1
         obs = self.observe(after, memory)
+        terminated = self.is_over(after) | course.diverged
         return EnvState(
             physics=after,
             obs=obs,
             reward=jnp.asarray(sum(terms.values()), obs.dtype),
-            terminated=self.is_over(after) | course.diverged,
-            truncated=num_steps >= self.episode_length,
+            terminated=terminated,
+            truncated=(num_steps >= self.episode_length) & ~terminated,
             metrics={**terms, "diverged": course.diverged.astype(obs.dtype)},
             num_steps=num_steps,
             memory=memory,
@@ -207,3 +215,17 @@ class Environment(InEngine):
         if self.randomisation is None:
             return self
         return dataclasses.replace(self, scene=self.randomisation(key, self.scene))
+
+    def changes(self, key: PRNGKeyArray) -> PyTree:
+        """Draw what sets one copy apart, see `randomised`; in a batch of them the copies share all else.
+
+        Returns:
+            Its own numbers, for `with_changes`.
+        """
+        pairs = zip(jax.tree.leaves(self.randomised(key)), jax.tree.leaves(self), strict=True)
+        return [None if copied is own else copied for copied, own in pairs]
+
+    def with_changes(self, changes: PyTree) -> "Environment":
+        """Return the copy whose own numbers `changes` drew."""
+        own, structure = jax.tree.flatten(self)
+        return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])

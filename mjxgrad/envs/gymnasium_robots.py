@@ -32,6 +32,7 @@ class Robot(Environment):
         alive_reward: for every step that ends within the healthy ranges.
         healthy_height: of the torso (m); beyond it an episode ends.
         healthy_angle: of a planar torso (rad).
+        healthy_rest: most that all angles and speeds but those of the way may be (rad, m/s, rad/s).
         num_unseen: leading positions that are not observed, where it is.
         speed_limit: what observed speeds are clipped to.
         position_noise, velocity_noise: uniform about the reference pose at the start; `is_normal` draws velocities from a normal
@@ -44,6 +45,7 @@ class Robot(Environment):
     alive_reward: float = eqx.field(static=True, default=0.0, kw_only=True)
     healthy_height: tuple[float, float] = eqx.field(static=True, default=_ANY, kw_only=True)
     healthy_angle: tuple[float, float] = eqx.field(static=True, default=_ANY, kw_only=True)
+    healthy_rest: float = eqx.field(static=True, default=float("inf"), kw_only=True)
     num_unseen: int = eqx.field(static=True, default=1, kw_only=True)
     speed_limit: float = eqx.field(static=True, default=float("inf"), kw_only=True)
     noise: float = eqx.field(static=True, kw_only=True)
@@ -78,6 +80,8 @@ class Robot(Environment):
     def _is_healthy(self, state: State) -> Bool[Array, ""]:
         is_planar = self.num_unseen == 1
         is_healthy = _is_within(state.qpos[1 if is_planar else 2], self.healthy_height)
+        rest = jnp.concatenate([state.qpos[2:], state.qvel])
+        is_healthy &= jnp.all(jnp.abs(rest) < self.healthy_rest)
         return is_healthy & _is_within(state.qpos[2], self.healthy_angle) if is_planar else is_healthy
 
     def _place(self, state: State) -> Float[Array, ""]:
@@ -97,6 +101,7 @@ def hopper() -> Robot:
         alive_reward=1.0,
         healthy_height=(0.7, float("inf")),
         healthy_angle=(-0.2, 0.2),
+        healthy_rest=100.0,
         speed_limit=10.0,
         noise=5e-3,
     )

@@ -1,0 +1,58 @@
+"""Any environment as one of brax, for its learners."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+
+from mjxgrad.envs.environment import Environment, EnvState
+
+try:
+    from brax.envs.base import Env, State
+except ImportError as error:
+    raise ImportError("mjxgrad.envs.brax needs brax: pip install 'mjxgrad[playground]'") from error
+
+
+class BraxEnv(Env):
+    """An environment as brax's wrappers take it: `train(BraxEnv(environment), environment.episode_length, ...)`.
+
+    Resets and time-outs are those of brax's wrappers, by the episode length that the learner is given; `done` is the end for
+    good alone. Each copy draws its friction, masses and gains in `reset`, and keeps them, if those are random.
+    """
+
+    def __init__(self, environment: Environment):
+        self.environment = environment
+
+    def reset(self, rng: PRNGKeyArray | UInt32[Array, "2"]) -> State:
+        key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
+        copy_key, reset_key = jax.random.split(key)
+        changes = self.environment.changes(copy_key)
+        physics = self.environment.with_changes(changes).reset(reset_key)
+        return _told(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
+
+    def step(self, state: State, action: Float[Array, " nu"]) -> State:
+        before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        return _told(state, self.environment.with_changes(state.info["changes"]).step(before, action))
+
+    @property
+    def observation_size(self) -> int:
+        return self.environment.num_observations
+
+    @property
+    def action_size(self) -> int:
+        return self.environment.num_actions
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    @property
+    def dt(self) -> float:
+        """Time between two actions (s)."""
+        return float(self.environment.interval)
+
+
+def _told(state: State, now: EnvState) -> State:
+    done = now.terminated.astype(now.obs.dtype)
+    # Wrappers add to the metrics in place.
+    metrics = {**state.metrics, **now.metrics}
+    return state.replace(pipeline_state=now, obs=now.obs, reward=now.reward, done=done, metrics=metrics)

@@ -1,0 +1,204 @@
+"""Environments step as rollouts do, end for the right reason, and begin anew without a trace in the derivative."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad._rollout import rollout
+from mjxgrad.envs.diffrl import CartPole
+from mjxgrad.scene import load_scene
+from mjxgrad.tasks import scene_path
+
+ACTIONS = jnp.array([[0.7], [-0.4], [0.9], [0.2]])
+RAIL = 1.5  # m
+
+
+class Cart(CartPole):
+    """The swing-up with an end of the rail."""
+
+    def is_over(self, state):
+        return jnp.abs(state.qpos[0]) > RAIL
+
+
+def heavier(key, scene):
+    """Carts and poles of one to two times the mass."""
+    return scene.with_model(body_mass=scene.model.body_mass * jax.random.uniform(key, (), minval=1, maxval=2))
+
+
+@pytest.fixture(scope="module")
+def cart():
+    """Three actions long, so that the fourth comes after the end."""
+    return Cart(load_scene(scene_path("cartpole")), frame_skip=2, episode_length=3, randomisation=heavier)
+
+
+@pytest.fixture(scope="module")
+def state(cart):
+    return jax.jit(lambda key: cart.reset(key))(jax.random.key(3))
+
+
+@pytest.fixture(scope="module")
+def step(cart):
+    return jax.jit(lambda state, action: cart.step(state, action))
+
+
+@pytest.fixture(scope="module")
+def going_on(cart):
+    """Where a step led, where the next one begins, and the derivatives of both states by the action."""
+
+    @jax.jit
+    def both(state, action):
+        def physics(action):
+            ended, following = cart.step_on(state, action)
+            return [(x.physics.qpos, x.physics.qvel, x.obs) for x in (ended, following)], (ended, following)
+
+        _, slopes, states = jax.jvp(physics, (action,), (jnp.ones_like(action),), has_aux=True)
+        return states, [jnp.concatenate([jnp.ravel(x) for x in slope]) for slope in slopes]
+
+    return both
+
+
+def placed(state, *, qpos=None, qvel=None, num_steps=0):
+    """The same with other physics and another count."""
+    parts = {name: jnp.array(x) for name, x in (("qpos", qpos), ("qvel", qvel)) if x is not None}
+    physics = dataclasses.replace(state.physics, **parts)
+    return dataclasses.replace(state, physics=physics, num_steps=jnp.array(num_steps, jnp.int32))
+
+
+def test_steps_are_those_of_a_rollout_of_the_controls(cart, state, step):
+    """To the order of additions: a scan of two steps, twice, is compiled apart from one of four."""
+    controls = jnp.repeat(jax.vmap(cart.control)(ACTIONS[:2]), 2, axis=0)
+    course = jax.jit(lambda start: rollout(cart.scene, start, controls, onset=cart.onset))(state.physics)
+    first = step(state, ACTIONS[0])
+    second = step(first, ACTIONS[1])
+    for index, reached in ((2, first), (4, second)):
+        np.testing.assert_allclose(reached.physics.qpos, course.qpos[index], rtol=1e-13)
+        np.testing.assert_allclose(reached.physics.qvel, course.qvel[index], rtol=1e-12)
+
+
+def test_an_action_beyond_its_limits_is_the_limit(state, step):
+    beyond, limit = step(state, jnp.array([1.7])), step(state, jnp.array([1.0]))
+    np.testing.assert_array_equal(beyond.physics.qvel, limit.physics.qvel)
+    assert step(state, jnp.array([0.9])).physics.qvel[0] != limit.physics.qvel[0]
+
+
+def test_the_reward_is_the_sum_of_its_terms(state, step):
+    stepped = step(state, ACTIONS[0])
+    np.testing.assert_allclose(stepped.reward, stepped.metrics["pole"] + stepped.metrics["cart"], rtol=1e-15)
+
+
+def test_time_that_is_up_truncates_and_does_not_terminate(state, step):
+    ends = []
+    for action in ACTIONS[:3]:
+        state = step(state, action)
+        ends.append((bool(state.terminated), bool(state.truncated), bool(state.done)))
+    assert ends == [(False, False, False), (False, False, False), (False, True, True)]
+
+
+def test_an_end_for_good_terminates_and_is_not_truncated_even_in_the_last_step(state, step):
+    for num_steps in (0, 2):
+        stepped = step(placed(state, qpos=[RAIL + 0.1, 3.0], num_steps=num_steps), ACTIONS[0])
+        assert stepped.terminated
+        assert not stepped.truncated
+
+
+def test_a_state_that_diverges_ends_the_episode_and_says_so(state, step):
+    """Speeds beyond 1e4 count as diverged; the state stays the last good one."""
+    stepped = step(placed(state, qvel=[2e4, 0.0]), ACTIONS[0])
+    assert stepped.terminated
+    assert stepped.metrics["diverged"] == 1
+    assert jnp.isfinite(stepped.obs).all()
+    assert step(state, ACTIONS[0]).metrics["diverged"] == 0
+
+
+def test_after_an_end_a_fresh_start_follows(cart, state, going_on):
+    (ended, following), _ = going_on(placed(state, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
+    assert ended.terminated
+    assert ended.physics.qpos[0] > RAIL
+    assert following.num_steps == 0
+    assert not following.done
+    assert following.physics.time == 0
+    # Starts are within half a metre and half a metre per second of rest.
+    assert np.abs(following.physics.qpos[0]) < 0.5
+    assert np.abs(following.physics.qvel).max() < 0.5
+    np.testing.assert_array_equal(following.obs, cart.observe(following.physics, None))
+
+
+def test_without_an_end_the_episode_goes_on(state, going_on):
+    (ended, following), _ = going_on(state, ACTIONS[0])
+    assert not ended.done
+    for now, then in zip(jax.tree.leaves(ended.physics), jax.tree.leaves(following.physics), strict=True):
+        np.testing.assert_array_equal(now, then)
+    assert following.num_steps == 1
+
+
+def test_each_next_episode_begins_elsewhere(state, going_on):
+    beyond = placed(state, qpos=[RAIL + 0.1, 3.0])
+    (_, first), _ = going_on(beyond, ACTIONS[0])
+    (_, second), _ = going_on(placed(first, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
+    assert np.abs(first.physics.qpos - second.physics.qpos).min() > 0
+
+
+def test_nothing_after_an_end_depends_on_an_action_before_it(state, going_on):
+    _, (slope_of_end, slope_of_next) = going_on(placed(state, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
+    assert np.abs(slope_of_end).min() > 0
+    np.testing.assert_array_equal(slope_of_next, 0.0)
+
+
+def test_within_an_episode_the_derivative_goes_on(state, going_on):
+    _, (slope_of_end, slope_of_next) = going_on(state, ACTIONS[0])
+    np.testing.assert_array_equal(slope_of_next, slope_of_end)
+    assert np.abs(slope_of_next).min() > 0
+
+
+def test_random_copies_under_vmap_are_those_one_by_one(cart, state):
+    keys = jax.random.split(jax.random.key(0), 3)
+    changes = jax.jit(jax.vmap(cart.changes))(keys)
+
+    def speed(changes):
+        return cart.with_changes(changes).step(state, ACTIONS[0]).physics.qvel
+
+    together = jax.jit(jax.vmap(speed))(changes)
+    one = jax.jit(lambda key: cart.randomised(key).step(state, ACTIONS[0]).physics.qvel)
+    # One factorises a batch of matrices, the other one matrix.
+    np.testing.assert_allclose(together, np.stack([one(key) for key in keys]), rtol=1e-12)
+    assert np.ptp(together[:, 0]) > 1e-3
+
+
+def test_copies_share_what_is_not_random(cart):
+    changes = cart.changes(jax.random.key(0))
+    own = sum(x is not None for x in changes)
+    assert 0 < own < 0.2 * len(changes)
+    assert all(x is None for x in dataclasses.replace(cart, randomisation=None).changes(jax.random.key(0)))
+
+
+def test_the_gradient_of_a_return_is_its_slope(cart, state):
+    """Central differences: their error is the square of the width 1e-5, and rounding 1e-16 / 1e-5."""
+
+    def total(actions):
+        def advance(state, action):
+            stepped = cart.step(state, action)
+            return stepped, stepped.reward
+
+        return jax.lax.scan(advance, state, actions)[1].sum()
+
+    value_and_gradient = jax.jit(jax.value_and_grad(total))
+    _, gradient = value_and_gradient(ACTIONS)
+    width = 1e-5
+    for index in range(len(ACTIONS)):
+        change = jnp.zeros_like(ACTIONS).at[index].set(width)
+        high, low = (value_and_gradient(ACTIONS + sign * change)[0] for sign in (1, -1))
+        np.testing.assert_allclose(gradient[index, 0], (high - low) / (2 * width), rtol=1e-7)
+
+
+def test_an_action_of_the_wrong_length_is_refused(cart, state):
+    with pytest.raises(ValueError, match=r"action must have shape \(1,\), got \(2,\)"):
+        cart.step(state, jnp.zeros(2))
+
+
+@pytest.mark.parametrize("name", ["frame_skip", "episode_length"])
+def test_counts_below_one_are_refused(cart, name):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+        dataclasses.replace(cart, **{name: 0})
