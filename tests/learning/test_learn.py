@@ -210,6 +210,18 @@ def _numbers(kind, folder, count=1):
 
 
 @pytest.mark.slow
+def test_seeds_side_by_side_learn_as_each_alone(cartpole, key):
+    """Up to the order of sums in a batch."""
+    keys = jax.random.split(key, 2)
+    both = learning.learn(cartpole, keys, num_updates=2, settings=SMALL)
+    assert both.history["reward"].shape == (2, 2)
+    alone = learning.learn(cartpole, keys[1], num_updates=2, settings=SMALL)
+    pairs = zip(jax.tree.leaves(both.policy), jax.tree.leaves(alone.policy), strict=True)
+    for together, mine in pairs:
+        assert_allclose(together[1], mine, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.slow
 def test_several_devices_and_processes_learn_the_same(tmp_path):
     """Sums over environments are done in another order: some digits of the last places, times two updates of Adam."""
     one = _numbers("one", tmp_path)
