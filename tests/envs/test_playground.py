@@ -110,14 +110,15 @@ def both(request, menagerie):
     """What an environment tells as it is, but with a solver that converges, and by our step: one start, the same actions."""
     from mujoco_playground import registry
 
-    overrides = NAMES[request.param] | {"impl": "jax"}
+    num_actions, options = NAMES[request.param]
+    overrides = options | {"impl": "jax"}
     theirs = registry.load(request.param, config_overrides=overrides)
     # Theirs stop after 1 to 4 iterations, wherever they are then.
     option = theirs.mjx_model.opt.replace(iterations=100, ls_iterations=50)
     theirs._mjx_model = theirs.mjx_model.replace(opt=option)
     ours = playground.load(request.param, config_overrides=overrides)
     start = jax.jit(theirs.reset)(jax.random.PRNGKey(0))
-    actions = jax.random.uniform(jax.random.key(3), (NUM_ACTIONS, ours.action_size), minval=-0.7, maxval=0.7)
+    actions = jax.random.uniform(jax.random.key(3), (num_actions, ours.action_size), minval=-0.7, maxval=0.7)
 
     def told(env, actions):
         def advance(state, action):
