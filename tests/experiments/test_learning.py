@@ -31,7 +31,7 @@ def course(method, returns, **history):
 def test_the_verdict_names_the_best_in_mujoco():
     """Means over episodes 3 and 5, so 4 ± √2 over seeds; 256 steps are 4 updates of 2 environments of 32."""
     outcome = Outcome(QUICK, [course("zeroth", [[1, 1], [1, 1]]), course("onset", [[2, 4], [4, 6]])], None)
-    assert verdict(outcome) == "First order returns 4.0 ± 1.4 in C MuJoCo after 256 steps; zeroth order 1.00."
+    assert verdict(outcome) == "After 256 steps first order returns 4.0 ± 1.4 in C MuJoCo; zeroth order 1.00."
 
 
 def test_what_was_left_out_is_said():
