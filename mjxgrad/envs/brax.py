@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 from mjxgrad.envs.environment import Environment, EnvState
 
 try:
-    from brax.envs.base import Env, State
+    from brax.envs.base import Env, State  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise ImportError("mjxgrad.envs.brax needs brax: pip install 'mjxgrad[playground]'") from error
 

@@ -48,7 +48,7 @@ def load(
     """
     # Imported here: brax's environments need no playground.
     try:
-        from mujoco_playground import registry
+        from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(f"{name} is MuJoCo Playground's, not installed: pip install 'mjxgrad[playground]'") from error
     overrides = {**(config_overrides or {}), "impl": "jax"}

@@ -181,7 +181,7 @@ def test_their_auto_reset_cuts_the_derivative(menagerie):
 
 @pytest.mark.slow
 def test_one_of_braxs_environments_steps_right():
-    """Its swimmer-like plane pendulum: the derivative by the push is the slope."""
+    """The derivative of where its pendulum goes by the push is the slope."""
     envs = pytest.importorskip("brax.envs", reason="pip install brax")
     env = playground.stepped_right(envs.get_environment("inverted_pendulum", backend="mjx"))
     start = jax.jit(env.reset)(jax.random.PRNGKey(0))
