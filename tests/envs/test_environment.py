@@ -17,7 +17,10 @@ RAIL = 1.5  # m
 
 
 class Cart(CartPole):
-    """The swing-up with an end of the rail."""
+    """The swing-up with an end of the rail, paid for its pushes, too."""
+
+    def rewards(self, before, action, after, memory):
+        return {**super().rewards(before, action, after, memory), "push": 0.1 * action[0]}
 
     def is_over(self, state):
         return jnp.abs(state.qpos[0]) > RAIL
@@ -79,14 +82,16 @@ def test_steps_are_those_of_a_rollout_of_the_controls(cart, state, step):
 
 
 def test_an_action_beyond_its_limits_is_the_limit(state, step):
+    """For the motion and for what is paid, 0.1 for a push of 1."""
     beyond, limit = step(state, jnp.array([1.7])), step(state, jnp.array([1.0]))
     np.testing.assert_array_equal(beyond.physics.qvel, limit.physics.qvel)
-    assert step(state, jnp.array([0.9])).physics.qvel[0] != limit.physics.qvel[0]
+    assert beyond.metrics["push"] == 0.1
+    assert step(state, jnp.array([0.9])).metrics["push"] == pytest.approx(0.09)
 
 
 def test_the_reward_is_the_sum_of_its_terms(state, step):
     stepped = step(state, ACTIONS[0])
-    np.testing.assert_allclose(stepped.reward, stepped.metrics["pole"] + stepped.metrics["cart"], rtol=1e-15)
+    np.testing.assert_allclose(stepped.reward, sum(stepped.metrics[k] for k in ("pole", "cart", "push")), rtol=1e-14)
 
 
 def test_time_that_is_up_truncates_and_does_not_terminate(state, step):

@@ -14,13 +14,12 @@ import pytest
 from mjxgrad.dynamics import Onset
 from mjxgrad.envs import playground
 
-NUM_ACTIONS = 8
-# Of theirs: actions until a foot of the Go1 is down, so that its solver of one iteration matters.
+# How many actions, and what is to be known: noise on observations and pushes have keys of their own.
 NAMES = {
-    "CartpoleSwingup": {},
-    "CheetahRun": {},
-    "HopperHop": {},
-    "Go1JoystickFlatTerrain": {"noise_config.level": 0.0},
+    "CartpoleSwingup": (8, {}),
+    "CheetahRun": (8, {}),
+    "HopperHop": (8, {}),
+    "Go1JoystickFlatTerrain": (2, {"noise_config.level": 0.0, "pert_config.enable": False}),
 }
 
 
@@ -181,7 +180,7 @@ def test_their_auto_reset_cuts_the_derivative(menagerie):
 
 @pytest.mark.slow
 def test_one_of_braxs_environments_steps_right():
-    """Its swimmer-like plane pendulum: the derivative by the push is the slope."""
+    """The derivative of where its pendulum goes by the push is the slope."""
     envs = pytest.importorskip("brax.envs", reason="pip install brax")
     env = playground.stepped_right(envs.get_environment("inverted_pendulum", backend="mjx"))
     start = jax.jit(env.reset)(jax.random.PRNGKey(0))
