@@ -6,8 +6,7 @@ Minimise over a
 
 with the laws s_i of `constraint`. The problem is strictly convex, so the starting point affects the time taken and not the
 answer. Along a search line the derivative of the cost is monotone and, but for elliptic rows and rows under noise, piecewise
-linear: Newton's method on it, kept inside a bracket, ends at the exact minimiser after as many steps as it crosses pieces. It
-takes a fixed number of steps, since under `vmap` a loop until convergence runs as long as its slowest member. (The
+linear: Newton's method on it, kept inside a bracket, ends at the exact minimiser after as many steps as it crosses pieces. (The
 minimiser can also be read off the values at all breakpoints at once, without iterating; that takes rows² work and was
 three times slower at 24 rows.) Elliptic cones need the loop: near the apex their curvature belongs to one side only, so that
 the minimiser may lie at a thousandth of the step that it promises, and what is not known to lower the cost may raise it.
@@ -45,11 +44,9 @@ _Scalar = Float[Array, "*batch"]
 _Truth = Bool[Array, "*batch"]
 _Result = tuple[_Vector, Int[Array, "*batch"]]
 
-# Newton steps along the search line. Near the solution the first, of length one, is already exact; far from it an inexact
-# search costs an outer iteration and not the answer. On a box and a ball that slide on a plane, 2 to 12 steps needed the
-# same number of outer iterations within two per cent.
+# Newton steps along the search line that all take: to ask whether they are needed takes as long as they do.
 _LINE_STEPS = 4
-# Bound of the loop that elliptic cones need. Halving alone gets to 1e-12 of the bracket; 25 were seen.
+# Bound of the steps after that, and of those for elliptic cones. Halving alone gets to 1e-12 of the bracket; 25 were seen.
 _MAX_LINE_STEPS = 40
 # A line search has converged where the slope has fallen to this part of its value at the start. On 512 stiff elliptic
 # problems 0.1, 0.01 and 0.001 took the same number of outer iterations.
@@ -502,14 +499,30 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
     # The inertial part alone bounds the root from above: the rows only add to the slope's growth.
     high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
-    if problem.is_piecewise_quadratic:
+    search = (_until_exact if problem.is_piecewise_quadratic else _until_flat)(improve, search)
+    return jnp.where(search.is_flat | (search.low == 0), search.length, search.low)
+
+
+def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Search:
+    """Improve a few times, and on until every slope is flat, at which the next look is the minimiser.
+
+    Without the second part the iteration may go around in a circle: where a step is a hundred times too long, as a foot that is
+    pressed hard may make it, four looks are all beyond the minimiser, and the last of them raises the cost.
+    """
+    is_done, num_looks = search.is_flat, 0
+    if jax.default_backend() != "cpu" and is_done.ndim:
         # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA
         # writes each step out again wherever the next one uses its length.
-        unroll = jax.default_backend() != "cpu" and start.ndim > 0
-        search = jax.lax.fori_loop(0, _LINE_STEPS, lambda _, s: improve(s), search, unroll=unroll)
-    else:
-        search = _until_flat(improve, search)
-    return jnp.where(search.is_flat | (search.low == 0), search.length, search.low)
+        num_looks = _LINE_STEPS
+        for _ in range(num_looks):
+            search = improve(search)
+
+    def goes_on(state):
+        search, count = state
+        is_left = ~(search.is_flat | is_done)
+        return (count < _LINE_STEPS) | ((jnp.any(is_left) if is_left.ndim else is_left) & (count < _MAX_LINE_STEPS))
+
+    return jax.lax.while_loop(goes_on, lambda state: (improve(state[0]), state[1] + 1), (search, num_looks))[0]
 
 
 def _until_flat(improve: Callable[[_Search], _Search], search: _Search) -> _Search:

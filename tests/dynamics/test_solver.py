@@ -153,6 +153,42 @@ def test_the_last_of_a_large_batch_are_finished_as_in_a_small_one(num_hard: int)
         assert 3 < np.sort(np.asarray(whole[1])[hard])[-2] <= 20
 
 
+_PENDULUM_BOX = """<mujoco><option iterations="100"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/><body pos="0 0 .1">
+  <joint axis="0 1 0" range="-.1 .1" frictionloss="1"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".02" mass=".1"/>
+  </body></body></worldbody></mujoco>"""
+
+
+def test_no_solve_goes_around_in_a_circle():
+    """A box pressed into the floor, on it a dry hinge at its limit: steps may be a hundred times too long.
+
+    With four looks along each line 5 of 2048 do not end. The answers are those of C at a tolerance of 1e-8.
+    """
+    model, size = mujoco.MjModel.from_xml_string(_PENDULUM_BOX), 2048
+    mjx_model, data = mjx.put_model(model), mjx.make_data(model)
+    random = np.random.default_rng(1)
+    poses = np.tile(data.qpos, (size, 1))
+    poses[:, :3] += 0.05 * random.normal(size=(size, 3))
+    poses[:, 3:7] += 0.03 * random.normal(size=(size, 4))
+    poses[:, 7] += 0.05 * random.normal(size=size)
+    speeds, starts = 2 * random.normal(size=(size, 7)), 1e3 * random.normal(size=(size, 7))
+
+    @jax.jit
+    @jax.vmap
+    def push(qpos, qvel, start):
+        moved = mg.forward(mjx_model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=start))
+        return moved.qacc, moved._impl.solver_niter
+
+    found, num_iterations = push(poses, speeds, starts)
+    assert num_iterations.max() <= 20
+    hardest = np.argsort(num_iterations)[-5:]
+    truth = mujoco.MjData(model)
+    for i in hardest:
+        truth.qpos[:], truth.qvel[:] = poses[i], speeds[i]
+        mujoco.mj_forward(model, truth)
+        np.testing.assert_allclose(found[i], truth.qacc, atol=1e-5 * np.abs(truth.qacc).max())
+
+
 def test_in_single_precision_it_ends_when_what_is_left_is_rounding():
     """What cancels within M a and J a is in no estimate of rounding: without a margin for it half of these go on to the end."""
     random, batch, size = np.random.default_rng(0), 128, 16
