@@ -23,6 +23,9 @@ ORDER = (
     ("baselines",),
     ("devices", "diagnostics", "integration", "planning", "render"),
     ("tasks",),
+    ("verdict",),
+    ("cli",),
+    ("__main__",),
 )
 LINE = {part: i for i, line in enumerate(ORDER) for part in line}
 MODULES = {
