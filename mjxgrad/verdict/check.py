@@ -90,12 +90,20 @@ class Verdict:
         for finding in self.findings:
             lead = "! " if finding.is_fault else "- "
             lines.append(textwrap.fill(finding.text, _WIDTH, initial_indent=lead, subsequent_indent="  "))
-        lines += ["", textwrap.indent(self.code, "    "), self.scene.summary(), "", self.stability.summary()]
-        spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
-        return "\n".join([*lines, "", f"Outcomes: {'; '.join(self.outcomes)}. Time: {spent}."])
+        return "\n\n".join(["\n".join(lines), textwrap.indent(self.code, "    ").rstrip(), *self._details().values()])
 
     def __str__(self) -> str:
         return self.summary()
+
+    def _details(self) -> dict[str, str]:
+        """Return what is there to look up: what was measured, the scene, its time step."""
+        spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
+        looked_at = f"Outcomes: {'; '.join(self.outcomes)}.\nTime: {spent}."
+        return {
+            "What was measured": looked_at,
+            "The scene": self.scene.summary(),
+            "Time step and contacts": self.stability.summary(),
+        }
 
     def as_json(self) -> str:
         """Write it for programs; numbers in SI units."""
@@ -118,7 +126,7 @@ class Verdict:
 
     def as_html(self) -> str:
         """Write it as one page that needs nothing beside it."""
-        details = {"The scene": self.scene.summary(), "Time step and contacts": self.stability.summary()}
+        details = self._details()
         return page(self.name, self.headline, self.findings, self.code, details, self.measured, self.outcomes)
 
 
@@ -139,8 +147,8 @@ def check(
 
     Args:
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
-        cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; it is followed from the start. None looks at
-            random mixes of where each body ends up.
+        cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
+            their start. None looks at random mixes of where bodies end up, and how fast.
         derivatives: measure them; False is a matter of seconds.
         seconds: to spend on motions after compilation, about. Slow scenes are followed for fewer steps.
         seed: of all that is random.
@@ -267,16 +275,16 @@ def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tupl
     model = scene.mj_model
     trees = np.unique(model.body_rootid[model.jnt_bodyid])
     heaviest = sorted(trees.tolist(), key=lambda root: -model.body_subtreemass[root])[:_MOST_TREES]
-    weights, names = np.zeros((len(heaviest), model.nq)), []
-    for row, root in enumerate(heaviest):
-        joints = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == root)
-        ends = [*model.jnt_qposadr[1:].tolist(), model.nq]
-        for joint in joints.tolist():
-            here = slice(int(model.jnt_qposadr[joint]), ends[joint])
-            weights[row, here] = rng.normal(size=here.stop - here.start)
-        names.append(f"where {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or f'body {root}'} ends up")
-    mixing = jnp.asarray(weights / np.sqrt((weights**2).sum(axis=1, keepdims=True)))
-    return tuple(names), lambda trajectory: mixing @ trajectory.qpos[-1]
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or f"body {root}" for root in heaviest]
+    dof_joints, sizes = model.dof_jntid, np.diff([*model.jnt_qposadr, model.nq])
+    mixes = []
+    for joints in (np.repeat(np.arange(model.njnt), sizes), dof_joints):
+        is_own = model.body_rootid[model.jnt_bodyid[joints]] == np.array(heaviest)[:, None]
+        weights = rng.normal(size=is_own.shape) * is_own
+        mixes.append(jnp.asarray(weights / np.sqrt((weights**2).sum(axis=1, keepdims=True))))
+    words = [f"where {name} ends up" for name in names] + [f"how fast {name} is in the end" for name in names]
+    ends = lambda trajectory: (trajectory.qpos[-1], trajectory.qvel[-1])  # noqa: E731
+    return tuple(words), lambda t: jnp.concatenate([mix @ end for mix, end in zip(mixes, ends(t), strict=True)])
 
 
 def _noise_row(noise) -> dict[str, Any]:

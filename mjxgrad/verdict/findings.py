@@ -20,6 +20,7 @@ Kind = Literal[
 MANY_PAIRS = 1000
 """Pairs of geoms from which on they are counted aloud."""
 _SPARE_STEP = 0.9
+_CLOSE = 0.05  # typical error of a derivative that is the slope
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,7 @@ def measured_findings(motions: Motions, measured: Measured) -> Iterator[Finding]
             f"{_some(line.changed)} touches on one side of it alone" if line.changed else "no pair differs beside it"
         )
         text = (
-            f"The outcome jumps as {line.varied} change{'s' * (line.varied == 'both')}: {pairs}. "
-            "No derivative sees a jump; alpha_order does."
+            f"The outcome jumps along a change of {line.varied}: {pairs}. No derivative sees a jump; alpha_order does."
         )
         yield Finding("jump", text, True)
     growth = np.array([line.growth for line in measured.lines])
@@ -136,28 +136,29 @@ def measured_findings(motions: Motions, measured: Measured) -> Iterator[Finding]
 
 
 def _slope_finding(found: Sequence[Slope]) -> Finding:
-    words = {"discrete": "MuJoCo's own derivative", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
     if not found[0].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
-    parts = [f"{words[one.kind]} at {one.num_readings - one.num_off} of {one.num_readings}" for one in found]
-    missed = found[0].error
-    extent = f" MuJoCo's own is typically off by {percent(missed)}." if found[0].num_off else ""
-    return Finding("slope", f"The mean derivative is the slope: {'; '.join(parts)} readings.{extent}")
+    words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
+    parts = [f"{words[one.kind]} {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}" for one in found]
+    return Finding("slope", f"Readings at which the mean derivative is the slope, and typical error: {'; '.join(parts)}.")
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
-    for noise in measured.noises:
-        contact = (
-            "the file's contact" if noise.stiffness is None else f"stiffness {format_number(noise.stiffness)} 1/s²"
-        )
-        until = noise.crossover.horizon
-        better = "as far as measured" if math.isinf(until) else f"up to {until:.2g} s"
-        if np.isnan(noise.advantage):
-            yield Finding("order", f"Noise {noise.stddev:g}, {contact}: no outcome felt it.")
+    """Yield a sentence for the file's contact, and one for a softer one that makes a difference."""
+    groups = [[one for one in measured.noises if (one.stiffness is None) == is_own] for is_own in (True, False)]
+    for group in groups:
+        felt = [one for one in group if not np.isnan(one.advantage)]
+        if not felt:
             continue
-        number = format_number(float(f"{noise.advantage:.2g}"))
-        text = f"Noise {noise.stddev:g}, {contact}: one first-order sample is worth {number} of zeroth order; better {better}."
-        yield Finding("order", text)
+        until = min(one.crossover.horizon for one in felt)
+        ends = f"first order is better up to {until:.2g} s" if math.isfinite(until) else "better as far as measured"
+        contact = (
+            "" if felt[0].stiffness is None else f" With contact softened to {format_number(felt[0].stiffness)} 1/s²:"
+        )
+        noises = " and ".join(f"{one.stddev:g}" for one in felt)
+        values = " and ".join(format_number(float(f"{one.advantage:.1g}")) for one in felt)
+        text = f"{contact} One first-order sample is worth {values} of zeroth order under noise of {noises}; {ends}."
+        yield Finding("order", text.strip())
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
@@ -186,7 +187,9 @@ def recommend(
         horizon = max(40, round(0.2 / motions.timestep))
         return Recommendation(touches, "discrete", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
     found = slopes(measured)
-    best = min(found, key=lambda one: one.num_off) if touches else found[0]
+    discrete, event, onset = found
+    needs_none = not touches or (discrete.num_off == 0 and not discrete.error > _CLOSE)
+    best = discrete if needs_none else onset if onset.num_off <= event.num_off else event
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]

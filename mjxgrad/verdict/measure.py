@@ -1,5 +1,6 @@
 """What is measured of a scene's derivatives: along lines, and under noise, by the diagnostics that there are for each."""
 
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,10 +21,11 @@ from mjxgrad.estimators.samples import Plan, Samples
 from mjxgrad.objective.base import unchanged
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.verdict.programs import CHUNK, Direction, Moved, Programs, contact_of
+from mjxgrad.verdict.programs import CHUNK, Direction, Moved, Programs, contact_of, moved
 
-HALF_LENGTH = 0.2
-"""Of a line, from its middle: m/s and rad/s of the start, shares of half the range of controls."""
+_TEETH = 8  # time steps through which the first touch is to move from the middle of a line to its end
+_SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
+_WIDE = 4.0  # times as long as the others is the last line: for jumps that are farther off
 STDDEVS = (0.1, 0.3)
 """Noise that is tried, as a share of half the range of controls; without controls in m/s and rad/s of the start."""
 SOFTER = 0.1
@@ -123,7 +125,8 @@ def measure(
     log(f"derivatives over {num_steps} steps, {num_steps * motions.timestep:.3g} s, from motions that touch")
     probe = _Probe(scene, motions, programs, lengths)
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
-    directions = [_direction(scene, rng, num_steps, i) for i in range(_NUM_LINES if scene.model.nu else 1)]
+    speed = max((touch.speed for touch in motions.touches), default=0.0) or 1.0
+    directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
     softness = _softer(scene)
     settings = [(stddev, soft) for soft in ([None] if softness is None else [None, softness]) for stddev in STDDEVS]
     with ThreadPoolExecutor(2) as pool:
@@ -138,10 +141,9 @@ def measure(
 
 def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: float) -> list[int]:
     """Choose how many steps, by when things touch and by how long a step takes here, and at which of them to look."""
-    import time
-
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
-    direction = Direction(np.zeros(motions.qvel.shape[2]), np.zeros((CHUNK, motions.controls.shape[2])))
+    still = np.zeros(motions.qvel.shape[2])
+    direction = Direction(still, still, np.zeros((CHUNK, motions.controls.shape[2])))
     states = _repeated(motions.state(0, 0), programs.size)
     controls = np.repeat(motions.controls[:1, :CHUNK], programs.size, axis=0)
     programs.move("onset", states, controls, direction, [CHUNK])
@@ -157,15 +159,24 @@ def _repeated(state: State, size: int) -> State:
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], size, axis=0), state)
 
 
-def _direction(scene: Scene, rng: np.random.Generator, num_steps: int, number: int) -> tuple[str, Direction]:
-    """Draw a change of the start, of the controls, or of both, of root mean square 1 in their units."""
+def _direction(
+    scene: Scene, rng: np.random.Generator, num_steps: int, speed: float, number: int
+) -> tuple[str, Direction]:
+    """Draw a change of the start, of the controls, or a wide one of both; from −1 to 1 of it is a line.
+
+    Long enough for the first touch to move through several steps, so that it meets the teeth of MuJoCo's motion.
+    """
     model, timestep = scene.model, float(scene.model.opt.timestep)
-    qvel = rng.normal(size=model.nv)
-    qvel /= np.sqrt((qvel**2).mean())
-    controls = smooth(rng, num_steps, model.nu, num_steps * timestep)
-    controls = controls / np.sqrt((controls**2).mean()) * half_range(scene) if model.nu else controls
-    parts = ((qvel, 0 * controls), (0 * qvel, controls), (qvel, controls))
-    return ("the start's velocities", "the controls", "both")[number], Direction(*parts[number])
+    units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
+    sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
+    parts = [
+        size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in zip(sizes, units, strict=True)
+    ]
+    wide = _WIDE if number == _NUM_LINES - 1 else 1.0
+    has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
+    given = (wide * has_start, wide * has_start, wide * has_controls)
+    words = ["the start"] * has_start + ["the controls"] * has_controls
+    return " and ".join(words), Direction(*(part * share for part, share in zip(parts, given, strict=True)))
 
 
 def _softer(scene: Scene) -> float | None:
@@ -184,41 +195,40 @@ class _Probe:
     def _at(self, motion: int, begin: int) -> tuple[State, Float[np.ndarray, "steps nu"]]:
         return self.motions.state(motion, begin), self.motions.controls[motion, begin : begin + self.lengths[-1]]
 
-    def line(self, motion: int, begin: int, varied: str, direction: Direction) -> Line:
+    def line(self, motion: int, begin: int, words: str, direction: Direction) -> Line:
         """Measure slope, derivatives and jumps along a line."""
         state, controls = self._at(motion, begin)
 
         def along(kind: str, places: Float[np.ndarray, " motions"]) -> Moved:
             states = _repeated(state, self.programs.size)
-            states.qvel[:] += places[:, None] * direction.qvel
-            moved = controls + places[:, None, None] * direction.controls
-            return self.programs.move(kind, states, moved, direction, self.lengths)
+            states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
+            states.qvel[:] += places[:, None] * direction.velocities
+            varied = controls + places[:, None, None] * direction.controls
+            return self.programs.move(kind, states, varied, direction, self.lengths)
 
-        places = phases((-HALF_LENGTH, HALF_LENGTH), self.programs.size)
+        places = phases((-1.0, 1.0), self.programs.size)
         discrete, event, onset = (along(kind, places) for kind in ("discrete", "event", "onset"))
         plain = compare_to_slope(places, discrete.outcomes, [discrete.derivatives, event.derivatives])
-        smooth = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
+        continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
         last = onset.outcomes[:, -1]
         centre, spread = np.nanmean(last, axis=0), np.nanstd(last, axis=0)
         scale = np.where(spread > 1e-9 * np.abs(centre), spread, np.inf)
         jumps = jumps_along(
             lambda x: (along("onset", x).outcomes[:, -1] - centre) / scale,
-            (-HALF_LENGTH, HALF_LENGTH),
+            (-1.0, 1.0),
             num_points=self.programs.size,
             num_candidates=self.programs.size // 8,
             num_refinements=3,
             smallest=_SMALLEST_JUMP,
         )
         return Line(
-            pose=f"{self.motions.poses[motion]}, {begin * self.motions.timestep:.3g} s on"
-            if begin
-            else self.motions.poses[motion],
-            varied=varied,
+            pose=self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else ""),
+            varied=words,
             plain=plain,
-            smooth=smooth,
+            smooth=continuous,
             jumps=jumps,
             changed=self._changed(state, controls, direction, jumps),
-            growth=np.median(onset.growth, axis=0) if direction.qvel.any() else np.full(len(self.lengths), np.nan),
+            growth=np.median(onset.growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
             num_diverged=discrete.num_diverged + onset.num_diverged,
             num_crowded=onset.num_crowded,
         )
@@ -227,10 +237,11 @@ class _Probe:
         """Name the pairs that touch on one side of the largest jump alone."""
         if jumps.largest < 0:
             return ()
-        place, aside, sides = jumps.places[jumps.largest], HALF_LENGTH / 100, []
-        for x in (place - aside, place + aside):
-            moved = State(state.qpos, state.qvel + x * direction.qvel, state.act, state.time, state.warmstart)
-            sides.append(pairs_at(self.scene, moved, controls + x * direction.controls))
+        place, sides = jumps.places[jumps.largest], []
+        for x in (place - 0.01, place + 0.01):
+            qpos = jnp.asarray(moved(self.scene.mj_model, np.asarray(state.qpos)[None], direction.positions, x)[0])
+            start = State(qpos, state.qvel + x * direction.velocities, state.act, state.time, state.warmstart)
+            sides.append(pairs_at(self.scene, start, controls + x * direction.controls))
         return tuple(sorted(sides[0] ^ sides[1]))
 
     def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:
@@ -238,23 +249,22 @@ class _Probe:
         state, controls = self._at(motion, begin)
         size, steps, half = self.programs.size, self.lengths[-1], half_range(self.scene)
         has_controls = self.scene.model.nu > 0
-        wiggle = (
-            smooth(rng, steps, len(half), steps * self.motions.timestep)
-            if has_controls
-            else rng.normal(size=(1, state.qvel.size))
-        )
+        still = np.zeros(state.qvel.size)
+        wiggle = rng.normal(size=(1, still.size))
+        if has_controls:
+            wiggle = smooth(rng, steps, len(half), steps * self.motions.timestep)
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
         states = _repeated(state, size)
         if has_controls:
-            direction, moved = Direction(0 * np.asarray(state.qvel), along * half), controls + noise * half
+            direction, noisy = Direction(still, still, along * half), controls + noise * half
         else:
-            direction, moved = Direction(along[0], controls), np.repeat(controls[None], size, axis=0)
+            direction, noisy = Direction(still, along[0], controls), np.repeat(controls[None], size, axis=0)
             states.qvel[:] += noise[:, 0]
         contact = None
         if stiffness is not None:
             contact = contact_of(Softness(stiffness=stiffness, damping_ratio=1.0).apply(self.scene.model))
-        found = self.programs.move("onset", states, moved, direction, self.lengths, contact)
+        found = self.programs.move("onset", states, noisy, direction, self.lengths, contact)
         # An outcome depends on the noise of the steps before it alone.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]

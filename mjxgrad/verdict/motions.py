@@ -163,18 +163,19 @@ def _touches(
 ) -> tuple[tuple[Touch, ...], tuple[str, ...], Int[np.ndarray, " motions"]]:
     """Find what begins to touch in any motion, what touches from the start, and the first beginning in each."""
     data, found, always, onsets = mujoco.MjData(model), {}, {}, np.full(len(qpos), -1)
+    before = set()
     for motion, step in np.ndindex(qpos.shape[:2]):
         data.qpos[:], data.qvel[:] = qpos[motion, step], qvel[motion, step]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         now = {tuple(contact.geom): contact for contact in data.contact if contact.efc_address >= 0}
         if step == 0:
-            always |= now
-        for pair in now.keys() - (now.keys() if step == 0 else before):
+            always, before = always | now, set(now)
+        for pair in now.keys() - before:
             onsets[motion] = step if onsets[motion] < 0 else onsets[motion]
             time, speed = found.get(pair, (np.inf, 0.0))
             found[pair] = (min(time, step * model.opt.timestep), max(speed, _approach(model, data, now[pair])))
-        before = now.keys()
+        before = set(now)
     named = [Touch(_pair(model, pair), *when) for pair, when in found.items()]
     return tuple(sorted(named, key=lambda touch: touch.time)), tuple(_pair(model, pair) for pair in always), onsets
 

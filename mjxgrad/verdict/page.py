@@ -13,9 +13,10 @@ from mjxgrad.verdict.measure import Line, Measured
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 360.0, 280.0, 58.0, 12.0, 34.0, 44.0
 _TICK = 0.022  # half the length of a tangent, as a share of the width
 _STYLE = """
-:root { color-scheme: light dark; --ink: #1d1d1f; --paper: #fff; --soft: #6b6b70; --line: #d9d9de; --plain: #c2500a; --smooth: #00795a; }
-@media (prefers-color-scheme: dark) { :root { --ink: #ececf0; --paper: #17171a; --soft: #a3a3ab; --line: #3a3a40; --plain: #ff9d5c;
-  --smooth: #3fd0a4; } }
+:root { color-scheme: light dark; --ink: #1d1d1f; --paper: #fff; --soft: #6b6b70; --line: #d9d9de;
+  --plain: #c2500a; --smooth: #00795a; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #ececf0; --paper: #17171a; --soft: #a3a3ab; --line: #3a3a40; --plain: #ff9d5c; --smooth: #3fd0a4; } }
 body { margin: 0; background: var(--paper); color: var(--ink); font: 1rem/1.5 system-ui, sans-serif; }
 main { max-width: 44rem; margin: 0 auto; padding: 1rem; }
 h1 { font-size: 1.35rem; line-height: 1.3; margin: .2rem 0 1rem; overflow-wrap: anywhere; }
@@ -26,7 +27,7 @@ svg .axis { stroke: var(--line); } svg .plain { stroke: var(--plain); fill: var(
 svg .smooth { stroke: var(--smooth); fill: var(--smooth); } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
 svg text.plain { stroke: none; fill: var(--plain); } svg text.smooth { stroke: none; fill: var(--smooth); }
 li { margin: .35rem 0; overflow-wrap: anywhere; } .fault { font-weight: 600; } ul { padding-left: 1.2rem; }
-pre { overflow-x: auto; border: 1px solid var(--line); border-radius: .4rem; padding: .7rem; font-size: .8rem; line-height: 1.45; }
+pre { overflow-x: auto; border: 1px solid var(--line); border-radius: .4rem; padding: .7rem; font-size: .8rem; }
 summary { cursor: pointer; padding: .3rem 0; }
 """
 
@@ -75,14 +76,13 @@ def _text(text: str) -> str:
 def _figure(measured: Measured, outcomes: Sequence[str]) -> str:
     """Draw the line on which MuJoCo's derivative is farthest from the slope, or that with the largest jump."""
     line, time, outcome = _most_telling(measured)
-    place = "m/s, rad/s" if line.varied == "the start's velocities" else "share of half the range"
     caption = (
-        f"{outcomes[outcome][:1].upper() + outcomes[outcome][1:]} after {measured.times[time]:.2g} s, as {line.varied} "
-        f"change along a random line ({line.pose}). Each dash is a derivative: it should lie along its curve."
+        f"{outcomes[outcome][:1].upper() + outcomes[outcome][1:]} after {measured.times[time]:.2g} s, along a "
+        f"random change of {line.varied} ({line.pose}). Each dash is a derivative: it should lie along its curve."
     )
     if len(line.jumps.places):
         caption += " Dashed: jumps."
-    return f"<figure>{_drawing(line, time, outcome, place)}<figcaption>{_text(caption)}</figcaption></figure>"
+    return f"<figure>{_drawing(line, time, outcome)}<figcaption>{_text(caption)}</figcaption></figure>"
 
 
 def _most_telling(measured: Measured) -> tuple[Line, int, int]:
@@ -96,7 +96,7 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
     return measured.lines[int(number)], int(time), int(outcome)
 
 
-def _drawing(line: Line, time: int, outcome: int, place: str) -> str:
+def _drawing(line: Line, time: int, outcome: int) -> str:
     x = line.plain.parameters
     curves = {"plain": (line.plain, "MuJoCo's step"), "smooth": (line.smooth, "with an onset")}
     values = np.concatenate([one.outcomes[:, time, outcome] for one, _ in curves.values()])
@@ -121,7 +121,7 @@ def _drawing(line: Line, time: int, outcome: int, place: str) -> str:
         text = format_number(round(float(value), 2))
         marks.append(f'<text x="{across(value):.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="{anchor}">{text}</text>')
     middle = (_LEFT + _WIDTH - _RIGHT) / 2
-    marks.append(f'<text x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">{_text(place)}</text>')
+    marks.append(f'<text x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">place on the line</text>')
     return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'
 
 

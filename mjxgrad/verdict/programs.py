@@ -1,9 +1,9 @@
 """One compiled program per kind of derivative, from which every measurement is taken.
 
-Compiling a step takes longer than running thousands of it. So there is one program for each of `KINDS`, which takes a batch of
-motions, and a change of each, ten steps further. Motions of any length are made of it, and a motion has all shorter
-ones within it. Contact parameters are arguments, so that a sweep over softness is no new program. Forward mode along one direction
-compiles in half the time of reverse mode, and gives the change of every outcome at every time.
+Compiling a step takes longer than running thousands of it. So there is one program for each of `KINDS`, which takes a
+batch of motions, and a change of each, ten steps further. Motions of any length are made of it, and a motion has all
+shorter ones within it. Contact parameters are arguments, so that a sweep over softness is no new program. Forward mode along
+one direction compiles in half the time of reverse mode, and gives the change of every outcome at every time.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -30,16 +31,23 @@ CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's code of the first level: half the time to compile (hopper, jax 0.10.2: 12 s in place of 24) and as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _WORKERS = 2
+_TINY = 1e-5  # m, rad: of a central difference through the exponential map of orientations, exact to its square
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A change of a motion: of the velocities at its start (m/s, rad/s), and of its controls, in their units."""
+    """A change of a motion: of the positions (m, rad) and velocities at its start (m/s, rad/s), and of its controls."""
 
-    qvel: Float[np.ndarray, " nv"]
+    positions: Float[np.ndarray, " nv"]
+    velocities: Float[np.ndarray, " nv"]
     controls: Float[np.ndarray, "steps nu"]
+
+    @property
+    def moves_start(self) -> bool:
+        """Whether it changes the start at all."""
+        return bool(self.positions.any() or self.velocities.any())
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,10 @@ class Programs:
         contact = self.contact if contact is None else contact
         dtype = states.qpos.dtype
         change = jax.tree.map(np.zeros_like, jax.tree.map(np.asarray, states))
-        change.qvel[:] = direction.qvel
+        change.qvel[:] = direction.velocities
+        if direction.positions.any():
+            ends = [moved(self.scene.mj_model, states.qpos, direction.positions, x) for x in (-_TINY, _TINY)]
+            change.qpos[:] = (ends[1] - ends[0]) / (2 * _TINY)
         controls = np.asarray(controls, dtype)
         control_change = np.broadcast_to(direction.controls, controls.shape).astype(dtype)
         pieces, bad, crowded, start = [], np.zeros(self.size, bool), np.zeros(self.size, bool), states
@@ -148,7 +159,7 @@ class Programs:
         judge = self._judge(tuple(lengths))
         outcomes, derivatives = judge((*path, controls, bad), (*path_change, control_change))
         size = np.sqrt(sum((part[:, list(lengths)] ** 2).sum(axis=2) for part in path_change[:2]))
-        first = np.sqrt((start_change.qvel**2).sum(axis=1))[:, None]
+        first = np.sqrt(sum((part**2).sum(axis=1) for part in (start_change.qpos, start_change.qvel)))[:, None]
         growth = size / np.where(first > 0, first, 1.0)
         return Moved(np.asarray(outcomes), np.asarray(derivatives), growth, int(crowded.sum()), int(bad.sum()))
 
@@ -182,6 +193,19 @@ class Programs:
 
 def _parts(state: State) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(part) for part in (state.qpos, state.qvel, state.act))
+
+
+def moved(
+    model: mujoco.MjModel,
+    qpos: Float[np.ndarray, "motions nq"],
+    positions: Float[np.ndarray, " nv"],
+    places: Float[np.ndarray, " motions"] | float,
+) -> Float[np.ndarray, "motions nq"]:
+    """Move poses by so much of a change of positions, quaternions by their own rule."""
+    found = np.array(qpos, float)
+    for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
+        mujoco.mj_integratePos(model, one, positions, float(place))
+    return found
 
 
 def contact_of(model: mjx.Model) -> dict[str, Array]:
