@@ -139,8 +139,13 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     if not found[0].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
-    parts = [f"{words[one.kind]} {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}" for one in found]
-    return Finding("slope", f"Readings at which the mean derivative is the slope, and typical error: {'; '.join(parts)}.")
+    parts = [
+        f"{words[one.kind]} {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}"
+        for one in found
+    ]
+    return Finding(
+        "slope", f"Readings at which the mean derivative is the slope, and typical error: {'; '.join(parts)}."
+    )
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
@@ -156,7 +161,7 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
             "" if felt[0].stiffness is None else f" With contact softened to {format_number(felt[0].stiffness)} 1/s²:"
         )
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
-        values = " and ".join(format_number(float(f"{one.advantage:.1g}")) for one in felt)
+        values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
         text = f"{contact} One first-order sample is worth {values} of zeroth order under noise of {noises}; {ends}."
         yield Finding("order", text.strip())
 

@@ -23,7 +23,7 @@ from mjxgrad.scene import Scene
 from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
 from mjxgrad.verdict.programs import CHUNK, Direction, Moved, Programs, contact_of, moved
 
-_TEETH = 8  # time steps through which the first touch is to move from the middle of a line to its end
+_TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
 _SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
 _WIDE = 4.0  # times as long as the others is the last line: for jumps that are farther off
 STDDEVS = (0.1, 0.3)
@@ -31,10 +31,11 @@ STDDEVS = (0.1, 0.3)
 SOFTER = 0.1
 """Stiffness that is tried beside the file's, as a share of it."""
 _NUM_LINES, _NUM_TIMES = 3, 4
-_BEFORE, _AFTER = 20, 40  # steps around the first touch
+_BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS = 4 * CHUNK, 30 * CHUNK
 _NUM_BATCHES = 24.0  # that are moved in all, about
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
+_REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,8 @@ def _direction(
     ]
     wide = _WIDE if number == _NUM_LINES - 1 else 1.0
     has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
-    given = (wide * has_start, wide * has_start, wide * has_controls)
+    # Positions no wider: they would begin within each other.
+    given = (1.0 * has_start, wide * has_start, wide * has_controls)
     words = ["the start"] * has_start + ["the controls"] * has_controls
     return " and ".join(words), Direction(*(part * share for part, share in zip(parts, given, strict=True)))
 
@@ -218,7 +220,7 @@ class _Probe:
             (-1.0, 1.0),
             num_points=self.programs.size,
             num_candidates=self.programs.size // 8,
-            num_refinements=3,
+            num_refinements=_REFINEMENTS,
             smallest=_SMALLEST_JUMP,
         )
         return Line(

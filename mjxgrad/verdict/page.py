@@ -5,13 +5,10 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float
 
-from mjxgrad.contact.warnings import format_number
 from mjxgrad.verdict.measure import Line, Measured
 
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 360.0, 280.0, 58.0, 12.0, 34.0, 44.0
-_TICK = 0.022  # half the length of a tangent, as a share of the width
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _PANEL, _GAP = 360.0, 330.0, 50.0, 8.0, 24.0, 126.0, 22.0
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1d1d1f; --paper: #fff; --soft: #6b6b70; --line: #d9d9de;
   --plain: #c2500a; --smooth: #00795a; }
@@ -22,10 +19,10 @@ main { max-width: 44rem; margin: 0 auto; padding: 1rem; }
 h1 { font-size: 1.35rem; line-height: 1.3; margin: .2rem 0 1rem; overflow-wrap: anywhere; }
 .kicker { color: var(--soft); margin: 0; overflow-wrap: anywhere; }
 figure { margin: 0 0 1rem; } figcaption { color: var(--soft); font-size: .9rem; }
-svg { width: 100%; height: auto; display: block; } svg text { font: 12px system-ui, sans-serif; fill: var(--ink); }
-svg .axis { stroke: var(--line); } svg .plain { stroke: var(--plain); fill: var(--plain); }
-svg .smooth { stroke: var(--smooth); fill: var(--smooth); } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
-svg text.plain { stroke: none; fill: var(--plain); } svg text.smooth { stroke: none; fill: var(--smooth); }
+svg { width: 100%; max-width: 34rem; height: auto; display: block; }
+svg text { font: 12px system-ui, sans-serif; fill: var(--ink); }
+svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); }
+svg .slope { stroke: var(--soft); fill: none; opacity: .6; } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
 li { margin: .35rem 0; overflow-wrap: anywhere; } .fault { font-weight: 600; } ul { padding-left: 1.2rem; }
 pre { overflow-x: auto; border: 1px solid var(--line); border-radius: .4rem; padding: .7rem; font-size: .8rem; }
 summary { cursor: pointer; padding: .3rem 0; }
@@ -78,10 +75,10 @@ def _figure(measured: Measured, outcomes: Sequence[str]) -> str:
     line, time, outcome = _most_telling(measured)
     caption = (
         f"{outcomes[outcome][:1].upper() + outcomes[outcome][1:]} after {measured.times[time]:.2g} s, along a "
-        f"random change of {line.varied} ({line.pose}). Each dash is a derivative: it should lie along its curve."
+        f"random change of {line.varied} ({line.pose}). Below: its derivatives, which should lie on the grey slope."
     )
     if len(line.jumps.places):
-        caption += " Dashed: jumps."
+        caption += " Dashed: a jump."
     return f"<figure>{_drawing(line, time, outcome)}<figcaption>{_text(caption)}</figcaption></figure>"
 
 
@@ -97,42 +94,47 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
 
 
 def _drawing(line: Line, time: int, outcome: int) -> str:
+    """Draw the outcome along the line, and below it its derivatives on the slope that they should have."""
     x = line.plain.parameters
-    curves = {"plain": (line.plain, "MuJoCo's step"), "smooth": (line.smooth, "with an onset")}
-    values = np.concatenate([one.outcomes[:, time, outcome] for one, _ in curves.values()])
-    values = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
-    low, high = float(values.min()), float(values.max())
-    high = high if high > low else low + 1.0
+    pairs = [
+        (one.outcomes[:, time, outcome], one.derivatives[0, :, time, outcome]) for one in (line.plain, line.smooth)
+    ]
+    (plain, plain_slopes), (smooth, smooth_slopes) = pairs
+    slope = np.gradient(smooth, x)
     across = lambda at: _LEFT + (at - x[0]) / (x[-1] - x[0]) * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
-    up = lambda value: _HEIGHT - _BOTTOM - (value - low) / (high - low) * (_HEIGHT - _BOTTOM - _TOP)  # noqa: E731
-    marks = [f'<path class="axis" fill="none" d="M{_LEFT} {_TOP}V{_HEIGHT - _BOTTOM}H{_WIDTH - _RIGHT}"/>']
-    for at in line.jumps.places:
-        marks.append(f'<path class="jump" d="M{across(at):.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
-    for number, (style, (one, label)) in enumerate(curves.items()):
-        dashes = _dashes(
-            across(x), up(one.outcomes[:, time, outcome]), _slant(one.derivatives[0, :, time, outcome], x, low, high)
-        )
-        marks.append(f'<path class="{style}" stroke-width="1.6" d="{dashes}"/>')
-        marks.append(f'<text class="{style}" x="{_LEFT + 130 * number}" y="18">{_text(label)}</text>')
-    digits = max(2, int(np.ceil(np.log10(max(abs(low), abs(high), 1e-12) / (high - low)))) + 2)
-    for value in (low, high):
-        marks.append(f'<text x="{_LEFT - 6}" y="{up(value) + 4:.1f}" text-anchor="end">{value:.{digits}g}</text>')
-    for value, anchor in ((x[0], "start"), (x[-1], "end")):
-        text = format_number(round(float(value), 2))
-        marks.append(f'<text x="{across(value):.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="{anchor}">{text}</text>')
-    middle = (_LEFT + _WIDTH - _RIGHT) / 2
-    marks.append(f'<text x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">place on the line</text>')
+    marks = []
+    panels = (("outcome", smooth, plain, smooth), ("derivative", slope, plain_slopes, smooth_slopes))
+    for number, (label, curve, *dots) in enumerate(panels):
+        top = _TOP + number * (_PANEL + _GAP)
+        low, high = _range(curve if number else np.concatenate([plain, smooth]))
+        up = lambda y, top=top, low=low, high=high: top + _PANEL * (1 - (np.clip(y, low, high) - low) / (high - low))  # noqa: E731
+        marks.append(f'<path class="axis" fill="none" d="M{_LEFT} {top}v{_PANEL}H{_WIDTH - _RIGHT}"/>')
+        marks += [f'<path class="jump" d="M{across(at):.1f} {top}v{_PANEL}"/>' for at in line.jumps.places]
+        marks.append(f'<path class="slope" d="{_path(across(x), up(curve))}"/>')
+        for style, values in zip(("plain", "smooth"), dots, strict=True):
+            marks += [
+                f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="1.9"/>'
+                for a, b in zip(across(x), up(values), strict=True)
+                if np.isfinite(b)
+            ]
+        digits = max(2, int(np.ceil(np.log10(max(abs(low), abs(high), 1e-12) / (high - low)))) + 2)
+        for value in (low, high):
+            marks.append(f'<text x="{_LEFT - 6}" y="{up(value) + 4:.1f}" text-anchor="end">{value:.{digits}g}</text>')
+        marks.append(f'<text x="{_WIDTH - _RIGHT}" y="{top - 6}" text-anchor="end">{label}</text>')
+    marks.append(f'<text class="plain" x="{_LEFT}" y="14">MuJoCo\'s step</text>')
+    marks.append(f'<text class="smooth" x="{_LEFT + 92}" y="14">with an onset</text>')
+    marks.append(f'<text x="{_LEFT}" y="{_HEIGHT - 6}">place on the line, −1 to 1</text>')
     return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'
 
 
-def _slant(derivatives: np.ndarray, x: np.ndarray, low: float, high: float) -> Float[np.ndarray, " points"]:
-    """Return derivatives as slopes on the paper, downwards positive."""
-    scale = (x[-1] - x[0]) / (_WIDTH - _LEFT - _RIGHT) * (_HEIGHT - _BOTTOM - _TOP) / (high - low)
-    return -derivatives * scale
+def _range(values: np.ndarray) -> tuple[float, float]:
+    """Return what to show: all that is finite, and a third more, but nothing empty."""
+    values = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
+    low, high = float(values.min()), float(values.max())
+    room = (high - low) / 3 if high > low else max(abs(low), 1e-9)
+    return low - room, high + room
 
 
-def _dashes(x: np.ndarray, y: np.ndarray, slant: np.ndarray) -> str:
-    """Draw a short tangent through each point, of one length whatever its slope."""
-    half = _TICK * _WIDTH / 2 / np.sqrt(1 + slant**2)
-    ends = zip(x - half, y - half * slant, 2 * half, 2 * half * slant, strict=True)
-    return "".join(f"M{a:.1f} {b:.1f}l{c:.1f} {d:.1f}" for a, b, c, d in ends if np.isfinite([a, b, c, d]).all())
+def _path(x: np.ndarray, y: np.ndarray) -> str:
+    points = [f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True) if np.isfinite(b)]
+    return "M" + "L".join(points) if points else ""
