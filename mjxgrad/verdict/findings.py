@@ -270,7 +270,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
 
 def percent(share: float) -> str:
     """Write a share for a reader."""
-    return f"{100 * share:.0f} %" if share >= 0.01 else f"{100 * share:.1g} %"
+    return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
 def _some(names: Sequence[str]) -> str:

@@ -35,6 +35,7 @@ _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS = 4 * CHUNK, 30 * CHUNK
 _NUM_BATCHES = 24.0  # that are moved in all, about
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
+_AT_REST = 1e-3  # of the largest variation at any time
 _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
 
 
@@ -212,9 +213,9 @@ class _Probe:
         discrete, event, onset = (along(kind, places) for kind in ("discrete", "event", "onset"))
         plain = compare_to_slope(places, discrete.outcomes, [discrete.derivatives, event.derivatives])
         continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
-        last = onset.outcomes[:, -1]
-        centre, spread = np.nanmean(last, axis=0), np.nanstd(last, axis=0)
-        scale = np.where(spread > 1e-9 * np.abs(centre), spread, np.inf)
+        centre, spreads = np.nanmean(onset.outcomes[:, -1], axis=0), np.nanstd(onset.outcomes, axis=0)
+        # What has come to rest by then varies by rounding alone.
+        scale = np.where(spreads[-1] > _AT_REST * spreads.max(axis=0), spreads[-1], np.inf)
         jumps = jumps_along(
             lambda x: (along("onset", x).outcomes[:, -1] - centre) / scale,
             (-1.0, 1.0),
