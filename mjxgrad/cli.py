@@ -61,7 +61,12 @@ class CommandError(Exception):
     """What cannot be done, in a sentence for whoever asked."""
 
 
-app = cyclopts.App(name="mjxgrad", help="Differentiable rollouts on MuJoCo MJX.", result_action="return_value")
+app = cyclopts.App(
+    name="mjxgrad",
+    help="Differentiable rollouts on MuJoCo MJX.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -271,7 +276,7 @@ def _experiments() -> Callable[[list[str]], int]:
     """Return the command line of the experiments, which lie beside the library in a checkout only."""
     if not (_checkout() / "experiments" / "__main__.py").is_file():
         raise CommandError(
-            "experiments are not part of the installed library: run this in a checkout, pip install -e '.[experiments]'"
+            "experiments come with a checkout, not with the installed library: git clone, then make demo"
         )
     sys.path.insert(0, str(_checkout()))
     try:

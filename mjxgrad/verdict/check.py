@@ -135,7 +135,7 @@ def check(
     cost: Cost | None = None,
     *,
     derivatives: bool = True,
-    seconds: float = 30.0,
+    seconds: int | float = 30.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Verdict:
@@ -158,9 +158,12 @@ def check(
         The verdict; `print` it.
 
     Raises:
-        ValueError: if so many geoms can touch that loading would take minutes, or the cost is neither a number nor one per state.
-        SceneError: if MuJoCo cannot read the source or MJX cannot simulate it, by name; and what `load_scene` raises.
+        ValueError: if `seconds` is not positive, or the cost does not return a number or numbers to be added up.
+        SceneError: if MuJoCo cannot read the source, MJX cannot simulate it, or so many geoms can touch that loading would take
+            minutes; and what else `load_scene` raises.
     """
+    if not seconds > 0:
+        raise ValueError(f"seconds must be positive, got {seconds}; derivatives=False measures nothing")
     say = log or (lambda _: None)
     rng, started = np.random.default_rng(seed), time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
@@ -185,7 +188,7 @@ def check(
         started = time.perf_counter()
         measured = measure(scene, motions, programs, rng, from_start=cost is not None, seconds=seconds, log=say)
         spent["measuring"] = time.perf_counter() - started
-        found += measured_findings(motions, measured)
+        found += measured_findings(measured)
     advice = recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
         name=scene.name,
@@ -255,7 +258,8 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
     """Leave room for the contacts that motions needed, where that is much less than for all."""
     if not scene.pairs:
         return scene, None
-    room = contacts_needed(scene, motions.trajectory()) + _SPARE_CONTACTS
+    needed = max(contacts_needed(scene, motions.trajectory(i)) for i in range(len(motions.poses)))
+    room = needed + _SPARE_CONTACTS
     if scene.data._impl.ncon <= max(_WORTHWHILE * room, 24):
         return scene, None
     return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room

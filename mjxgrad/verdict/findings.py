@@ -108,18 +108,17 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         yield Finding("note", f"In contact from the start, and nothing else touches: {_some(motions.touching)}.")
 
 
-def measured_findings(motions: Motions, measured: Measured) -> Iterator[Finding]:
+def measured_findings(measured: Measured) -> Iterator[Finding]:
     """Yield what lines and noise say."""
     jumps = [line for line in measured.lines if len(line.jumps.places)]
     if jumps:
-        line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
-        pairs = (
-            f"{_some(line.changed)} touches on one side of it alone" if line.changed else "no pair differs beside it"
-        )
+        line = max(jumps, key=lambda one: (bool(one.changed), float(one.jumps.sizes.max())))
         text = (
-            f"The outcome jumps along a change of {line.varied}: {pairs}. No derivative sees a jump; alpha_order does."
+            f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side of it alone."
         )
-        yield Finding("jump", text, True)
+        if not line.changed:
+            text = f"Along a change of {line.varied} the outcome rises within a 5000th of it, and no pair differs beside it."
+        yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", bool(line.changed))
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))
     if largest > LARGEST_GROWTH:

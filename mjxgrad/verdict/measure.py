@@ -113,7 +113,7 @@ def measure(
     rng: np.random.Generator,
     *,
     from_start: bool,
-    seconds: float,
+    seconds: int | float,
     log: Callable[[str], None],
 ) -> Measured:
     """Measure along lines and under noise, in about so many seconds after compilation."""
@@ -141,7 +141,7 @@ def measure(
     return Measured(np.array(lengths) * motions.timestep, num_steps, *measured)
 
 
-def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: float) -> list[int]:
+def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
     """Choose how many steps, by when things touch and by how long a step takes here, and at which of them to look."""
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
     still = np.zeros(motions.qvel.shape[2])

@@ -78,13 +78,12 @@ class Motions:
         qpos, qvel, act = (jnp.asarray(x[motion, step], float) for x in (self.qpos, self.qvel, self.act))
         return State(qpos, qvel, act, time=jnp.asarray(step * self.timestep), warmstart=jnp.zeros_like(qvel))
 
-    def trajectory(self) -> Trajectory:
-        """Return all of them as diagnostics of recorded motions take them."""
-        first_bad = jnp.asarray(self.bad_steps)
-        arrays = [jnp.asarray(x, float) for x in (self.qpos, self.qvel, self.controls)]
-        return Trajectory(
-            *arrays, observations=None, final=self.state(0, -1), diverged=first_bad >= 0, first_bad_step=first_bad
-        )
+    def trajectory(self, motion: int) -> Trajectory:
+        """Return one of them as diagnostics of recorded motions take it."""
+        first_bad = jnp.asarray(int(self.bad_steps[motion]))
+        arrays = [jnp.asarray(x[motion], float) for x in (self.qpos, self.qvel, self.controls)]
+        final = self.state(motion, -1)
+        return Trajectory(*arrays, observations=None, final=final, diverged=first_bad >= 0, first_bad_step=first_bad)
 
 
 def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
@@ -168,7 +167,7 @@ def _touches(
         data.qpos[:], data.qvel[:] = qpos[motion, step], qvel[motion, step]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        now = {tuple(contact.geom): contact for contact in data.contact if contact.efc_address >= 0}
+        now = {tuple(map(int, contact.geom)): contact for contact in data.contact if contact.efc_address >= 0}
         if step == 0:
             always, before = always | now, set(now)
         for pair in now.keys() - before:
@@ -181,7 +180,7 @@ def _touches(
 
 
 def _pair(model: mujoco.MjModel, geoms: tuple[int, ...]) -> str:
-    return " – ".join(geom_name(model, int(geom)) for geom in geoms)
+    return " – ".join(geom_name(model, geom) for geom in geoms)
 
 
 def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:

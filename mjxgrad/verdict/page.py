@@ -2,10 +2,10 @@
 
 import html
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
+from mjxgrad.verdict.findings import Finding
 from mjxgrad.verdict.measure import Line, Measured
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _PANEL, _GAP = 360.0, 330.0, 50.0, 8.0, 24.0, 126.0, 22.0
@@ -29,20 +29,10 @@ summary { cursor: pointer; padding: .3rem 0; }
 """
 
 
-class Sentence(Protocol):
-    """What stands in the list."""
-
-    @property
-    def text(self) -> str: ...
-
-    @property
-    def is_fault(self) -> bool: ...
-
-
 def page(
     name: str,
     headline: str,
-    findings: Sequence[Sentence],
+    findings: Sequence[Finding],
     code: str,
     details: dict[str, str],
     measured: Measured | None,

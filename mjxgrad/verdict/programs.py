@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad._rollout import State, Trajectory, initial_state, rollout
 from mjxgrad.dynamics import Onset
 from mjxgrad.scene import Scene
 from mjxgrad.task import finite_cost
@@ -113,10 +113,9 @@ class Programs:
         return advance
 
     def _shapes(self) -> tuple:
-        data, model = self.scene.data, self.scene.model
-        batch = lambda *shape: jax.ShapeDtypeStruct((self.size, *shape), data.qpos.dtype)  # noqa: E731
-        state = State(batch(model.nq), batch(model.nv), batch(model.na), batch(), batch(model.nv))
-        controls = batch(CHUNK, model.nu)
+        batch = lambda leaf: jax.ShapeDtypeStruct((self.size, *leaf.shape), leaf.dtype)  # noqa: E731
+        state = jax.tree.map(batch, initial_state(self.scene))
+        controls = batch(jax.ShapeDtypeStruct((CHUNK, self.scene.model.nu), self.scene.data.qpos.dtype))
         return self.contact, state, state, controls, controls
 
     def move(
@@ -135,8 +134,7 @@ class Programs:
         change = jax.tree.map(np.zeros_like, jax.tree.map(np.asarray, states))
         change.qvel[:] = direction.velocities
         if direction.positions.any():
-            ends = [moved(self.scene.mj_model, states.qpos, direction.positions, x) for x in (-_TINY, _TINY)]
-            change.qpos[:] = (ends[1] - ends[0]) / (2 * _TINY)
+            change.qpos[:] = change_of_poses(self.scene.mj_model, states.qpos, direction.positions)
         controls = np.asarray(controls, dtype)
         control_change = np.broadcast_to(direction.controls, controls.shape).astype(dtype)
         pieces, bad, crowded, start = [], np.zeros(self.size, bool), np.zeros(self.size, bool), states
@@ -206,6 +204,14 @@ def moved(
     for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
         mujoco.mj_integratePos(model, one, positions, float(place))
     return found
+
+
+def change_of_poses(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, "motions nq"], positions: Float[np.ndarray, " nv"]
+) -> Float[np.ndarray, "motions nq"]:
+    """Return the derivative of `moved` by the place, at zero."""
+    below, above = (moved(model, qpos, positions, x) for x in (-_TINY, _TINY))
+    return (above - below) / (2 * _TINY)
 
 
 def contact_of(model: mjx.Model) -> dict[str, Array]:
