@@ -161,7 +161,7 @@ def test_sentences_are_short(wall, bounce):
 
 def test_an_exploding_derivative_is_named():
     """e^(70 t) at 0.1 s is 1100."""
-    places = phases((-1, 1), 32)
+    places = phases((-1.0, 1.0), 32)
     times = np.array([0.05, 0.1])
     flat = np.repeat(places[:, None], 2, axis=1)[:, :, None]
     plain = compare_to_slope(places, flat, [np.ones_like(flat)] * 2)
