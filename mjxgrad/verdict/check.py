@@ -22,6 +22,7 @@ from mjxgrad.diagnostics.omissions import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.verdict.findings import (
+    MANY_PAIRS,
     Finding,
     Recommendation,
     headline,
@@ -98,9 +99,15 @@ class Verdict:
     def _details(self) -> dict[str, str]:
         """Return what is there to look up: what was measured, the scene, its time step."""
         spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
-        looked_at = f"Outcomes: {'; '.join(self.outcomes)}.\nTime: {spent}."
+        rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
+        noises = [
+            f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
+            f"{_numbers(row['first_variance'])} of first order, {_numbers(row['zeroth_variance'])} of zeroth; "
+            f"first less zeroth {_numbers(row['bias'])} ± {_numbers(row['bias_error'])}"
+            for row in rows
+        ]
         return {
-            "What was measured": looked_at,
+            "What was measured": "\n".join([f"Outcomes: {'; '.join(self.outcomes)}.", *noises, f"Time: {spent}."]),
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
@@ -168,7 +175,7 @@ def check(
     rng, started = np.random.default_rng(seed), time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene, path = _load(source)
+        scene, path = _load(source, say)
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
         stability = check_stability(scene, speed=touch_speed(motions))
@@ -205,7 +212,7 @@ def check(
     )
 
 
-def _load(source: Source) -> tuple[Scene, str]:
+def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
     """Return the scene, and how code calls its file."""
     if isinstance(source, Scene):
         return source, "scene.xml"
@@ -218,21 +225,23 @@ def _load(source: Source) -> tuple[Scene, str]:
         except ValueError as error:
             raise SceneError(f"the MjSpec must be one that MuJoCo compiles, but it says: {error}") from error
     if is_file and Path(source).is_file():  # pyright: ignore[reportArgumentType]
-        _refuse_pairs(mujoco.MjModel.from_xml_path, str(source))
+        _look_at_pairs(mujoco.MjModel.from_xml_path, str(source), say)
     elif isinstance(source, str) and not is_file:
-        _refuse_pairs(mujoco.MjModel.from_xml_string, source)
+        _look_at_pairs(mujoco.MjModel.from_xml_string, source, say)
     elif isinstance(source, mujoco.MjModel):
-        _refuse_pairs(lambda model: model, source)
+        _look_at_pairs(lambda model: model, source, say)
     return load_scene(source), str(source) if is_file else "scene.xml"
 
 
-def _refuse_pairs(read: Callable, argument: Any) -> None:
-    """Refuse a model of which more geoms can touch than can be loaded; what cannot be read is left to `load_scene`."""
+def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) -> None:
+    """Say how many geoms can touch, or refuse more than can be loaded; what cannot be read is left to `load_scene`."""
     try:
         model = read(argument)
     except ValueError:
         return
     count = count_pairs(model)
+    if count >= MANY_PAIRS:
+        say(f"about {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
     if count > MOST_PAIRS:
         raise SceneError(
             f"the scene must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
@@ -303,6 +312,10 @@ def _noise_row(noise) -> dict[str, Any]:
         "bias_error": error.tolist(),
         "first_is_better_until": noise.crossover.horizon,
     }
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.2g}" for value in values)
 
 
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:
