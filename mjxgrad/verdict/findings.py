@@ -139,12 +139,10 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
     parts = [
-        f"{words[one.kind]} {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}"
+        f"{words[one.kind]}: {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}."
         for one in found
     ]
-    return Finding(
-        "slope", f"Readings at which the mean derivative is the slope, and typical error: {'; '.join(parts)}."
-    )
+    return Finding("slope", f"How often the mean derivative is the slope, and its typical error. {' '.join(parts)}")
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
@@ -155,14 +153,14 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         if not felt:
             continue
         until = min(one.crossover.horizon for one in felt)
-        ends = f"first order is better up to {until:.2g} s" if math.isfinite(until) else "better as far as measured"
+        ends = f"It is better up to {until:.2g} s" if math.isfinite(until) else "It is better as far as measured"
         contact = (
             "" if felt[0].stiffness is None else f" With contact softened to {format_number(felt[0].stiffness)} 1/s²:"
         )
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
         values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
-        text = f"{contact} One first-order sample is worth {values} of zeroth order under noise of {noises}; {ends}."
-        yield Finding("order", text.strip())
+        text = f"{contact}{'O' if stiffness is None else 'o'}ne first-order sample is worth {values} of zeroth order, under noise of {noises}."
+        yield Finding("order", f"{text} {ends}.")
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:

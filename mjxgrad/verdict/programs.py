@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State, Trajectory, initial_state, rollout
@@ -105,7 +105,7 @@ class Programs:
             def run(state: State, controls: Array) -> tuple:
                 scene = with_contact(self.scene, contact)
                 trajectory = rollout(scene, state, controls, checkpoint=False, **KINDS[kind])
-                kept = (trajectory.qpos[1:], trajectory.qvel[1:], trajectory.act[1:])
+                kept = (trajectory.qpos[1:], trajectory.qvel[1:], jnp.asarray(trajectory.act)[1:])
                 return (trajectory.final, kept), (trajectory.diverged, trajectory.crowded > 0)
 
             return jax.jvp(run, (state, controls), (change, control_change), has_aux=True)
@@ -166,12 +166,12 @@ class Programs:
         if lengths in self._judges:
             return self._judges[lengths]
 
-        def at_all(qpos: Array, qvel: Array, act: Array, controls: Array, bad: Bool[Array, ""]) -> Array:
+        def at_all(bad: Bool[Array, ""], qpos: Array, qvel: Array, act: Array, controls: Array) -> Array:
             found = []
             for length in lengths:
-                states = (part[: length + 1] for part in (qpos, qvel))
                 trajectory = Trajectory(
-                    *states,
+                    qpos[: length + 1],
+                    qvel[: length + 1],
                     controls[:length],
                     observations=None,
                     final=State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0])),
@@ -183,8 +183,8 @@ class Programs:
             return jnp.stack(found)
 
         def one(motion: tuple, change: tuple) -> tuple[Array, Array]:
-            *parts, bad = motion
-            return jax.jvp(lambda *parts: at_all(*parts, bad), tuple(parts), change)
+            qpos, qvel, act, controls, bad = motion
+            return jax.jvp(lambda *parts: at_all(bad, *parts), (qpos, qvel, act, controls), change)
 
         return self._judges.setdefault(lengths, jax.jit(jax.vmap(one)))
 
@@ -195,7 +195,7 @@ def _parts(state: State) -> tuple[np.ndarray, ...]:
 
 def moved(
     model: mujoco.MjModel,
-    qpos: Float[np.ndarray, "motions nq"],
+    qpos: Float[ArrayLike, "motions nq"],
     positions: Float[np.ndarray, " nv"],
     places: Float[np.ndarray, " motions"] | float,
 ) -> Float[np.ndarray, "motions nq"]:
@@ -207,7 +207,7 @@ def moved(
 
 
 def change_of_poses(
-    model: mujoco.MjModel, qpos: Float[np.ndarray, "motions nq"], positions: Float[np.ndarray, " nv"]
+    model: mujoco.MjModel, qpos: Float[ArrayLike, "motions nq"], positions: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, "motions nq"]:
     """Return the derivative of `moved` by the place, at zero."""
     below, above = (moved(model, qpos, positions, x) for x in (-_TINY, _TINY))
