@@ -159,8 +159,8 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         )
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
         values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
-        text = f"{contact}{'O' if stiffness is None else 'o'}ne first-order sample is worth {values} of zeroth order, under noise of {noises}."
-        yield Finding("order", f"{text} {ends}.")
+        text = f"{contact}one first-order sample is worth {values} of zeroth order, under noise of {noises}."
+        yield Finding("order", f"{text[:1].upper()}{text[1:]} {ends}.")
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
