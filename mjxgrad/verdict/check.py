@@ -46,7 +46,7 @@ _SMALL, _BATCHES = (
     (64, 32),
 )  # degrees of freedom up to which a batch has the first number of motions, else the second
 _MOST_TREES = 3
-_SPARE_CONTACTS, _WORTHWHILE = 4, 3
+_SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
 
 
@@ -268,8 +268,9 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
     if not scene.pairs:
         return scene, None
     needed = max(contacts_needed(scene, motions.trajectory(i)) for i in range(len(motions.poses)))
-    room = needed + _SPARE_CONTACTS
-    if scene.data._impl.ncon <= max(_WORTHWHILE * room, 24):
+    # Motions along lines meet more than those looked at.
+    room = 2 * needed + _SPARE_CONTACTS
+    if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
         return scene, None
     return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room
 

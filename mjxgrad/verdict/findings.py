@@ -129,7 +129,9 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     if num_diverged:
         yield Finding("not_finite", f"{num_diverged} motions along the lines diverged: shorten the time step.", True)
     if crowded := sum(line.num_crowded for line in measured.lines):
-        yield Finding("many_pairs", f"In {crowded} motions more contacts may have acted than there was room for.", True)
+        yield Finding(
+            "note", f"In {crowded} motions more contacts may have acted than there was room for: raise max_contacts."
+        )
     yield _slope_finding(slopes(measured))
     yield from _order_findings(measured)
 
