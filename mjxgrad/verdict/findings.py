@@ -148,21 +148,19 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
-    """Yield a sentence for the file's contact, and one for a softer one that makes a difference."""
-    groups = [[one for one in measured.noises if (one.stiffness is None) == is_own] for is_own in (True, False)]
-    for group in groups:
-        felt = [one for one in group if not np.isnan(one.advantage)]
+    """Yield a sentence for the file's contact, and one for a softer one."""
+    for is_own in (True, False):
+        felt = [one for one in measured.noises if (one.stiffness is None) == is_own and not np.isnan(one.advantage)]
         if not felt:
             continue
         until = min(one.crossover.horizon for one in felt)
         ends = f"It is better up to {until:.2g} s" if math.isfinite(until) else "It is better as far as measured"
-        contact = (
-            "" if felt[0].stiffness is None else f" With contact softened to {format_number(felt[0].stiffness)} 1/s²:"
-        )
+        stiffness = felt[0].stiffness
+        lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
         values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
-        text = f"{contact}one first-order sample is worth {values} of zeroth order, under noise of {noises}."
-        yield Finding("order", f"{text[:1].upper()}{text[1:]} {ends}.")
+        text = f"{lead} first-order sample is worth {values} of zeroth order, under noise of {noises}. {ends}."
+        yield Finding("order", text)
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
