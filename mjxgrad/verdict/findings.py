@@ -20,6 +20,7 @@ Kind = Literal[
 MANY_PAIRS = 1000
 """Pairs of geoms from which on they are counted aloud."""
 _SPARE_STEP = 0.9
+_CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
 
 
@@ -34,12 +35,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Slope:
-    """How often the mean of a derivative is not the slope, of so many readings, and its median error as a share."""
+    """How often the mean of a derivative is not the slope, or too scattered to tell, and its median error as a share."""
 
     kind: str
     num_off: int
     num_readings: int
     error: float
+
+    @property
+    def share_off(self) -> float:
+        """Of all readings."""
+        return self.num_off / max(self.num_readings, 1)
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,10 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
         yield Finding(
             "note", f"In {crowded} motions more contacts may have acted than there was room for: raise max_contacts."
         )
+    if scattered := [one for one in measured.noises if one.stiffness is None and one.advantage < 1]:
+        until = min(one.crossover.horizon for one in scattered)
+        text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
+        yield Finding("explodes", text + " Shorten the horizon, soften the contact or widen the onset.", True)
     yield _slope_finding(slopes(measured))
     yield from _order_findings(measured)
 
@@ -170,8 +180,10 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
         off, errors = [], []
         for line in measured.lines:
             comparison = line.smooth if kind == "onset" else line.plain
-            at, is_clear = comparison.gradients.index(kind), comparison.is_resolved() & (comparison.slope != 0)
-            off += comparison.is_off()[at][is_clear].tolist()
+            at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
+            is_clear = (size > 0) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
+            is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
+            off += (comparison.is_off()[at] | is_scattered)[is_clear].tolist()
             size = np.maximum(np.abs(comparison.slope), comparison.resolution)
             errors += (np.abs(comparison.error[at]) / size)[is_clear].tolist()
         found.append(Slope(kind, sum(off), len(off), float(np.median(errors)) if errors else math.nan))
@@ -191,7 +203,7 @@ def recommend(
     found = slopes(measured)
     discrete, event, onset = found
     needs_none = not touches or (discrete.num_off == 0 and not discrete.error > _CLOSE)
-    best = discrete if needs_none else onset if onset.num_off <= event.num_off else event
+    best = discrete if needs_none else onset if onset.share_off <= event.share_off else event
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
