@@ -4,6 +4,7 @@ import json
 import time
 from pathlib import Path
 
+import gymnasium
 import jax
 import mujoco
 import numpy as np
@@ -213,7 +214,7 @@ def test_the_code_of_a_verdict_runs(bounce, tmp_path):
     assert np.isfinite(names["estimate"].value).all()
 
 
-ASSETS = Path(__import__("gymnasium").__file__).parent / "envs" / "mujoco" / "assets"
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 SEVEN = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid", "swimmer", "inverted_double_pendulum")
 
 
