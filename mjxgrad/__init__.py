@@ -27,6 +27,7 @@ from mjxgrad.optimiser import (
 from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.scene import LeaveOut, Scene, load_scene, sensor, site_position
 from mjxgrad.task import SceneTask
+from mjxgrad.verdict import Verdict, check
 
 __all__ = [
     "Convergence",
@@ -45,7 +46,9 @@ __all__ = [
     "Stopped",
     "Trajectory",
     "TrustRegion",
+    "Verdict",
     "baselines",
+    "check",
     "check_omissions",
     "check_stability",
     "check_trajectory",

@@ -23,8 +23,10 @@ ORDER = (
     ("baselines",),
     ("devices", "diagnostics", "integration", "planning", "render"),
     ("tasks",),
-    ("envs",),
+    ("envs", "verdict"),
     ("learning",),
+    ("cli",),
+    ("__main__",),
 )
 LINE = {part: i for i, line in enumerate(ORDER) for part in line}
 MODULES = {

@@ -1,0 +1,7 @@
+"""`python -m mjxgrad`, which is `mjxgrad`."""
+
+import sys
+
+from mjxgrad.cli import main
+
+sys.exit(main())

@@ -1,0 +1,285 @@
+"""The command line: check a scene, begin a program of one's own, draw it, look at it, run experiments."""
+
+import functools
+import importlib
+import importlib.util
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import cyclopts
+import numpy as np
+
+TEMPLATE = '''\
+"""{name}: controls that move it, found by {estimator} gradients through contact; and their video."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mjxgrad as mg
+import optax
+
+HORIZON, STEPS_PER_KNOT = {horizon}, {per_knot}  # time steps
+scene = mg.load_scene({path!r}{settings})
+
+
+def cost(trajectory):  # yours: here how far the first coordinate comes (m or rad), and what it costs to drive it there
+    return -trajectory.qpos[-1, 0] + 1e-3 * (trajectory.ctrl**2).mean()
+
+
+low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
+task = mg.SceneTask(scene, mg.initial_state(scene), cost, HORIZON, onset=mg.Onset())
+
+
+def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
+    return jnp.repeat((low + high) / 2 + (high - low) / 2 * jnp.tanh(knots), STEPS_PER_KNOT, axis=0)[:HORIZON]
+
+
+start = jnp.zeros((-(-HORIZON // STEPS_PER_KNOT), scene.model.nu))
+result = mg.optimise(
+    mg.parameter_noise(lambda knots: task.run(controls(knots["knots"])).cost, stddev={stddev}),
+    {{"knots": start}},
+    jax.random.key(0),
+    estimator=functools.partial(mg.estimators.{estimator}, num_samples=16),
+    optimiser=optax.adam(0.1),
+    num_steps=30,
+    log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
+)
+course = mg.rollout(scene, task.state, controls(result.params["knots"]), onset=mg.Onset())
+print("cost", cost(course), "from", task.run(controls(start)).cost)
+mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
+'''
+
+
+class CommandError(Exception):
+    """What cannot be done, in a sentence for whoever asked."""
+
+
+app = cyclopts.App(
+    name="mjxgrad",
+    help="Differentiable rollouts on MuJoCo MJX.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; the exit status is 0, 1 for faults that `check` found, 2 for a refusal, 130 for an interruption."""
+    # Whatever asks to stop is answered as Ctrl-C is.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return app(arguments, exit_on_error=False, print_error=False) or 0
+    except KeyboardInterrupt:
+        _say("interrupted")
+        return 130
+    except BrokenPipeError:  # whoever read has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except cyclopts.CycloptsError as error:
+        _say(f"{error}; mjxgrad --help lists the commands")
+    # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
+    except (CommandError, ValueError, OSError, FloatingPointError, MemoryError, RuntimeError) as error:
+        _say(str(error) or type(error).__name__)
+    return 2
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+@app.command
+def check(
+    scene: str,
+    *,
+    cost: str | None = None,
+    as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
+    html: Path | None = None,
+    quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+    seconds: float = 30.0,
+    seed: int = 0,
+) -> int:
+    """Say whether and how a scene can be differentiated; the exit status is 1 where there are faults.
+
+    Args:
+        scene: an MJCF file.
+        cost: module:function, from a trajectory to its cost; the module is looked for in the current folder, too.
+        as_json: write JSON.
+        html: write a page to this file.
+        quick: only what takes seconds: contact, time step, what has no effect.
+        seconds: to spend on measuring once all is compiled.
+        seed: of what is random.
+    """
+    mg, started = _library(), time.monotonic()
+
+    def log(text: str) -> None:
+        _say(f"{time.monotonic() - started:4.0f} s  {text}")
+
+    function = None if cost is None else _function(cost)
+    verdict = mg.check(_existing(scene), function, derivatives=not quick, seconds=seconds, seed=seed, log=log)
+    if html is not None:
+        html.write_text(verdict.as_html(), encoding="utf-8")
+        log(f"wrote {html}")
+    print(verdict.as_json() if as_json else verdict.summary())
+    return 1 if verdict.faults else 0
+
+
+@app.command
+def new(
+    scene: str, *, output: Path = Path("task.py"), force: Annotated[bool, cyclopts.Parameter(negative="")] = False
+) -> None:
+    """Write a program that optimises a motion of a scene and films it, with what a quick check recommends.
+
+    Args:
+        scene: an MJCF file, with actuators.
+        output: the program to write.
+        force: replace a program that is there.
+    """
+    if output.exists() and not force:
+        raise CommandError(f"{output} is there already; name another --output, or replace it with --force")
+    verdict = _library().check(_existing(scene), derivatives=False)
+    advice, timestep = verdict.recommendation, verdict.motions.timestep
+    if not verdict.scene.model.nu:
+        raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
+    given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
+    settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+    text = TEMPLATE.format(
+        name=Path(scene).name,
+        path=str(Path(scene)),
+        settings=settings,
+        horizon=min(300, max(50, round(0.5 / (advice.timestep or timestep)))),
+        per_knot=max(1, round(0.05 / (advice.timestep or timestep))),
+        estimator=advice.estimator,
+        stddev=advice.stddev,
+        video=str(output.with_suffix(".mp4")),
+    )
+    output.write_text(text, encoding="utf-8")
+    print(f"wrote {output}: write your cost into it, then python {output}")
+
+
+@app.command
+def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.mp4"), speed: float = 1.0) -> None:
+    """Film a scene: a recorded motion, or a random one.
+
+    Args:
+        scene: an MJCF file.
+        qpos: an NPZ or NPY file with positions (states, nq), in an NPZ under the name qpos; one state per time step.
+        output: the video to write.
+        speed: simulated over shown time.
+    """
+    mg = _library()
+    loaded = mg.load_scene(_existing(scene))
+    if qpos is None:
+        from mjxgrad.verdict.motions import random_motions
+
+        states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
+    else:
+        with np.load(_existing(str(qpos))) as found:
+            if "qpos" not in found:
+                raise CommandError(f"{qpos} must hold an array named qpos, got {', '.join(found) or 'none'}")
+            states = found["qpos"]
+    mg.render.write_video(output, mg.render.frames(loaded, states, speed=speed))
+    print(output)
+
+
+@app.command
+def view(scene: str) -> None:
+    """Open a scene in MuJoCo's viewer, or without a display in the browser, by mjviser where it is installed.
+
+    Args:
+        scene: an MJCF file.
+    """
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(_existing(scene))
+    has_display = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    if has_display:
+        importlib.import_module("mujoco.viewer").launch(model)
+    elif importlib.util.find_spec("mjviser"):
+        importlib.import_module("mjviser").Viewer(model, mujoco.MjData(model)).run()
+    else:
+        raise CommandError(
+            "there is no display: pip install mjviser shows it in a browser, mjxgrad render makes a video"
+        )
+
+
+@app.command
+def run(
+    config: str,
+    *overrides: str,
+    output: Path = Path("runs"),
+    force: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+) -> int:
+    """Run an experiment of a checkout.
+
+    Args:
+        config: a TOML file, or the name of one in experiments/.
+        overrides: settings to change, key=value in TOML syntax.
+        output: folder for results.
+        force: run even if nothing has changed.
+    """
+    return _experiments()(["run", config, *overrides, "--output", str(output), *["--force"] * force])
+
+
+@app.command(name="list")
+def list_experiments(*, as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False) -> int:
+    """List the experiments of a checkout.
+
+    Args:
+        as_json: write their names as JSON.
+    """
+    main_of_experiments = _experiments()
+    if not as_json:
+        return main_of_experiments(["list"])
+    print(json.dumps(sorted(path.stem for path in _checkout().glob("experiments/*.toml"))))
+    return 0
+
+
+@functools.cache
+def _library() -> Any:
+    """Return mjxgrad in double precision, in which jumps and slopes are told apart."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    return importlib.import_module("mjxgrad")
+
+
+def _existing(path: str) -> str:
+    if not Path(path).is_file():
+        raise CommandError(f"there is no file {path}")
+    return path
+
+
+def _function(name: str) -> Callable:
+    """Find a function by module:function."""
+    module, colon, function = name.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), function, None) if colon else None
+    except ImportError as error:
+        raise CommandError(f"--cost must be module:function, got {name!r}: {error}") from error
+    if not callable(found):
+        raise CommandError(f"--cost must be module:function of a function that is there, got {name!r}")
+    return found
+
+
+def _checkout() -> Path:
+    return Path(__file__).parents[1]
+
+
+def _experiments() -> Callable[[list[str]], int]:
+    """Return the command line of the experiments, which lie beside the library in a checkout only."""
+    if not (_checkout() / "experiments" / "__main__.py").is_file():
+        raise CommandError(
+            "experiments come with a checkout, not with the installed library: git clone, then make demo"
+        )
+    sys.path.insert(0, str(_checkout()))
+    try:
+        return importlib.import_module("experiments.__main__").main
+    except ImportError as error:
+        raise CommandError(f"experiments need {error.name}: pip install -e '.[experiments]'") from error

@@ -1,0 +1,347 @@
+"""One call for a scene of one's own: may it be differentiated, how, and up to where."""
+
+import dataclasses
+import json
+import os
+import textwrap
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._rollout import Trajectory
+from mjxgrad.contact.warnings import format_number
+from mjxgrad.diagnostics.omissions import contacts_needed
+from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.scene import Scene, SceneError, load_scene
+from mjxgrad.verdict.findings import (
+    MANY_PAIRS,
+    Finding,
+    Recommendation,
+    headline,
+    measured_findings,
+    recommend,
+    slopes,
+    static_findings,
+    touch_speed,
+)
+from mjxgrad.verdict.measure import Measured, measure
+from mjxgrad.verdict.motions import Motions, half_range, random_motions
+from mjxgrad.verdict.page import page
+from mjxgrad.verdict.programs import KINDS, Outcomes, Programs
+
+Cost = Callable[[Trajectory], Float[Array, "..."]]
+Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
+MOST_PAIRS = 20_000
+"""Pairs of geoms beyond which loading takes minutes and a scene is refused."""
+_SMALL, _BATCHES = (
+    12,
+    (64, 32),
+)  # degrees of freedom up to which a batch has the first number of motions, else the second
+_MOST_TREES = 3
+_SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
+_WIDTH = 100
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What `check` says.
+
+    Attributes:
+        name: of the scene.
+        headline: the answer, in at most 15 words.
+        findings: faults first.
+        recommendation: what to ask for.
+        code: the same, to be pasted.
+        outcomes: what was looked at, in words.
+        scene: that was checked.
+        stability: what the time step makes of each contact.
+        motions: by C MuJoCo.
+        measured: of derivatives; None where that was not asked for.
+        seconds: of each part.
+    """
+
+    name: str
+    headline: str
+    findings: tuple[Finding, ...]
+    recommendation: Recommendation
+    code: str
+    outcomes: tuple[str, ...]
+    scene: Scene
+    stability: StabilityReport
+    motions: Motions
+    measured: Measured | None
+    seconds: dict[str, float]
+
+    @property
+    def faults(self) -> tuple[Finding, ...]:
+        """Those of the findings that are to be mended or minded."""
+        return tuple(finding for finding in self.findings if finding.is_fault)
+
+    def summary(self) -> str:
+        """Say it for a terminal: the answer, faults, numbers, code, then the scene in detail."""
+        lines = [f"{self.name}: {self.headline}", ""]
+        for finding in self.findings:
+            lead = "! " if finding.is_fault else "- "
+            lines.append(textwrap.fill(finding.text, _WIDTH, initial_indent=lead, subsequent_indent="  "))
+        return "\n\n".join(["\n".join(lines), textwrap.indent(self.code, "    ").rstrip(), *self._details().values()])
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _details(self) -> dict[str, str]:
+        """Return what is there to look up: what was measured, the scene, its time step."""
+        spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
+        rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
+        noises = [
+            f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
+            f"{_numbers(row['first_variance'])} of first order, {_numbers(row['zeroth_variance'])} of zeroth; "
+            f"first less zeroth {_numbers(row['bias'])} ± {_numbers(row['bias_error'])}"
+            for row in rows
+        ]
+        return {
+            "What was measured": "\n".join([f"Outcomes: {'; '.join(self.outcomes)}.", *noises, f"Time: {spent}."]),
+            "The scene": self.scene.summary(),
+            "Time step and contacts": self.stability.summary(),
+        }
+
+    def as_json(self) -> str:
+        """Write it for programs; numbers in SI units."""
+        measured = self.measured
+        table: dict[str, Any] = {
+            "scene": self.name,
+            "headline": self.headline,
+            "findings": [asdict(finding) for finding in self.findings],
+            "recommendation": asdict(self.recommendation),
+            "code": self.code,
+            "outcomes": self.outcomes,
+            "touches": [asdict(touch) for touch in self.motions.touches],
+            "slopes": [] if measured is None else [asdict(one) for one in slopes(measured)],
+            "noise": [] if measured is None else list(map(_noise_row, measured.noises)),
+            "omissions": [asdict(one) for one in self.scene.omissions],
+            "conversions": [asdict(one) for one in self.scene.conversions],
+            "seconds": self.seconds,
+        }
+        return json.dumps(table, indent=2, ensure_ascii=False, default=str)
+
+    def as_html(self) -> str:
+        """Write it as one page that needs nothing beside it."""
+        details = self._details()
+        return page(self.name, self.headline, self.findings, self.code, details, self.measured, self.outcomes)
+
+
+def check(
+    source: Source,
+    cost: Cost | None = None,
+    *,
+    derivatives: bool = True,
+    seconds: int | float = 30.0,
+    seed: int = 0,
+    log: Callable[[str], None] | None = None,
+) -> Verdict:
+    """Say whether and how a scene can be differentiated.
+
+    Random motions by C MuJoCo come first: what touches, and what has no effect. Then derivatives are measured along lines
+    through them and under noise: which is the slope, where outcomes jump, how much better first order is than zeroth, and for how
+    long. Each diagnostic is that of `mjxgrad.diagnostics`.
+
+    Args:
+        source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
+        cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
+            their start. None looks at random mixes of where bodies end up, and how fast.
+        derivatives: measure them; False is a matter of seconds.
+        seconds: to spend on motions after compilation, about. Slow scenes are followed for fewer steps.
+        seed: of all that is random.
+        log: called with what is being done.
+
+    Returns:
+        The verdict; `print` it.
+
+    Raises:
+        ValueError: if `seconds` is not positive, or the cost does not return a number or numbers to be added up.
+        SceneError: if MuJoCo cannot read the source, MJX cannot simulate it, or so many geoms can touch that loading would take
+            minutes; and what else `load_scene` raises.
+    """
+    if not seconds > 0:
+        raise ValueError(f"seconds must be positive, got {seconds}; derivatives=False measures nothing")
+    say = log or (lambda _: None)
+    rng, started = np.random.default_rng(seed), time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene, path = _load(source, say)
+        motions = random_motions(scene, rng)
+        scene, max_contacts = _with_room(scene, motions)
+        stability = check_stability(scene, speed=touch_speed(motions))
+    spent = {"loading and motions": time.perf_counter() - started}
+    found = [*static_findings(scene, motions, stability), *_warned(caught)]
+    for finding in found:
+        say(("! " if finding.is_fault else "- ") + finding.text)
+    names, outcomes = _outcomes(scene, cost, rng)
+    measured = None
+    if derivatives and (motions.bad_steps < 0).any():
+        say("compiling three kinds of derivative")
+        started = time.perf_counter()
+        size = _BATCHES[scene.model.nv > _SMALL]
+        programs = Programs(scene, size, outcomes, tuple(KINDS))
+        programs.wait()
+        spent["compiling"] = time.perf_counter() - started
+        started = time.perf_counter()
+        measured = measure(scene, motions, programs, rng, from_start=cost is not None, seconds=seconds, log=say)
+        spent["measuring"] = time.perf_counter() - started
+        found += measured_findings(measured)
+    advice = recommend(scene, motions, stability, measured, max_contacts)
+    return Verdict(
+        name=scene.name,
+        headline=headline(found, advice, motions),
+        findings=tuple(sorted(found, key=lambda one: not one.is_fault)),
+        recommendation=advice,
+        code=_code(scene, advice, path),
+        outcomes=names,
+        scene=scene,
+        stability=stability,
+        motions=motions,
+        measured=measured,
+        seconds=spent,
+    )
+
+
+def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
+    """Return the scene, and how code calls its file."""
+    if isinstance(source, Scene):
+        return source, "scene.xml"
+    is_file = isinstance(source, os.PathLike) or (
+        isinstance(source, str) and not source.lstrip("\ufeff \t\r\n").startswith("<")
+    )
+    if isinstance(source, mujoco.MjSpec):
+        try:
+            source = source.compile()
+        except ValueError as error:
+            raise SceneError(f"the MjSpec must be one that MuJoCo compiles, but it says: {error}") from error
+    if is_file and Path(source).is_file():  # pyright: ignore[reportArgumentType]
+        _look_at_pairs(mujoco.MjModel.from_xml_path, str(source), say)
+    elif isinstance(source, str) and not is_file:
+        _look_at_pairs(mujoco.MjModel.from_xml_string, source, say)
+    elif isinstance(source, mujoco.MjModel):
+        _look_at_pairs(lambda model: model, source, say)
+    return load_scene(source), str(source) if is_file else "scene.xml"
+
+
+def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) -> None:
+    """Say how many geoms can touch, or refuse more than can be loaded; what cannot be read is left to `load_scene`."""
+    try:
+        model = read(argument)
+    except ValueError:
+        return
+    count = count_pairs(model)
+    if count >= MANY_PAIRS:
+        say(f"about {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
+    if count > MOST_PAIRS:
+        raise SceneError(
+            f"the scene must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
+            "touch contype and conaffinity that do not match, or <contact><exclude>; then max_contacts bounds those that do"
+        )
+
+
+def count_pairs(model: mujoco.MjModel) -> int:
+    """Count pairs of geoms of different bodies whose contype and conaffinity match, without listing them."""
+    keys = np.stack([model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]], axis=1)
+
+    def matching(columns: np.ndarray) -> int:
+        kinds, counts = np.unique(columns, axis=0, return_counts=True)
+        first, second = kinds[:, :1], kinds[:, 1:2]
+        match = ((first & second.T) | (second & first.T)) != 0
+        return int(counts @ match @ counts)
+
+    own = sum(matching(keys[keys[:, 2] == body, :2]) for body in np.unique(keys[:, 2]))
+    return (matching(keys[:, :2]) - own) // 2
+
+
+def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
+    """Leave room for the contacts that motions needed, where that is much less than for all."""
+    if not scene.pairs:
+        return scene, None
+    needed = max(contacts_needed(scene, motions.trajectory(i)) for i in range(len(motions.poses)))
+    # Motions along lines meet more than those looked at.
+    room = 2 * needed + _SPARE_CONTACTS
+    if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
+        return scene, None
+    return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room
+
+
+def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
+    for message in dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)):
+        # What the time step is too long for is said in a sentence of its own.
+        if "refsafe" not in message and "h²k" not in message:
+            yield Finding("note", message.partition(": ")[2][:1].upper() + message.partition(": ")[2][1:] + ".")
+
+
+def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:
+    """Return what to look at of a trajectory, and its names."""
+    if cost is not None:
+        return ("the cost",), lambda trajectory: jnp.asarray(cost(trajectory)).sum()[None]
+    model = scene.mj_model
+    trees = np.unique(model.body_rootid[model.jnt_bodyid])
+    heaviest = sorted(trees.tolist(), key=lambda root: -model.body_subtreemass[root])[:_MOST_TREES]
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or f"body {root}" for root in heaviest]
+    dof_joints, sizes = model.dof_jntid, np.diff([*model.jnt_qposadr, model.nq])
+    mixes = []
+    for joints in (np.repeat(np.arange(model.njnt), sizes), dof_joints):
+        is_own = model.body_rootid[model.jnt_bodyid[joints]] == np.array(heaviest)[:, None]
+        weights = rng.normal(size=is_own.shape) * is_own
+        mixes.append(jnp.asarray(weights / np.sqrt((weights**2).sum(axis=1, keepdims=True))))
+    words = [f"where {name} ends up" for name in names] + [f"how fast {name} is in the end" for name in names]
+    ends = lambda trajectory: (trajectory.qpos[-1], trajectory.qvel[-1])  # noqa: E731
+    return tuple(words), lambda t: jnp.concatenate([mix @ end for mix, end in zip(mixes, ends(t), strict=True)])
+
+
+def _noise_row(noise) -> dict[str, Any]:
+    bias = np.asarray(noise.first.value - noise.zeroth.value)[-1, :, 0]
+    error = np.hypot(np.asarray(noise.first.standard_error), np.asarray(noise.zeroth.standard_error))[-1, :, 0]
+    return {
+        "stddev": noise.stddev,
+        "stiffness": noise.stiffness,
+        "first_variance": np.asarray(noise.first.variance)[-1].tolist(),
+        "zeroth_variance": np.asarray(noise.zeroth.variance)[-1].tolist(),
+        "bias": bias.tolist(),
+        "bias_error": error.tolist(),
+        "first_is_better_until": noise.crossover.horizon,
+    }
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.2g}" for value in values)
+
+
+def _code(scene: Scene, advice: Recommendation, path: str) -> str:
+    """Write the recommendation as a program."""
+    given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
+    settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+    if advice.stiffness is not None:
+        settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
+    step = "onset=mg.Onset()" if advice.onset else f'onset=None, gradient="{advice.gradient}"'
+    stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
+    noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
+    if scene.model.nu:
+        objective, start = f"mg.open_loop(task, stddev={noise})", "jnp.zeros(objective.dim)"
+    else:
+        run = "task.run(None, start=mg.initial_state(scene, qvel=velocity)).cost"
+        objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise})"
+        start = f"jnp.zeros({scene.model.nv})"
+    return f"""\
+import jax
+import jax.numpy as jnp
+import mjxgrad as mg
+
+scene = mg.load_scene({path!r}{settings})
+cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
+task = mg.SceneTask(scene, mg.initial_state(scene), cost, horizon={advice.horizon}, {step})
+objective = {objective}
+estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
+"""

@@ -1,0 +1,287 @@
+"""What the measurements mean: faults by name, findings, and what to do, in the words of the scene."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from mjxgrad._rollout import LARGEST_GROWTH
+from mjxgrad.contact.warnings import format_number, name_pairs
+from mjxgrad.diagnostics.stability import Spring, StabilityReport
+from mjxgrad.scene import Scene
+from mjxgrad.verdict.measure import STDDEVS, Measured
+from mjxgrad.verdict.motions import Motions
+
+Kind = Literal[
+    "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs", "slope", "order", "note"
+]
+MANY_PAIRS = 1000
+"""Pairs of geoms from which on they are counted aloud."""
+_SPARE_STEP = 0.9
+_CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
+_CLOSE = 0.05  # typical error of a derivative that is the slope
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found: its kind, a sentence or two in the words of the scene, and whether it is a fault."""
+
+    kind: Kind
+    text: str
+    is_fault: bool = False
+
+
+@dataclass(frozen=True)
+class Slope:
+    """How often the mean of a derivative is not the slope, or too scattered to tell, and its median error as a share."""
+
+    kind: str
+    num_off: int
+    num_readings: int
+    error: float
+
+    @property
+    def share_off(self) -> float:
+        """Of all readings."""
+        return self.num_off / max(self.num_readings, 1)
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """What to ask for.
+
+    Attributes:
+        onset: whether contacts should begin within the step.
+        gradient: of the step, where they do not.
+        estimator: name in `mjxgrad.estimators`.
+        stddev: of the noise, as a share of half the range of controls.
+        horizon: in steps, up to which first order was the better one, or as far as it was measured.
+        timestep: in s; None is the file's, as with the next three.
+        stiffness: of all contacts, in 1/s².
+        max_contacts: room for so many.
+    """
+
+    onset: bool
+    gradient: str
+    estimator: str
+    stddev: float
+    horizon: int
+    timestep: float | None = None
+    stiffness: float | None = None
+    max_contacts: int | None = None
+
+
+def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) -> Iterator[Finding]:
+    """Yield what random motions and the contact parameters say by themselves."""
+    if len(scene.pairs) >= MANY_PAIRS:
+        yield Finding("many_pairs", f"{len(scene.pairs)} pairs of geoms can touch: exclude those that never do.", True)
+    for spring in steps_too_long(stability, touch_speed(motions)):
+        yield Finding("time_step", _time_step(spring, touch_speed(motions)), True)
+    bad = [pose for pose, step in zip(motions.poses, motions.bad_steps, strict=True) if step >= 0]
+    if bad:
+        first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
+        text = (
+            f"From {bad[0]} the motion leaves all numbers after {first:.3g} s, in C MuJoCo too: shorten the time step."
+        )
+        yield Finding("not_finite", text, True)
+    yield from _contact_findings(scene, motions)
+    if motions.idle:
+        text = f"No effect: {', '.join(motions.idle)}. A change of the control leaves every position as it was."
+        yield Finding("no_effect", text, True)
+    unfelt = [name for name in motions.unfelt if motions.touches or motions.touching or name != "friction"]
+    if unfelt:
+        text = f"A tenth more changes nothing in the motion looked at: {_some(unfelt)}. Its derivative is zero."
+        yield Finding("note", text)
+
+
+def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
+    if not scene.pairs:
+        yield Finding("note", "No two geoms can touch, so all derivatives are those of smooth motion.")
+    elif not motions.touches and not motions.touching:
+        text = (
+            f"Nothing touches within {motions.seconds:.3g} s, although {name_pairs(scene.pairs)} could: derivatives know of "
+            "no contact. Start nearer, or take mg.Smoothing or a margin."
+        )
+        yield Finding("no_contact", text, True)
+    elif motions.touches:
+        first = motions.touches[0]
+        more = f", then {len(motions.touches) - 1} more" if len(motions.touches) > 1 else ""
+        text = f"First to touch: {first.pair}, after {first.time:.3g} s at {first.speed:.2g} m/s{more}."
+        yield Finding("note", text)
+    else:
+        yield Finding("note", f"In contact from the start, and nothing else touches: {_some(motions.touching)}.")
+
+
+def measured_findings(measured: Measured) -> Iterator[Finding]:
+    """Yield what lines and noise say."""
+    jumps = [line for line in measured.lines if len(line.jumps.places)]
+    if jumps:
+        line = max(jumps, key=lambda one: (bool(one.changed), float(one.jumps.sizes.max())))
+        text = (
+            f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side of it alone."
+        )
+        if not line.changed:
+            text = f"Along a change of {line.varied} the outcome rises within a 5000th of it, and no pair differs beside it."
+        yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", bool(line.changed))
+    growth = np.array([line.growth for line in measured.lines])
+    largest = float(np.nanmax(growth, initial=0.0))
+    if largest > LARGEST_GROWTH:
+        when = measured.times[int(np.nanmax(growth, axis=0).argmax())]
+        text = f"The derivative explodes: a change of the start grows {largest:.1e} times within {when:.3g} s."
+        yield Finding("explodes", text + " Shorten the horizon, soften the contact or widen the onset.", True)
+    num_diverged = sum(line.num_diverged for line in measured.lines)
+    if num_diverged:
+        yield Finding("not_finite", f"{num_diverged} motions along the lines diverged: shorten the time step.", True)
+    if crowded := sum(line.num_crowded for line in measured.lines):
+        yield Finding(
+            "note", f"In {crowded} motions more contacts may have acted than there was room for: raise max_contacts."
+        )
+    if scattered := [one for one in measured.noises if one.stiffness is None and one.advantage < 1]:
+        until = min(one.crossover.horizon for one in scattered)
+        text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
+        yield Finding("explodes", text + " Shorten the horizon, soften the contact or widen the onset.", True)
+    yield _slope_finding(slopes(measured))
+    yield from _order_findings(measured)
+
+
+def _slope_finding(found: Sequence[Slope]) -> Finding:
+    if not found[0].num_readings:
+        return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
+    words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
+    parts = [
+        f"{words[one.kind]}: {one.num_readings - one.num_off} of {one.num_readings}, {percent(one.error)}."
+        for one in found
+    ]
+    return Finding("slope", f"How often the mean derivative is the slope, and its typical error. {' '.join(parts)}")
+
+
+def _order_findings(measured: Measured) -> Iterator[Finding]:
+    """Yield a sentence for the file's contact, and one for a softer one."""
+    for is_own in (True, False):
+        felt = [one for one in measured.noises if (one.stiffness is None) == is_own and not np.isnan(one.advantage)]
+        if not felt:
+            continue
+        until = min(one.crossover.horizon for one in felt)
+        ends = f"It is better up to {until:.2g} s" if math.isfinite(until) else "It is better as far as measured"
+        stiffness = felt[0].stiffness
+        lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
+        noises = " and ".join(f"{one.stddev:g}" for one in felt)
+        values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
+        text = f"{lead} first-order sample is worth {values} of zeroth order, under noise of {noises}. {ends}."
+        yield Finding("order", text)
+
+
+def slopes(measured: Measured) -> tuple[Slope, ...]:
+    """Count over all lines, times and outcomes how often each derivative is not the slope, where there is a clear one."""
+    found = []
+    for kind in ("discrete", "event", "onset"):
+        off, errors = [], []
+        for line in measured.lines:
+            comparison = line.smooth if kind == "onset" else line.plain
+            at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
+            is_clear = (size > 0) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
+            is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
+            off += (comparison.is_off()[at] | is_scattered)[is_clear].tolist()
+            size = np.maximum(np.abs(comparison.slope), comparison.resolution)
+            errors += (np.abs(comparison.error[at]) / size)[is_clear].tolist()
+        found.append(Slope(kind, sum(off), len(off), float(np.median(errors)) if errors else math.nan))
+    return tuple(found)
+
+
+def recommend(
+    scene: Scene, motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
+) -> Recommendation:
+    """Say what to ask for, from what was measured; without measurements what is never wrong."""
+    needed = [largest_step(spring, touch_speed(motions)) for spring in steps_too_long(stability, touch_speed(motions))]
+    timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
+    touches = bool(motions.touches or motions.touching)
+    if measured is None:
+        horizon = max(40, round(0.2 / motions.timestep))
+        return Recommendation(touches, "discrete", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
+    found = slopes(measured)
+    discrete, event, onset = found
+    needs_none = not touches or (discrete.num_off == 0 and not discrete.error > _CLOSE)
+    best = discrete if needs_none else onset if onset.share_off <= event.share_off else event
+    has_jumps = any(len(line.jumps.places) for line in measured.lines)
+    stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
+    own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
+    softer = [noise for noise in measured.noises if noise.stiffness is not None and noise.stddev == stddev]
+    limits = [noise.crossover.horizon for noise in own]
+    limits += [
+        float(t)
+        for line in measured.lines
+        for t, g in zip(measured.times, line.growth, strict=True)
+        if g > LARGEST_GROWTH
+    ]
+    limit = min(limits, default=math.inf)
+    is_limited = limit < measured.times[-1]
+    is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
+    return Recommendation(
+        onset=best.kind == "onset",
+        gradient="event" if best.kind == "event" else "discrete",
+        estimator="alpha_order" if has_jumps or is_limited else "first_order",
+        stddev=stddev,
+        horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
+        timestep=timestep,
+        stiffness=softer[0].stiffness if is_helped else None,
+        max_contacts=max_contacts,
+    )
+
+
+def touch_speed(motions: Motions) -> float | None:
+    """Return the largest speed at which anything began to touch, in m/s."""
+    return max((touch.speed for touch in motions.touches if touch.speed > 0), default=None)
+
+
+def steps_too_long(stability: StabilityReport, speed: float | None) -> list[Spring]:
+    """Return the springs that the time step is too long for, one of those that are alike."""
+    found = [one for one in stability.springs if largest_step(one, speed) < one.timestep * (1 - 1e-6)]
+    return list({(one.kind, one.given, round(one.coupled_load, 6), one.stiffness): one for one in found}.values())
+
+
+def largest_step(spring: Spring, speed: float | None) -> float:
+    """Return the longest time step in s that follows a spring: that asked for by the file, stable, and not passing through."""
+    asked = spring.given / 2 if spring.is_hidden and spring.given is not None else math.inf
+    passed = spring.size / speed if speed and spring.kind == "contact" else math.inf
+    return min(asked, spring.timestep / spring.coupled_load if spring.coupled_load >= 1 else math.inf, passed)
+
+
+def _time_step(spring: Spring, speed: float | None) -> str:
+    step, needed = 1e3 * spring.timestep, format_number(1e3 * largest_step(spring, speed))
+    what = f"The time step of {step:g} ms is too long for {spring.kind} {spring.name}"
+    if spring.is_hidden and spring.given is not None:
+        asked, used = (format_number(1e3 * t) for t in (spring.given, spring.time_constant))
+        return f"{what}: the file asks for a time constant of {asked} ms and gets {used} ms. At most {needed} ms."
+    if spring.coupled_load >= 1:
+        return f"{what}: it gains energy. Take less than {needed} ms, or a softer contact."
+    return f"{what}: at {speed:.2g} m/s it passes through. Take less than {needed} ms."
+
+
+def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
+    """Answer in at most 15 words."""
+    asked = "onset=mg.Onset()" if advice.onset else f'gradient="{advice.gradient}"'
+    answer = f"{asked} and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
+    faults = [finding.kind for finding in findings if finding.is_fault]
+    words = {
+        "time_step": "the time step is too long for a contact",
+        "not_finite": "motions leave all numbers",
+        "no_contact": "nothing touches",
+        "no_effect": "an actuator has no effect",
+        "jump": "the outcome jumps",
+        "explodes": "the derivative explodes",
+        "many_pairs": "too many pairs can touch",
+    }
+    found = next((words[kind] for kind in words if kind in faults), None)
+    return f"Differentiate it with {answer}." if found is None else f"Mind that {found}. Then {answer}."
+
+
+def percent(share: float) -> str:
+    """Write a share for a reader."""
+    return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" + {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more

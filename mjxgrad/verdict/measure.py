@@ -1,0 +1,316 @@
+"""What is measured of a scene's derivatives: along lines, and under noise, by the diagnostics that there are for each."""
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._rollout import State
+from mjxgrad.contact import Softness
+from mjxgrad.diagnostics.horizon import Crossover, crossover
+from mjxgrad.diagnostics.jumps import Jumps, jumps_along
+from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
+from mjxgrad.estimators import GradientEstimate
+from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
+from mjxgrad.estimators.samples import Plan, Samples
+from mjxgrad.objective.base import unchanged
+from mjxgrad.scene import Scene
+from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
+from mjxgrad.verdict.programs import CHUNK, Direction, Moved, Programs, contact_of, moved
+
+_TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
+_SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
+_WIDE = 4.0  # times as long as the others is the last line: for jumps that are farther off
+STDDEVS = (0.1, 0.3)
+"""Noise that is tried, as a share of half the range of controls; without controls in m/s and rad/s of the start."""
+SOFTER = 0.1
+"""Stiffness that is tried beside the file's, as a share of it."""
+_NUM_LINES, _NUM_TIMES = 3, 4
+_BEFORE, _AFTER = 30, 40  # steps around the first touch
+_FEWEST_STEPS, _MOST_STEPS = 4 * CHUNK, 30 * CHUNK
+_NUM_BATCHES = 24.0  # that are moved in all, about
+_SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
+_AT_REST = 1e-3  # of the largest variation at any time
+_REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
+
+
+@dataclass(frozen=True)
+class Line:
+    """Motions along a line through one of the random motions.
+
+    Attributes:
+        pose: where it starts, in words.
+        varied: what is changed along it, in words.
+        plain: MuJoCo's motion: its slope, and its derivatives by kind.
+        smooth: the motion with an onset, likewise.
+        jumps: of the motion with an onset, over its spread; the parameter is the place on the line.
+        changed: pairs that touch on one side of the largest jump alone.
+        growth: of a change of the start, by time; NaN where only controls are changed.
+        num_diverged: motions that left all numbers.
+        num_crowded: motions in which contacts may have found no room.
+    """
+
+    pose: str
+    varied: str
+    plain: SlopeComparison
+    smooth: SlopeComparison
+    jumps: Jumps
+    changed: tuple[str, ...]
+    growth: Float[np.ndarray, " times"]
+    num_diverged: int
+    num_crowded: int
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Both estimates of the derivative along one direction, under noise on everything.
+
+    Attributes:
+        stddev: see `STDDEVS`.
+        stiffness: of all contacts in 1/s²; None is the file's.
+        first: by time and outcome.
+        zeroth: of the same motions.
+        crossover: the time from which zeroth order is at least as good, in s.
+    """
+
+    stddev: float
+    stiffness: float | None
+    first: GradientEstimate
+    zeroth: GradientEstimate
+    crossover: Crossover
+
+    @property
+    def advantage(self) -> float:
+        """How many times fewer samples first order needs at the last time, by the median over outcomes."""
+        first, zeroth = (np.asarray(one.variance)[-1] for one in (self.first, self.zeroth))
+        is_felt = zeroth > 0
+        return (
+            float(np.median(zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])))
+            if is_felt.any()
+            else np.nan
+        )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All that was measured; times are those of outcomes after the start of a line, in s."""
+
+    times: Float[np.ndarray, " times"]
+    num_steps: int
+    lines: tuple[Line, ...]
+    noises: tuple[Noise, ...]
+
+
+def measure(
+    scene: Scene,
+    motions: Motions,
+    programs: Programs,
+    rng: np.random.Generator,
+    *,
+    from_start: bool,
+    seconds: int | float,
+    log: Callable[[str], None],
+) -> Measured:
+    """Measure along lines and under noise, in about so many seconds after compilation."""
+    order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
+    begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
+    onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
+    lengths = _lengths(programs, motions, onsets, seconds)
+    num_steps = lengths[-1]
+    # A motion that begins to touch late is followed from shortly before.
+    begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
+    log(f"derivatives over {num_steps} steps, {num_steps * motions.timestep:.3g} s, from motions that touch")
+    probe = _Probe(scene, motions, programs, lengths)
+    chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
+    speed = max((touch.speed for touch in motions.touches), default=0.0) or 1.0
+    directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
+    softness = _softer(scene)
+    settings = [(stddev, soft) for soft in ([None] if softness is None else [None, softness]) for stddev in STDDEVS]
+    with ThreadPoolExecutor(2) as pool:
+        noise_keys = [np.random.default_rng(int(rng.integers(2**31))) for _ in settings]
+        noises = [
+            pool.submit(probe.noise, *chosen[0], *one, own) for one, own in zip(settings, noise_keys, strict=True)
+        ]
+        lines = [pool.submit(probe.line, *at, *one) for at, one in zip(chosen, directions, strict=False)]
+        measured = tuple(one.result() for one in lines), tuple(one.result() for one in noises)
+    return Measured(np.array(lengths) * motions.timestep, num_steps, *measured)
+
+
+def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
+    """Choose how many steps, by when things touch and by how long a step takes here, and at which of them to look."""
+    wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
+    still = np.zeros(motions.qvel.shape[2])
+    direction = Direction(still, still, np.zeros((CHUNK, motions.controls.shape[2])))
+    states = _repeated(motions.state(0, 0), programs.size)
+    controls = np.repeat(motions.controls[:1, :CHUNK], programs.size, axis=0)
+    programs.move("onset", states, controls, direction, [CHUNK])
+    started = time.perf_counter()
+    programs.move("onset", states, controls, direction, [CHUNK])
+    affordable = CHUNK * int(seconds / (_NUM_BATCHES * (time.perf_counter() - started)))
+    num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
+    num_chunks = num_steps // CHUNK
+    return sorted({CHUNK * max(1, round(num_chunks * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
+
+
+def _repeated(state: State, size: int) -> State:
+    return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], size, axis=0), state)
+
+
+def _direction(
+    scene: Scene, rng: np.random.Generator, num_steps: int, speed: float, number: int
+) -> tuple[str, Direction]:
+    """Draw a change of the start, of the controls, or a wide one of both; from −1 to 1 of it is a line.
+
+    Long enough for the first touch to move through several steps, so that it meets the teeth of MuJoCo's motion.
+    """
+    model, timestep = scene.model, float(scene.model.opt.timestep)
+    units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
+    sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
+    parts = [
+        size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in zip(sizes, units, strict=True)
+    ]
+    wide = _WIDE if number == _NUM_LINES - 1 else 1.0
+    has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
+    # Positions no wider: they would begin within each other.
+    given = (1.0 * has_start, wide * has_start, wide * has_controls)
+    words = ["the start"] * has_start + ["the controls"] * has_controls
+    return " and ".join(words), Direction(*(part * share for part, share in zip(parts, given, strict=True)))
+
+
+def _softer(scene: Scene) -> float | None:
+    if not scene.pairs:
+        return None
+    return SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))
+
+
+@dataclass(frozen=True)
+class _Probe:
+    scene: Scene
+    motions: Motions
+    programs: Programs
+    lengths: Sequence[int]
+
+    def _at(self, motion: int, begin: int) -> tuple[State, Float[np.ndarray, "steps nu"]]:
+        return self.motions.state(motion, begin), self.motions.controls[motion, begin : begin + self.lengths[-1]]
+
+    def line(self, motion: int, begin: int, words: str, direction: Direction) -> Line:
+        """Measure slope, derivatives and jumps along a line."""
+        state, controls = self._at(motion, begin)
+
+        def along(kind: str, places: Float[np.ndarray, " motions"]) -> Moved:
+            states = _repeated(state, self.programs.size)
+            states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
+            states.qvel[:] += places[:, None] * direction.velocities
+            varied = controls + places[:, None, None] * direction.controls
+            return self.programs.move(kind, states, varied, direction, self.lengths)
+
+        places = phases((-1.0, 1.0), self.programs.size)
+        discrete, event, onset = (along(kind, places) for kind in ("discrete", "event", "onset"))
+        plain = compare_to_slope(places, discrete.outcomes, [discrete.derivatives, event.derivatives])
+        continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
+        centre, spreads = np.nanmean(onset.outcomes[:, -1], axis=0), np.nanstd(onset.outcomes, axis=0)
+        # What has come to rest by then varies by rounding alone.
+        scale = np.where(spreads[-1] > _AT_REST * spreads.max(axis=0), spreads[-1], np.inf)
+        jumps = jumps_along(
+            lambda x: (along("onset", x).outcomes[:, -1] - centre) / scale,
+            (-1.0, 1.0),
+            num_points=self.programs.size,
+            num_candidates=self.programs.size // 8,
+            num_refinements=_REFINEMENTS,
+            smallest=_SMALLEST_JUMP,
+        )
+        return Line(
+            pose=self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else ""),
+            varied=words,
+            plain=plain,
+            smooth=continuous,
+            jumps=jumps,
+            changed=self._changed(state, controls, direction, jumps),
+            growth=np.median(onset.growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
+            num_diverged=discrete.num_diverged + onset.num_diverged,
+            num_crowded=onset.num_crowded,
+        )
+
+    def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
+        """Name the pairs that touch on one side of the largest jump alone."""
+        if jumps.largest < 0:
+            return ()
+        place, sides = jumps.places[jumps.largest], []
+        for x in (place - 0.01, place + 0.01):
+            qpos = jnp.asarray(moved(self.scene.mj_model, np.asarray(state.qpos)[None], direction.positions, x)[0])
+            start = State(qpos, state.qvel + x * direction.velocities, state.act, state.time, state.warmstart)
+            sides.append(pairs_at(self.scene, start, controls + x * direction.controls))
+        return tuple(sorted(sides[0] ^ sides[1]))
+
+    def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:
+        """Estimate one derivative by both orders, all controls (or velocities of the start) being noisy."""
+        state, controls = self._at(motion, begin)
+        size, steps, half = self.programs.size, self.lengths[-1], half_range(self.scene)
+        has_controls = self.scene.model.nu > 0
+        still = np.zeros(state.qvel.size)
+        wiggle = rng.normal(size=(1, still.size))
+        if has_controls:
+            wiggle = smooth(rng, steps, len(half), steps * self.motions.timestep)
+        along = wiggle / np.sqrt((wiggle**2).sum())
+        noise = stddev * rng.normal(size=(size, *along.shape))
+        states = _repeated(state, size)
+        if has_controls:
+            direction, noisy = Direction(still, still, along * half), controls + noise * half
+        else:
+            direction, noisy = Direction(still, along[0], controls), np.repeat(controls[None], size, axis=0)
+            states.qvel[:] += noise[:, 0]
+        contact = None
+        if stiffness is not None:
+            contact = contact_of(Softness(stiffness=stiffness, damping_ratio=1.0).apply(self.scene.model))
+        found = self.programs.move("onset", states, noisy, direction, self.lengths, contact)
+        # An outcome depends on the noise of the steps before it alone.
+        scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
+        scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
+        first, zeroth = _estimates(found.outcomes, found.derivatives, scores[:, :, None])
+        times = np.array(self.lengths) * self.motions.timestep
+        return Noise(stddev, stiffness, first, zeroth, _crossover(times, found, scores[:, :, None], zeroth))
+
+
+def _estimates(
+    costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray
+) -> tuple[GradientEstimate, GradientEstimate]:
+    """Return both estimates from motions that there are already, by time and outcome."""
+    plan = Plan(len(costs), with_gradient=True, with_score=True)
+
+    def of_one(costs: Array, derivatives: Array, scores: Array) -> tuple[GradientEstimate, GradientEstimate]:
+        column, yes = costs[:, None], jnp.ones(len(costs), bool)
+        samples = Samples(
+            column,
+            derivatives[:, None, None],
+            scores[:, None, None],
+            jnp.full_like(scores, jnp.nan)[:, None, None],
+            jax.tree_util.Partial(unchanged),
+            is_noisy=yes,
+            is_noise_free=~yes,
+            silent_costs=jnp.zeros_like(costs),
+            is_quiet=~yes,
+        )
+        return both_results(both_summary(samples), plan, "leave_one_out", unchanged)
+
+    flat = [jnp.asarray(np.broadcast_to(x, costs.shape).reshape(len(costs), -1)) for x in (costs, derivatives, scores)]
+    found = jax.jit(jax.vmap(of_one, in_axes=1))(*flat)
+    return jax.tree.map(lambda leaf: leaf.reshape(*costs.shape[1:], *leaf.shape[1:]), found)
+
+
+def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: GradientEstimate) -> Crossover:
+    """Find from when on single samples of zeroth order are as near to the derivative, outcomes weighing alike."""
+    is_finite = np.isfinite(found.outcomes).all(axis=(1, 2)) & np.isfinite(found.derivatives).all(axis=(1, 2))
+    costs, derivatives, scores = (x[is_finite] for x in (found.outcomes, found.derivatives, scores))
+    if len(costs) < 2:
+        return Crossover(float(times[0]), float(times[0]), float(times[0]), np.zeros(len(times)))
+    terms = (costs - costs.mean(axis=0)) * scores * len(costs) / (len(costs) - 1)
+    truth = np.asarray(zeroth.value)[..., 0]
+    squares = [(one - truth) ** 2 for one in (derivatives, terms)]
+    weight = squares[1].mean(axis=0)
+    shares = [(square / np.where(weight > 0, weight, np.inf)).sum(axis=2) for square in squares]
+    return crossover(times, *shares, num_resamples=200)

@@ -1,0 +1,236 @@
+"""What a scene does by itself: random motions in C MuJoCo, which need no compilation, and what touches in them.
+
+They come first because they take a second, and because they say where the dear measurements should look: just before
+something begins to touch.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from mjxgrad._rollout import State, Trajectory
+from mjxgrad.contact.parameters import geom_name
+from mjxgrad.scene import Scene
+from mjxgrad.scene.refusals import element_name
+
+_NUM_MOTIONS = 4
+_SECONDS, _MOST_STEPS, _FEWEST_STEPS = 2.0, 1000, 50
+_KNOTS_PER_SECOND = 4.0  # slow enough for bodies to follow
+_REACH = 0.8  # of half the range, so that small changes are not clipped
+_REPLAYED = 100  # steps before and after the first touch, in which what has an effect shows it
+_SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding of double precision over that many steps
+_FASTEST = 1e4  # m/s, rad/s: beyond it a rollout counts as diverged, too
+_Start = tuple[str, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Two geoms that begin to touch: their names, when first (s), and the largest speed of approach (m/s)."""
+
+    pair: str
+    time: float
+    speed: float
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Random motions from the poses of a scene, by C MuJoCo.
+
+    Attributes:
+        poses: names of the poses that they start from.
+        qpos: positions before each step and after the last.
+        qvel: velocities, likewise.
+        act: activations, likewise.
+        controls: of each step.
+        timestep: of the scene, in s.
+        bad_steps: for each motion the first step that is not finite or beyond all speeds, −1 if there is none.
+        onsets: for each motion the step in which something first begins to touch, −1 if nothing does.
+        touches: pairs that begin to touch, in order of time.
+        touching: pairs in contact from the first step on.
+        idle: actuators whose control changes nothing.
+        unfelt: masses and frictions whose change by a tenth changes nothing.
+    """
+
+    poses: tuple[str, ...]
+    qpos: Float[np.ndarray, "motions states nq"]
+    qvel: Float[np.ndarray, "motions states nv"]
+    act: Float[np.ndarray, "motions states na"]
+    controls: Float[np.ndarray, "motions steps nu"]
+    timestep: float
+    bad_steps: Int[np.ndarray, " motions"]
+    onsets: Int[np.ndarray, " motions"]
+    touches: tuple[Touch, ...]
+    touching: tuple[str, ...]
+    idle: tuple[str, ...]
+    unfelt: tuple[str, ...]
+
+    @property
+    def seconds(self) -> float:
+        """How long each was followed, in s."""
+        return self.controls.shape[1] * self.timestep
+
+    def state(self, motion: int, step: int) -> State:
+        """Return where a motion is after so many steps."""
+        qpos, qvel, act = (jnp.asarray(x[motion, step], float) for x in (self.qpos, self.qvel, self.act))
+        return State(qpos, qvel, act, time=jnp.asarray(step * self.timestep), warmstart=jnp.zeros_like(qvel))
+
+    def trajectory(self, motion: int) -> Trajectory:
+        """Return one of them as diagnostics of recorded motions take it."""
+        first_bad = jnp.asarray(int(self.bad_steps[motion]))
+        arrays = [jnp.asarray(x[motion], float) for x in (self.qpos, self.qvel, self.controls)]
+        final = self.state(motion, -1)
+        return Trajectory(*arrays, observations=None, final=final, diverged=first_bad >= 0, first_bad_step=first_bad)
+
+
+def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
+    """Return half the width of each actuator's range of controls, in its units; 1 where there is none."""
+    low, high = np.asarray(scene.ctrlrange, float).T
+    width = high - low
+    return np.where(np.isfinite(width) & (width > 0), width / 2, 1.0)
+
+
+def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:
+    """Draw numbers between −1 and 1 that are linear in time between a few random ones."""
+    knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * seconds) + 1), num_columns))
+    at = np.linspace(0, len(knots) - 1, num_steps)
+    lower = np.minimum(at.astype(int), len(knots) - 2)
+    share = (at - lower)[:, None]
+    return (1 - share) * knots[lower] + share * knots[lower + 1]
+
+
+def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
+    """Move a scene from its reference pose and its key frames, under random controls that are smooth in time."""
+    model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
+    low, high = np.asarray(scene.ctrlrange, float).T
+    middle, half = np.where(np.isfinite(low + high), (low + high) / 2, 0.0), half_range(scene)
+    starts = list(_starts(model))
+    chosen = [starts[i % len(starts)] for i in range(_NUM_MOTIONS)]
+    wiggles = [smooth(rng, num_steps, model.nu, num_steps * timestep) for _ in chosen]
+    controls = np.array([middle + _REACH * half * one for one in wiggles])
+    moved = [_roll(model, start[1:], ctrl) for start, ctrl in zip(chosen, controls, strict=True)]
+    qpos, qvel, act = (np.array([one[i] for one in moved]) for i in range(3))
+    touches, touching, onsets = _touches(model, qpos, qvel)
+    begin = max(0, int(onsets[0]) - _REPLAYED)
+    start = (qpos[0, begin], qvel[0, begin], act[0, begin])
+    window = controls[0, begin : begin + 2 * _REPLAYED]
+    return Motions(
+        poses=tuple(name for name, *_ in chosen),
+        qpos=qpos,
+        qvel=qvel,
+        act=act,
+        controls=controls,
+        timestep=timestep,
+        bad_steps=np.array([one[3] for one in moved]),
+        onsets=onsets,
+        touches=touches,
+        touching=touching,
+        idle=_without_effect(model, start, window, _actuators(model, window, half)),
+        unfelt=_without_effect(model, start, window, _parameters(model, window)),
+    )
+
+
+def _starts(model: mujoco.MjModel) -> Iterator[_Start]:
+    yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
+    for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or str(i)
+        yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
+
+
+def _roll(model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray) -> tuple:
+    """Return positions, velocities and activations, the last good ones from the first bad step on, and that step."""
+    data, first_bad = mujoco.MjData(model), -1
+    data.qpos[:], data.qvel[:], data.act[:] = start
+    states = [tuple(np.array(part) for part in start)]
+    for step, ctrl in enumerate(controls):
+        if first_bad < 0:
+            data.ctrl[:] = ctrl
+            mujoco.mj_step(model, data)
+            is_good = np.isfinite(data.qpos).all() and (np.abs(data.qvel) < _FASTEST).all()
+            first_bad = -1 if is_good else step
+        states.append(states[-1] if first_bad >= 0 else (data.qpos.copy(), data.qvel.copy(), data.act.copy()))
+    return *(np.array(part) for part in zip(*states, strict=True)), first_bad
+
+
+def _touches(
+    model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray
+) -> tuple[tuple[Touch, ...], tuple[str, ...], Int[np.ndarray, " motions"]]:
+    """Find what begins to touch in any motion, what touches from the start, and the first beginning in each."""
+    data, found, always, onsets = mujoco.MjData(model), {}, {}, np.full(len(qpos), -1)
+    before = set()
+    for motion, step in np.ndindex(qpos.shape[:2]):
+        data.qpos[:], data.qvel[:] = qpos[motion, step], qvel[motion, step]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        now = {tuple(map(int, contact.geom)): contact for contact in data.contact if contact.efc_address >= 0}
+        if step == 0:
+            always, before = always | now, set(now)
+        for pair in now.keys() - before:
+            onsets[motion] = step if onsets[motion] < 0 else onsets[motion]
+            time, speed = found.get(pair, (np.inf, 0.0))
+            found[pair] = (min(time, step * model.opt.timestep), max(speed, _approach(model, data, now[pair])))
+        before = set(now)
+    named = [Touch(_pair(model, pair), *when) for pair, when in found.items()]
+    return tuple(sorted(named, key=lambda touch: touch.time)), tuple(_pair(model, pair) for pair in always), onsets
+
+
+def _pair(model: mujoco.MjModel, geoms: tuple[int, ...]) -> str:
+    return " – ".join(geom_name(model, geom) for geom in geoms)
+
+
+def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
+    """Return the speed of approach along the normal; the edges of a pyramid have it as their mean."""
+    is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and contact.dim > 1
+    num_rows = 2 * (contact.dim - 1) if is_pyramid else 1
+    return max(0.0, -float(data.efc_vel[contact.efc_address : contact.efc_address + num_rows].mean()))
+
+
+def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"]) -> frozenset[str]:
+    """Return what touches at any time of a motion by C MuJoCo."""
+    model = scene.to_mujoco()
+    qpos, qvel, _, _ = _roll(model, tuple(np.asarray(x, float) for x in (state.qpos, state.qvel, state.act)), controls)
+    touches, touching, _ = _touches(model, qpos[None], qvel[None])
+    return frozenset([touch.pair for touch in touches]) | frozenset(touching)
+
+
+def _without_effect(
+    model: mujoco.MjModel,
+    start: tuple[np.ndarray, ...],
+    controls: np.ndarray,
+    changes: Iterator[tuple[str, np.ndarray]],
+) -> tuple[str, ...]:
+    """Name the changes under which a motion stays as it was; a change of the model lasts until the next one is asked for."""
+    usual, found = _roll(model, start, controls), []
+    for name, changed in changes:
+        other = _roll(model, start, changed)
+        if max(np.abs(other[i] - usual[i]).max(initial=0.0) for i in range(2)) < _SMALLEST_EFFECT:
+            found.append(name)
+    return tuple(found)
+
+
+def _actuators(model: mujoco.MjModel, controls: np.ndarray, half: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    for i, size in enumerate(half):
+        change = np.where(np.arange(model.nu) == i, (1 - _REACH) * size, 0.0)
+        yield element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i), controls + change
+
+
+def _parameters(model: mujoco.MjModel, controls: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Change the model in place: a tenth more mass of a body, a tenth more friction everywhere."""
+    kept = (model.body_mass.copy(), model.body_inertia.copy(), model.geom_friction.copy(), model.pair_friction.copy())
+    moving = np.flatnonzero((model.body_weldid > 0) & (model.body_mass > 0)).tolist()
+    for body in [*moving, None]:
+        if body is None:
+            model.geom_friction *= 1.1
+            model.pair_friction *= 1.1
+        else:
+            model.body_mass[body] *= 1.1
+            model.body_inertia[body] *= 1.1
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        yield "friction" if body is None else f"mass of {element_name(model, mujoco.mjtObj.mjOBJ_BODY, body)}", controls
+        model.body_mass[:], model.body_inertia[:], model.geom_friction[:], model.pair_friction[:] = kept
+    mujoco.mj_setConst(model, mujoco.MjData(model))

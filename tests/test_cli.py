@@ -1,0 +1,103 @@
+"""The command line: what it prints where, its exit codes, and what it writes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import cli
+
+ROOT = Path(__file__).parents[1]
+SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/><body pos="0 0 .2">
+  <joint name="z" type="slide" axis="0 0 1"/><geom size=".05" mass=".2"/></body></worldbody>
+  <actuator><motor name="push" joint="z" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    Path("scene.xml").write_text(SCENE.format(gear=1))
+    return "scene.xml"
+
+
+def test_check_prints_its_verdict_and_says_no_fault_by_its_exit_code(scene, capsys):
+    assert cli.main(["check", scene, "--quick"]) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("scene.xml: Differentiate it")
+    assert "First to touch" in said.err
+
+
+def test_json_is_all_that_is_on_standard_output(scene, capsys):
+    Path(scene).write_text(SCENE.format(gear=0))
+    assert cli.main(["check", scene, "--quick", "--json", "--html", "page.html"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert [one["kind"] for one in found["findings"] if one["is_fault"]] == ["no_effect"]
+    assert Path("page.html").read_text().startswith("<!DOCTYPE html>")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["check", "nowhere.xml"], "there is no file nowhere.xml"),
+        (["check", "refused.xml"], "MJX has no integrator 'implicit'"),
+        (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "must be module:function"),
+        (["chek"], 'Did you mean "check"'),
+        (["new", "scene.xml", "--output", "scene.xml"], "--force"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said):
+    Path("refused.xml").write_text(
+        SCENE.format(gear=1).replace("<worldbody>", '<option integrator="implicit"/><worldbody>')
+    )
+    assert cli.main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_an_interruption_ends_in_one_line(scene, capsys, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mg, "check", interrupted)
+    assert cli.main(["check", scene]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_new_writes_a_short_program(scene):
+    assert cli.main(["new", scene]) == 0
+    text = Path("task.py").read_text()
+    compile(text, "task.py", "exec")
+    assert len(text.splitlines()) <= 40
+    assert "'scene.xml'" in text
+
+
+def test_list_names_every_experiment(scene, capsys):
+    assert cli.main(["list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == sorted(path.stem for path in (ROOT / "experiments").glob("*.toml"))
+
+
+def test_without_a_checkout_experiments_are_one_sentence(scene, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(cli, "_checkout", lambda: tmp_path)
+    assert cli.main(["run", "ball_wall"]) == 2
+    assert "come with a checkout" in capsys.readouterr().err
+
+
+def test_importing_the_library_imports_no_command_line_and_no_pictures():
+    """Nor what only experiments need."""
+    heavy = ("cyclopts", "OpenGL", "gymnasium", "matplotlib", "mediapy")
+    code = f"import sys, mjxgrad; print([name for name in {heavy} if name in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert ran.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_a_new_program_moves_the_scene_and_films_it(scene):
+    assert cli.main(["new", scene]) == 0
+    ran = subprocess.run([sys.executable, "task.py"], capture_output=True, text=True, check=True)
+    _, reached, _, before = ran.stdout.splitlines()[-1].split()
+    assert float(reached) < float(before)
+    assert Path("task.mp4").stat().st_size > 1000

@@ -1,0 +1,228 @@
+"""Planted faults are named, and what is measured is what closed forms say."""
+
+import json
+import time
+from pathlib import Path
+
+import gymnasium
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.diagnostics.jumps import Jumps
+from mjxgrad.diagnostics.slope import compare_to_slope, phases
+from mjxgrad.verdict.check import count_pairs
+from mjxgrad.verdict.findings import measured_findings, slopes
+from mjxgrad.verdict.measure import Line, Measured, _estimates
+from mjxgrad.verdict.programs import change_of_poses
+
+BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></default><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1"/>
+  <body name="ball" pos="0 0 {height}"><joint name="z" type="slide" axis="0 0 1"/><geom name="ball" size=".05" mass=".2"/></body>
+</worldbody><actuator><motor name="push" joint="z" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+# A ball so small that between a hit and a miss lies nothing to be sampled; no gravity, so that its height is that of its start.
+WALL = """<mujoco><option timestep=".005" gravity="0 0 0"/><worldbody>
+  <geom name="wall" type="box" pos="1 0 1" size=".05 1 .1"/><body name="ball" pos=".2 0 1.08">
+  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom name="ball" size=".0002" mass=".2"/>
+  </body></worldbody><keyframe><key name="throw" qvel="3 0"/></keyframe></mujoco>"""
+
+
+def ball(timestep=0.002, height=0.3, gear=1, contact=""):
+    return BALL.format(timestep=timestep, height=height, gear=gear, contact=contact)
+
+
+def quick(source):
+    return mg.check(source, derivatives=False)
+
+
+def kinds(verdict):
+    return {fault.kind for fault in verdict.faults}
+
+
+def fault(verdict, kind):
+    (found,) = [one.text for one in verdict.faults if one.kind == kind]
+    return found
+
+
+@pytest.fixture(scope="module")
+def wall():
+    return mg.check(WALL, seconds=10)
+
+
+@pytest.fixture(scope="module")
+def bounce():
+    return mg.check(ball(), seconds=10)
+
+
+def test_a_sound_scene_has_no_fault():
+    assert not kinds(quick(ball()))
+
+
+@pytest.mark.parametrize(
+    ("contact", "longest"),
+    [
+        ('solref=".004 1"', 0.002),  # a time constant takes two steps at least, or refsafe replaces it
+        # h²k + 2hb = 4 with k = 4e4, b = 400: h = (−b + √(b² + 4k)) / k = 0.0041; the steepest impedance is taken, so less.
+        ('solref="-40000 -400"', 0.0042),
+    ],
+)
+def test_a_time_step_too_long_for_a_contact_is_named(contact, longest):
+    verdict = quick(ball(timestep=0.01, contact=contact))
+    assert "10 ms is too long for contact floor – ball" in fault(verdict, "time_step")
+    assert 0 < verdict.recommendation.timestep < longest
+    assert not kinds(quick(ball(timestep=verdict.recommendation.timestep, contact=contact)))
+
+
+def test_an_actuator_without_effect_is_named_and_no_other():
+    assert "actuator 'push'" in fault(quick(ball(gear=0)), "no_effect")
+    assert not kinds(quick(ball(gear=1)))
+
+
+def test_contact_that_never_touches_is_named():
+    """It falls for two seconds, 20 m."""
+    assert "floor – ball" in fault(quick(ball(height=40, gear=0.1)), "no_contact")
+
+
+def test_motions_that_leave_all_numbers_are_named():
+    """A spring of 1e7 N/m on 0.2 kg, integrated explicitly: h²k/m = 200, beyond 4."""
+    unstable = ball().replace('motor name="push" joint="z" gear="1"', 'position name="push" joint="z" kp="1e7"')
+    assert "not_finite" in kinds(quick(unstable))
+
+
+def test_the_first_touch_is_that_of_free_fall():
+    """From 0.25 m above the floor, √(2 d / g) and √(2 g d); a push of 1 N on 0.2 kg changes g by half at most."""
+    (touch,) = quick(ball(gear=1e-3)).motions.touches
+    np.testing.assert_allclose(touch.time, np.sqrt(2 * 0.25 / 9.81), atol=0.004)
+    np.testing.assert_allclose(touch.speed, np.sqrt(2 * 9.81 * 0.25), rtol=0.02)
+
+
+def test_scenes_with_too_many_pairs_are_refused_at_once_with_their_number():
+    """300 balls, 300 · 299 / 2 pairs; loading them takes a minute."""
+    one = "<body pos='{} 0 0'><freejoint/><geom size='.1'/></body>"
+    many = f"<mujoco><worldbody>{''.join(one.format(i) for i in range(300))}</worldbody></mujoco>"
+    started = time.monotonic()
+    with pytest.raises(ValueError, match=r"about 44850: .*contype"):
+        quick(many)
+    assert time.monotonic() - started < 5
+
+
+def test_pairs_are_counted_as_they_are_listed():
+    """By contype and conaffinity; geoms of one body never touch."""
+    geoms = "<geom size='.1'/><geom size='.1' contype='2' conaffinity='4'/>"
+    bodies = "".join(f"<body pos='{i} 0 0'><freejoint/>{geoms}</body>" for i in range(4))
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><geom size='.1'/>{bodies}</worldbody></mujoco>")
+    assert count_pairs(model) == len(contact_pairs(model)) == 10
+
+
+def test_all_sources_give_the_same_verdict():
+    text = ball()
+    spec, model = mujoco.MjSpec.from_string(text), mujoco.MjModel.from_xml_string(text)
+    sources = (text, spec, model, mg.load_scene(text))
+    assert len({quick(source).headline for source in sources}) == 1
+
+
+def test_hit_or_miss_is_named_with_its_pair(wall):
+    assert "ball – wall touches on one side" in fault(wall, "jump")
+    assert wall.recommendation.estimator == "alpha_order"
+
+
+@pytest.mark.slow
+def test_a_bounce_has_its_slope_with_an_onset_and_not_without(bounce):
+    """Contact begins with a jump, at an impedance of 0.9, which MuJoCo's derivative does not see."""
+    discrete, _, onset = slopes(bounce.measured)
+    assert discrete.share_off > onset.share_off
+    assert bounce.recommendation.onset
+    assert bounce.recommendation.estimator == "first_order"
+    assert "jump" not in kinds(bounce)
+
+
+def test_the_page_begins_with_the_answer_and_a_picture_and_needs_nothing_beside_it(wall):
+    text = wall.as_html()
+    assert text.index("<h1>") < text.index("<svg") < text.index("<ul>")
+    assert len(wall.headline.split()) <= 15
+    assert "http" not in text
+
+
+def test_json_holds_the_verdict(wall):
+    found = json.loads(wall.as_json())
+    assert found["headline"] == wall.headline
+    assert [one["kind"] for one in found["findings"] if one["is_fault"]] == ["jump"]
+    assert len(found["noise"]) == 4
+
+
+def test_sentences_are_short(wall):
+    sentences = [one for finding in wall.findings for one in finding.text.split(". ")]
+    assert max(len(one.split()) for one in sentences) <= 25
+
+
+def line_of(discrete, event, onset, growth=1.0):
+    """Outcomes that rise by 1 along a line at two times, and derivatives that are said to be theirs."""
+    places = phases((-1.0, 1.0), 64)
+    outcomes = np.repeat(places[:, None], 2, axis=1)[:, :, None]
+    filled = [np.broadcast_to(np.reshape(one, (-1, 1, 1)), outcomes.shape) for one in (discrete, event, onset)]
+    plain, smooth = (
+        compare_to_slope(places, outcomes, filled[:2]),
+        compare_to_slope(places, outcomes, filled[2:], ("onset",)),
+    )
+    none = Jumps(places, places, *[np.zeros(0)] * 3, steepest=1.0, scale=1.0, resolution=1e-3, num_finite=64)
+    line = Line("the reference pose", "the start", plain, smooth, none, (), growth * np.ones(2), 0, 0)
+    return Measured(np.array([0.05, 0.1]), 50, (line,), ())
+
+
+def test_a_derivative_that_is_off_or_too_scattered_to_tell_is_not_the_slope():
+    """The slope is 1; half of it is off, 1 ± 30 from 64 motions has an error of 4, and 1 is right."""
+    scattered = 1 + 30 * (-1.0) ** np.arange(64) * np.sqrt(np.arange(64) % 7)
+    discrete, event, onset = slopes(line_of(0.5, scattered, 1.0))
+    assert [one.num_off for one in (discrete, event, onset)] == [2, 2, 0]
+    np.testing.assert_allclose([discrete.error, onset.error], [0.5, 0], atol=1e-12)
+
+
+def test_an_exploding_derivative_is_named():
+    assert not [one for one in measured_findings(line_of(1.0, 1.0, 1.0, growth=900.0)) if one.kind == "explodes"]
+    (found,) = [one for one in measured_findings(line_of(1.0, 1.0, 1.0, growth=1100.0)) if one.kind == "explodes"]
+    assert found.is_fault
+    assert "within 0.05 s" in found.text
+
+
+def test_both_estimates_of_a_linear_cost_are_its_slope(key):
+    """Of f = 3 w: first order exactly, zeroth order within three of its own errors."""
+    noise = np.asarray(0.1 * jax.random.normal(key, (400, 1, 1)))
+    first, zeroth = _estimates(3 * noise, np.full_like(noise, 3.0), noise / 0.1**2)
+    np.testing.assert_allclose(first.value, 3.0, rtol=1e-12)
+    assert abs(float(zeroth.value.squeeze()) - 3) < 3 * float(zeroth.standard_error.squeeze())
+
+
+def test_a_change_of_orientation_is_half_the_turn_times_the_quaternion():
+    """At the identity dq/dx = (0, ω / 2)."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    change = change_of_poses(model, model.qpos0[None], np.array([1.0, 2, 3, 0.2, 0.4, 0.6]))[0]
+    np.testing.assert_allclose(change, [1, 2, 3, 0, 0.1, 0.2, 0.3], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_code_of_a_verdict_runs(bounce, tmp_path):
+    names = {}
+    (tmp_path / "scene.xml").write_text(ball())
+    code = bounce.code.replace("'scene.xml'", repr(str(tmp_path / "scene.xml")))
+    exec(compile(code, "verdict", "exec"), names)
+    assert np.isfinite(names["estimate"].value).all()
+
+
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+SEVEN = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid", "swimmer", "inverted_double_pendulum")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEVEN)
+def test_gymnasiums_scenes_get_a_verdict_without_a_false_alarm(name):
+    """All seven are in use: none has an idle actuator, a step too long or a motion that ends in NaN."""
+    verdict = mg.check(ASSETS / f"{name}.xml")
+    assert not kinds(verdict) & {"no_effect", "not_finite", "time_step", "no_contact"}
+    discrete, _, onset = slopes(verdict.measured)
+    assert onset.num_off <= discrete.num_off
