@@ -1,0 +1,237 @@
+r"""What was found, how surely, and what the recordings cannot tell.
+
+With residuals $r$ in units of the noise and $J = \partial r / \partial \theta$ at the end, $n$ numbers and $p$ unknowns,
+$s^2 = r^T r / (n - p)$ estimates how much larger the noise is than was said, and the covariance of the parameters is
+$s^2 (J^T J)^{-1}$. It holds where the model is right, the noise independent, and residuals almost linear over the interval. What
+a singular value decomposition of $J$ with columns of length 1 shows to be of no consequence has no interval: it is named.
+
+References:
+    Bates, Watts. Nonlinear Regression Analysis and Its Applications. Wiley 1988, chapters 2 and 3.
+"""
+
+import dataclasses
+import enum
+from pathlib import Path
+
+import jax
+import numpy as np
+import scipy.linalg
+import scipy.stats
+from jaxtyping import Float
+
+from mjxgrad.contact.warnings import format_number
+from mjxgrad.identification.parameters import Coordinates
+from mjxgrad.scene import Scene
+
+_LEVEL = 0.95
+_SMALL_PART = 0.05  # of a combination: what takes part in it with less is not named
+_NO_PART = 1e-4  # of a direction that is not determined: what has no more is determined all the same
+_NEAR_BOUND = 1e-4  # of the range
+
+
+class Stopped(enum.Enum):
+    """Why a search ended."""
+
+    CONVERGED = "converged"
+    STALLED = "stalled: by the derivative the residuals could still fall, but no step along it lowers them"
+    STEPS = "max_steps reached"
+
+
+@dataclasses.dataclass(frozen=True)
+class Statistics:
+    """What the residuals and their derivative at the end say; see `Identification` for the fields."""
+
+    covariance: Float[np.ndarray, "dim dim"]
+    half_width: Float[np.ndarray, " dim"]
+    condition_number: float
+    without_effect: tuple[str, ...]
+    inseparable: tuple[dict[str, float], ...]
+    removable: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Identification:
+    """Parameters from recorded motions.
+
+    Attributes:
+        values: by name.
+        start: the nominal values, by name.
+        half_width: of the 95 % intervals, by name; infinite for what the recordings do not determine.
+        covariance: of all numbers in the order of `names`; infinite on the diagonal where they are not determined.
+        names: of all numbers, `inertia[3]` for one of several.
+        condition_number: of J with columns of length 1. Beyond a hundred or so single intervals are much wider than combinations.
+        without_effect: names on which no measurement depends.
+        inseparable: combinations that no measurement can tell apart: each says by how much several numbers may change together,
+            relative to their values, without any effect.
+        at_bounds: names that ended at a bound: the data ask for more, and their intervals mean little.
+        rms: root mean square of the residuals in units of the noise, before and after; about 1 after if noise and model are right.
+        held_out_rms: the same of the recordings that were held out; None without any.
+        offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        num_numbers: measured numbers that took part.
+        num_steps: of the search.
+        stopped: why it ended.
+        scenes: with the values found.
+        coordinates: bounds and names, for saving.
+    """
+
+    values: dict[str, np.ndarray]
+    start: dict[str, np.ndarray]
+    half_width: dict[str, np.ndarray]
+    covariance: Float[np.ndarray, "dim dim"]
+    names: tuple[str, ...]
+    condition_number: float
+    without_effect: tuple[str, ...]
+    inseparable: tuple[dict[str, float], ...]
+    at_bounds: tuple[str, ...]
+    rms: tuple[float, float]
+    held_out_rms: tuple[float, float] | None
+    offsets: tuple[np.ndarray, ...] | None
+    num_numbers: int
+    num_steps: int
+    stopped: Stopped
+    scenes: tuple[Scene, ...]
+    coordinates: Coordinates
+    units: dict[str, str]
+
+    @property
+    def scene(self) -> Scene:
+        """The first, or only, scene, with the values found."""
+        return self.scenes[0]
+
+    def summary(self) -> str:
+        """Describe the result in text: the values with their intervals, then what to beware of."""
+        count = len(self.names)
+        head = f"{count} number{'s' * (count > 1)} from {self.num_numbers} measured ones in {self.num_steps} steps, {self.stopped.value}."
+        rms = f"Residuals, in units of the noise: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
+        if self.held_out_rms is not None:
+            rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
+        return "\n".join([head, f"{rms}.", "", *self._table(), *[f"\n{line}" for line in self._warnings()]])
+
+    def _table(self) -> list[str]:
+        units = {name: unit for name, unit in self.units.items()}
+        columns = [np.concatenate([np.ravel(part[k]) for k in self.values]) for part in (self.values, self.half_width, self.start)]
+        bounds = zip(np.asarray(self.coordinates.lower), np.asarray(self.coordinates.upper), strict=True)
+        rows = [("parameter", "found", "± 95 %", "start", "bounds")]
+        for name, found, half, start, (low, high) in zip(self.names, *columns, bounds, strict=True):
+            unit = units.get(name.split("[")[0], "")
+            shown = (_digits(found, half), f"{half:.2g}" if np.isfinite(half) else "unknown", format_number(start))
+            rows.append((f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}"))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+
+    def _warnings(self) -> list[str]:
+        found = []
+        if self.stopped is Stopped.STALLED:
+            found.append("The search stalled: take onset=mg.Onset(), shorter windows, or another start.")
+        if self.without_effect:
+            found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Measure more, or leave them out.")
+        for combination in self.inseparable:
+            changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())
+            found.append(f"Cannot be told apart: {', '.join(combination)}. {changes} changes nothing measured.")
+        if self.at_bounds:
+            found.append(f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it, or doubt the model.")
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write values and bounds as YAML, as a `ParameterDict` of `mujoco.sysid` is saved and loaded.
+
+        Args:
+            path: of the file.
+        """
+        lower, upper = (self.coordinates.unravel(np.asarray(x)) for x in (self.coordinates.lower, self.coordinates.upper))
+        lines = []
+        for name, value in self.values.items():
+            parts = {"nominal": self.start[name], "min_value": lower[name], "max_value": upper[name], "value": value}
+            lines += [f"{name}:", f"  name: {name}", "  frozen: false"]
+            lines += [f"  {key}: [{', '.join(map(_yaml, np.ravel(x).tolist()))}]" for key, x in parts.items()]
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def statistics(
+    coordinates: Coordinates,
+    values: Float[np.ndarray, " dim"],
+    residual: Float[np.ndarray, " numbers"],
+    slope: Float[np.ndarray, "numbers dim"],
+    num_numbers: int,
+    num_offsets: int,
+) -> Statistics:
+    """Return intervals and what the recordings cannot tell.
+
+    Args:
+        coordinates: names and bounds.
+        values: at the end.
+        residual: there, in units of the noise.
+        slope: its derivative by the values, what starts explain taken out.
+        num_numbers: of residuals that are measurements.
+        num_offsets: unknowns beside the parameters.
+    """
+    rounding = float(np.finfo(np.asarray(coordinates.nominal).dtype).eps)
+    lengths = np.linalg.norm(slope, axis=0)
+    width = np.asarray(coordinates.upper - coordinates.lower, float)
+    effects = lengths * np.where(np.isfinite(width), width, np.maximum(np.abs(values), 1.0))
+    is_felt = effects > np.sqrt(rounding) * effects.max(initial=0.0)
+    left, sizes, right = np.linalg.svd(slope[:, is_felt] / lengths[is_felt], full_matrices=False)
+    is_clear = sizes > max(1e-4, rounding**0.4) * sizes.max(initial=0.0)
+    blurred = right[~is_clear]
+    spread = np.where(is_clear, 1 / np.where(sizes > 0, sizes, 1.0), 0.0)[:, None] * right / lengths[is_felt]
+    freedom = max(num_numbers - num_offsets - int(is_clear.sum()), 1)
+    variance = residual @ residual / freedom
+    covariance = np.full((len(values), len(values)), np.nan)
+    covariance[np.ix_(is_felt, is_felt)] = variance * spread.T @ spread
+    lost = ~is_felt
+    lost[np.flatnonzero(is_felt)[(blurred**2).sum(axis=0) > _NO_PART**2]] = True
+    covariance[lost], covariance[:, lost] = np.nan, np.nan
+    covariance[lost, lost] = np.inf
+    half_width = scipy.stats.t.ppf((1 + _LEVEL) / 2, freedom) * np.sqrt(np.diag(covariance))
+    explained = np.linalg.norm(left[:, is_clear].T @ residual) ** 2
+    return Statistics(
+        covariance,
+        half_width,
+        float(sizes[0] / sizes[-1]) if sizes.size and sizes[-1] > 0 else np.inf,
+        tuple(name for name, felt in zip(coordinates.names, is_felt, strict=True) if not felt),
+        _combinations(blurred / lengths[is_felt], values[is_felt], np.array(coordinates.names)[is_felt]),
+        float(explained / max(residual @ residual, np.finfo(float).tiny)),
+    )
+
+
+def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:
+    """Return directions without effect as relative changes, each of as few numbers as possible, the first by one per cent."""
+    if not len(blurred):
+        return ()
+    relative = blurred / np.where(values != 0, np.abs(values), 1.0)
+    _, _, order = scipy.linalg.qr(relative, mode="economic", pivoting=True)
+    relative = np.linalg.solve(relative[:, order[: len(blurred)]], relative)
+    found = []
+    for row in relative:
+        parts = np.flatnonzero(np.abs(row) > _SMALL_PART * np.abs(row).max())
+        found.append({str(names[i]): float(0.01 * row[i] / row[parts[0]]) for i in parts})
+    return tuple(found)
+
+
+def at_bounds(coordinates: Coordinates, values: Float[np.ndarray, " dim"]) -> tuple[str, ...]:
+    """Return the names of numbers that lie at a bound."""
+    lower, upper = np.asarray(coordinates.lower, float), np.asarray(coordinates.upper, float)
+    width = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.abs(values), 1.0))
+    is_near = np.minimum(values - lower, upper - values) < _NEAR_BOUND * width
+    return tuple(name for name, near in zip(coordinates.names, is_near, strict=True) if near)
+
+
+def _digits(value: float, half_width: float) -> str:
+    """Return a value to the second digit of its interval."""
+    if not (np.isfinite(half_width) and half_width > 0 and value):
+        return format_number(value)
+    digits = int(np.clip(np.ceil(np.log10(abs(value) / half_width)) + 2, 2, 9))
+    return f"{value:.{digits}g}"
+
+
+def _yaml(number: float) -> str:
+    """Return a number as YAML 1.1 reads it: with a point, also before an exponent."""
+    if not np.isfinite(number):
+        return ".inf" if number > 0 else "-.inf"
+    mantissa, exponent, power = repr(float(number)).partition("e")
+    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power
+
+
+def on_host(tree):
+    """Return arrays of numpy in double precision."""
+    return jax.tree.map(lambda x: np.asarray(x, float), tree)
