@@ -15,6 +15,7 @@ from mjxgrad.identification.parameters import (
 from mjxgrad.identification.recording import Recording
 from mjxgrad.identification.result import Identification, Stopped
 from mjxgrad.identification.search import identify
+from mjxgrad.identification.sequences import identify_sequences
 
 __all__ = [
     "Identification",
@@ -28,6 +29,7 @@ __all__ = [
     "gains",
     "gear",
     "identify",
+    "identify_sequences",
     "inertia",
     "mass",
     "softness",

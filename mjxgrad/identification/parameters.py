@@ -91,7 +91,9 @@ class Coordinates(eqx.Module):
             for part in ("nominal", "lower", "upper")
         ]
         names = [
-            name + "".join(f"[{i}]" for i in place) for name, p in parameters.items() for place in np.ndindex(p.nominal.shape)
+            name + "".join(f"[{i}]" for i in place if p.nominal.size > 1)
+            for name, p in parameters.items()
+            for place in np.ndindex(p.nominal.shape)
         ]
         return cls(*columns, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items()))
 

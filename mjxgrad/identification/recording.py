@@ -157,9 +157,8 @@ def _window(
         columns = scene.model.nv if name == "qpos" else width
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
-        if name == "qpos":  # compared as a whole: a quaternion without one of its numbers is none
-            is_there = np.repeat(is_there.all(axis=1, keepdims=True), columns, axis=1)
-            value = np.where(is_there[:, :1], value, np.asarray(scene.data.qpos))
+        if name == "qpos":  # a quaternion without one of its numbers is none
+            value, is_there = np.where(is_there, value, np.asarray(scene.data.qpos)), _joints_there(scene.model, is_there)
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
@@ -170,6 +169,13 @@ def _window(
         measured=measured,
         weight=weight,
     )
+
+
+def _joints_there(model: mjx.Model, is_there: np.ndarray) -> np.ndarray:
+    """Return for each velocity whether all coordinates of its joint were measured."""
+    joint_of = np.searchsorted(model.jnt_qposadr, np.arange(model.nq), side="right") - 1
+    of_joint = np.stack([is_there[:, joint_of == joint].all(axis=1) for joint in range(model.njnt)], axis=1)
+    return of_joint[:, model.dof_jntid]
 
 
 def _width(scene: Scene, name: str) -> int:

@@ -33,7 +33,7 @@ class Stopped(enum.Enum):
     """Why a search ended."""
 
     CONVERGED = "converged"
-    STALLED = "stalled: by the derivative the residuals could still fall, but no step along it lowers them"
+    STALLED = "stalled"
     STEPS = "max_steps reached"
 
 
@@ -67,6 +67,8 @@ class Identification:
         rms: root mean square of the residuals in units of the noise, before and after; about 1 after if noise and model are right.
         held_out_rms: the same of the recordings that were held out; None without any.
         offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        removable: share of the sum of squares that the derivative at the end says could still be removed. About 0 at a minimum of
+            a smooth motion.
         num_numbers: measured numbers that took part.
         num_steps: of the search.
         stopped: why it ended.
@@ -86,6 +88,7 @@ class Identification:
     rms: tuple[float, float]
     held_out_rms: tuple[float, float] | None
     offsets: tuple[np.ndarray, ...] | None
+    removable: float
     num_numbers: int
     num_steps: int
     stopped: Stopped
@@ -122,7 +125,10 @@ class Identification:
     def _warnings(self) -> list[str]:
         found = []
         if self.stopped is Stopped.STALLED:
-            found.append("The search stalled: take onset=mg.Onset(), shorter windows, or another start.")
+            found.append(
+                f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step along it helps. "
+                "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start, and doubt the intervals."
+            )
         if self.without_effect:
             found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Measure more, or leave them out.")
         for combination in self.inseparable:

@@ -27,7 +27,7 @@ from mjxgrad.scene import Scene
 Apply = Callable[[Scene, Values], Scene]
 Log = Callable[[int, dict[str, float]], None]
 _MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
-_STALLED = 1e-3  # of the sum of squares, that the linear model would remove at the end
+_STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
 _VANISHED = 1e-6  # of the residuals at the start: what is left is rounding
 # Residuals are scaled so that optimistix's first damping, 1, is a thousandth of what the derivative has in its directions.
 _FIRST_SIZE = 30.0
@@ -150,6 +150,7 @@ def search(
         rms=(first, float(after / np.sqrt(numbers))),
         held_out_rms=program.held_out_rms(nominal, values),
         offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
+        removable=verdict.removable,
         num_numbers=numbers,
         num_steps=num_steps,
         stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if ended else Stopped.STEPS,
