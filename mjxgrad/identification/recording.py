@@ -103,11 +103,11 @@ class Windows(eqx.Module):
     """
 
     state: State
-    controls: Float[Array, "windows steps nu"]
-    index: Int[Array, "windows rows"]
-    share: Float[Array, "windows rows"]
-    measured: dict[str, Float[Array, "windows rows _"]]
-    weight: dict[str, Float[Array, "windows rows _"]]
+    controls: Float[Array, "*windows steps nu"]
+    index: Int[Array, "*windows rows"]
+    share: Float[Array, "*windows rows"]
+    measured: dict[str, Float[Array, "*windows rows _"]]
+    weight: dict[str, Float[Array, "*windows rows _"]]
 
 
 def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:

@@ -204,7 +204,7 @@ def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) ->
     """Return directions without effect as relative changes, each of as few numbers as possible, the first by one per cent."""
     if not len(blurred):
         return ()
-    relative = blurred / np.where(values != 0, np.abs(values), 1.0)
+    relative = blurred / np.where(values != 0, values, 1.0)
     _, _, order = scipy.linalg.qr(relative, mode="economic", pivoting=True)
     relative = np.linalg.solve(relative[:, order[: len(blurred)]], relative)
     found = []

@@ -8,6 +8,7 @@ point and chooses the next.
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -234,7 +235,7 @@ class _Program:
         count = sum(int((np.asarray(w) > 0).sum()) for _, one in judged for w in one.weight.values())
         dtype = self.coordinates.nominal.dtype
         found = [of_all(jnp.asarray(p, dtype), [one.prepare(p) for one, _ in judged]) for p in points]
-        first, last = (float(x) / np.sqrt(count) for x in found)
+        first, last = (float(x) / math.sqrt(count) for x in found)
         return first, last
 
 
@@ -249,7 +250,7 @@ def _descend(program: _Program, max_steps: int, log: Log | None):
     length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
     if not np.isfinite(length):
         raise DivergedError("the nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
-    first, size = length / np.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
+    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     linear = _linear_model(program, found, point, size)
