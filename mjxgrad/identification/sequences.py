@@ -173,7 +173,7 @@ class _CompiledFields:
                 slopes.setdefault(name, []).append((above[name] - below[name]) / (ends[1] - ends[0]))
         return {name: (value, np.stack(slopes[name], axis=-1)) for name, value in self._numbers(vector).items()}
 
-    def put(self, scene: Scene, vector: Array, numbers: dict[str, tuple[Array, Array]]) -> Scene:
+    def put(self, scene: Scene, vector: Array, numbers: dict[str, Any]) -> Scene:
         """Return the scene with numbers whose values and derivatives by the parameters are these."""
         change = vector - jax.lax.stop_gradient(vector)  # zero, but for its derivative
         dtype = vector.dtype
