@@ -267,7 +267,9 @@ def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
     names = [mjx.id2name(model, kind, index) for index in range(getattr(model, count))]
     if name not in names:
         listed = ", ".join(repr(one) for one in names if one) or "none"
-        raise ValueError(f"there is no {word} {name!r}; named {'bodies' if word == 'body' else f'{word}s'} are {listed}")
+        raise ValueError(
+            f"there is no {word} {name!r}; named {'bodies' if word == 'body' else f'{word}s'} are {listed}"
+        )
     return names.index(name)
 
 

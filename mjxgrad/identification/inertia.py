@@ -6,8 +6,8 @@ every body that can exist,
 $$J = \begin{pmatrix} \Sigma & h \\ h^T & m \end{pmatrix} = U U^T, \qquad U = e^{\alpha} \begin{pmatrix} e^{d_1} & s_{12} &
 s_{13} & t_1 \\ & e^{d_2} & s_{23} & t_2 \\ & & e^{d_3} & t_3 \\ & & & 1 \end{pmatrix}.$$
 
-The ten numbers are $(\alpha, d_1, d_2, d_3, s_{12}, s_{23}, s_{13}, t_1, t_2, t_3)$, as in `mujoco.sysid`: $m = e^{2 \alpha}$, and
-$t$ is the centre of mass.
+The ten numbers are $(\alpha, d_1, d_2, d_3, s_{12}, s_{23}, s_{13}, t_1, t_2, t_3)$, as in `mujoco.sysid`. The mass is
+$e^{2 \alpha}$, and $t$ the centre of mass.
 
 MuJoCo keeps principal moments and their axes. Where two moments are equal the axes have no derivative, though the tensor has one.
 The moments are therefore kept apart by a share of $\sqrt\epsilon$, to which the motion is blind.
@@ -61,7 +61,12 @@ def pseudo_inertia(numbers: Float[Array, "10"]) -> Float[Array, "4 4"]:
     """Return the pseudo-inertia of ten numbers (kg, kg m, kg m²)."""
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = numbers
     zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
-    rows = [[jnp.exp(d1), s12, s13, t1], [zero, jnp.exp(d2), s23, t2], [zero, zero, jnp.exp(d3), t3], [zero, zero, zero, one]]
+    rows = [
+        [jnp.exp(d1), s12, s13, t1],
+        [zero, jnp.exp(d2), s23, t2],
+        [zero, zero, jnp.exp(d3), t3],
+        [zero, zero, zero, one],
+    ]
     root = jnp.exp(alpha) * jnp.array(rows)
     return root @ root.T
 

@@ -1,9 +1,9 @@
 r"""What is to be found: named numbers between bounds, and what each of them changes in a model.
 
 A search among numbers without bounds is simpler than one that must stop at them. A parameter between two bounds is therefore
-$\theta = m + h \sin u$, with the middle $m$ and half width $h$: smooth, onto the bounds themselves, and without the flat ends of
-a sigmoid. With one bound it is $\theta = l + s (\sqrt{1 + u^2} - 1)$, with none $\theta = \theta_0 + s u$. Derivatives and intervals
-are those by $\theta$, not by $u$.
+$\theta = m + h \sin u$, with the middle $m$ and half width $h$: smooth, onto the bounds themselves, and without the flat ends
+of a sigmoid. With one bound it is $\theta = l + s (\sqrt{1 + u^2} - 1)$, with none $\theta = \theta_0 + s u$. Derivatives and
+intervals are those by $\theta$, not by $u$.
 
 References:
     James, Roos. Minuit: a system for function minimization and analysis of the parameter errors and correlations. Computer
@@ -43,8 +43,8 @@ class Parameter:
         nominal: where the search begins, in the parameter's unit.
         lower: least value; minus infinity for none.
         upper: greatest value; infinity for none.
-        write: from a model and a value to the changed fields, `{"dof_damping": ...}`. What MuJoCo derives from them follows, as in
-            `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
+        write: from a model and a value to the changed fields, `{"dof_damping": ...}`. What MuJoCo derives from them follows, as
+            in `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
         unit: for reports.
     """
 
@@ -86,7 +86,7 @@ class Coordinates(eqx.Module):
         """Return those of named parameters; refuse none."""
         if not parameters:
             raise ValueError("parameters must name at least one parameter, got none")
-        columns = [
+        nominal, lower, upper = [
             jnp.asarray(np.concatenate([getattr(p, part).ravel() for p in parameters.values()]))
             for part in ("nominal", "lower", "upper")
         ]
@@ -95,7 +95,9 @@ class Coordinates(eqx.Module):
             for name, p in parameters.items()
             for place in np.ndindex(p.nominal.shape)
         ]
-        return cls(*columns, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items()))
+        return cls(
+            nominal, lower, upper, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items())
+        )
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""
@@ -169,7 +171,11 @@ def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) 
 
 
 def friction(
-    scene: Scene, *, pairs: tuple[tuple[str, str], ...] | None = None, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any
+    scene: Scene,
+    *,
+    pairs: tuple[tuple[str, str], ...] | None = None,
+    bounds: tuple[float, float] = (0.0, 2.0),
+    **subset: Any,
 ) -> Parameter:
     """Return the sliding friction of contacts, one for all that are named; it is written to all geoms that decide it.
 
@@ -287,6 +293,8 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
     nominal = np.asarray(nominal, float)
     if bounds is None:
         if not (nominal > 0).all():
-            raise ValueError(f"bounds of {name} must be given where the model's is not positive, got {nominal.tolist()}")
+            raise ValueError(
+                f"bounds of {name} must be given where the model's is not positive, got {nominal.tolist()}"
+            )
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)

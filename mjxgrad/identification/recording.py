@@ -30,7 +30,8 @@ class Recording:
         control_times: of the controls, which are then interpolated linearly (s); None for one row for each time step.
         noise: standard deviation of each signal in its own unit, one number or one for each column, those of "qpos" being one for
             each velocity (m, rad). Signals without one have 1. Their ratios weigh the signals; the overall size is estimated.
-        start: the state at time 0; None for the first row of "qpos" and "qvel" where that is at time 0, else the scene's pose, at rest.
+        start: the state at time 0; None for the first row of "qpos" and "qvel" where that is at time 0, else the scene's pose, at
+            rest.
         name: for messages.
     """
 
@@ -47,11 +48,15 @@ class Recording:
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
         if len(lengths) != 1:
-            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}")
+            raise ValueError(
+                f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
+            )
         for name in ("times", "control_times"):
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {np.asarray(value).tolist()}")
+                raise ValueError(
+                    f"{name} of {self.name} must increase from 0 or later, got {np.asarray(value).tolist()}"
+                )
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
 
@@ -83,10 +88,15 @@ class Recording:
             later = {} if controls is None else {"controls": controls, "control_times": at - times[rows[0]]}
             if controls is not None:
                 kept = later["control_times"] > -timestep / 2
-                later = {"controls": np.asarray(controls)[kept], "control_times": np.maximum(later["control_times"][kept], 0)}
+                later = {
+                    "controls": np.asarray(controls)[kept],
+                    "control_times": np.maximum(later["control_times"][kept], 0),
+                }
             measured = {name: value[rows] for name, value in self.measured.items()}
             name = f"{self.name} from {times[rows[0]]:g} s"
-            windows.append(Recording(measured, times=times[rows] - times[rows[0]], noise=self.noise, name=name, **later))
+            windows.append(
+                Recording(measured, times=times[rows] - times[rows[0]], noise=self.noise, name=name, **later)
+            )
         return windows
 
 
@@ -153,12 +163,17 @@ def _window(
         width = _width(scene, name)
         value = recording.measured.get(name, np.full((len(times), width), np.nan))
         if value.shape[1] != width:
-            raise ValueError(f"{name} of {recording.name} must have {width} columns in this scene, got {value.shape[1]}")
+            raise ValueError(
+                f"{name} of {recording.name} must have {width} columns in this scene, got {value.shape[1]}"
+            )
         columns = scene.model.nv if name == "qpos" else width
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
         if name == "qpos":  # a quaternion without one of its numbers is none
-            value, is_there = np.where(is_there, value, np.asarray(scene.data.qpos)), _joints_there(scene.model, is_there)
+            value, is_there = (
+                np.where(is_there, value, np.asarray(scene.data.qpos)),
+                _joints_there(scene.model, is_there),
+            )
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
@@ -245,9 +260,9 @@ def residuals(
     for name, measured in window.measured.items():
         before, after = found[name][window.index], found[name][window.index + 1]
         simulated = before + window.share[:, None] * (after - before)
-        if name == "qpos":
-            change = jax.vmap(position_change, (None, 0, 0))(model, measured, simulated)
-        else:
-            change = simulated - measured
+        is_pose = name == "qpos"
+        change = (
+            jax.vmap(position_change, (None, 0, 0))(model, measured, simulated) if is_pose else simulated - measured
+        )
         parts.append((change * window.weight[name]).ravel())
     return jnp.concatenate(parts), course.diverged

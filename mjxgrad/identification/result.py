@@ -64,7 +64,7 @@ class Identification:
         inseparable: combinations that no measurement can tell apart: each says by how much several numbers may change together,
             relative to their values, without any effect.
         at_bounds: names that ended at a bound: the data ask for more, and their intervals mean little.
-        rms: root mean square of the residuals in units of the noise, before and after; about 1 after if noise and model are right.
+        rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         held_out_rms: the same of the recordings that were held out; None without any.
         offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
         removable: share of the sum of squares that the derivative at the end says could still be removed. About 0 at a minimum of
@@ -74,6 +74,7 @@ class Identification:
         stopped: why it ended.
         scenes: with the values found.
         coordinates: bounds and names, for saving.
+        units: by name.
     """
 
     values: dict[str, np.ndarray]
@@ -104,21 +105,31 @@ class Identification:
     def summary(self) -> str:
         """Describe the result in text: the values with their intervals, then what to beware of."""
         count = len(self.names)
-        head = f"{count} number{'s' * (count > 1)} from {self.num_numbers} measured ones in {self.num_steps} steps, {self.stopped.value}."
+        head = f"{count} number{'s' * (count > 1)} from {self.num_numbers} measured ones in {self.num_steps} steps"
         rms = f"Residuals, in units of the noise: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
         if self.held_out_rms is not None:
             rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
-        return "\n".join([head, f"{rms}.", "", *self._table(), *[f"\n{line}" for line in self._warnings()]])
+        return "\n".join(
+            [
+                f"{head}, {self.stopped.value}.",
+                f"{rms}.",
+                "",
+                *self._table(),
+                *[f"\n{line}" for line in self._warnings()],
+            ]
+        )
 
     def _table(self) -> list[str]:
-        units = {name: unit for name, unit in self.units.items()}
-        columns = [np.concatenate([np.ravel(part[k]) for k in self.values]) for part in (self.values, self.half_width, self.start)]
+        parts = (self.values, self.half_width, self.start)
+        columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
         bounds = zip(np.asarray(self.coordinates.lower), np.asarray(self.coordinates.upper), strict=True)
         rows = [("parameter", "found", "± 95 %", "start", "bounds")]
         for name, found, half, start, (low, high) in zip(self.names, *columns, bounds, strict=True):
-            unit = units.get(name.split("[")[0], "")
+            unit = self.units.get(name.split("[")[0], "")
             shown = (_digits(found, half), f"{half:.2g}" if np.isfinite(half) else "unknown", format_number(start))
-            rows.append((f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}"))
+            rows.append(
+                (f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}")
+            )
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
@@ -126,16 +137,18 @@ class Identification:
         found = []
         if self.stopped is Stopped.STALLED:
             found.append(
-                f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step along it helps. "
-                "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start, and doubt the intervals."
+                f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step helps. "
+                "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
         if self.without_effect:
-            found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Measure more, or leave them out.")
+            found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Leave them out.")
         for combination in self.inseparable:
             changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())
             found.append(f"Cannot be told apart: {', '.join(combination)}. {changes} changes nothing measured.")
         if self.at_bounds:
-            found.append(f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it, or doubt the model.")
+            found.append(
+                f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it, or doubt the model."
+            )
         return found
 
     def save(self, path: str | Path) -> None:
@@ -144,7 +157,9 @@ class Identification:
         Args:
             path: of the file.
         """
-        lower, upper = (self.coordinates.unravel(np.asarray(x)) for x in (self.coordinates.lower, self.coordinates.upper))
+        lower, upper = (
+            self.coordinates.unravel(np.asarray(x)) for x in (self.coordinates.lower, self.coordinates.upper)
+        )
         lines = []
         for name, value in self.values.items():
             parts = {"nominal": self.start[name], "min_value": lower[name], "max_value": upper[name], "value": value}
@@ -205,7 +220,7 @@ def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) ->
     if not len(blurred):
         return ()
     relative = blurred / np.where(values != 0, values, 1.0)
-    _, _, order = scipy.linalg.qr(relative, mode="economic", pivoting=True)
+    *_, order = scipy.linalg.qr(relative, mode="economic", pivoting=True)
     relative = np.linalg.solve(relative[:, order[: len(blurred)]], relative)
     found = []
     for row in relative:

@@ -29,7 +29,7 @@ Apply = Callable[[Scene, Values], Scene]
 Log = Callable[[int, dict[str, float]], None]
 _MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
 _STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
-_VANISHED = 1e-6  # of the residuals at the start: what is left is rounding
+_VANISHED = 1e3  # roundings of the residuals at the start: what is left is no more
 # Residuals are scaled so that optimistix's first damping, 1, is a thousandth of what the derivative has in its directions.
 _FIRST_SIZE = 30.0
 _NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
@@ -100,7 +100,9 @@ def identify(
     groups = [recordings] if isinstance(scene, Scene) else list(recordings)
     others = ([held_out] if isinstance(scene, Scene) else list(held_out)) or [()] * len(scenes)
     if not len(scenes) == len(groups) == len(others) or not all(groups):
-        raise ValueError(f"recordings must hold at least one for each of {len(scenes)} scenes, got {[len(g) for g in groups]}")
+        raise ValueError(
+            f"recordings must hold at least one for each of {len(scenes)} scenes, got {[len(g) for g in groups]}"
+        )
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     coordinates = Coordinates.of(parameters)
@@ -136,7 +138,8 @@ def search(
     residual, slope, num_offsets = _without_offsets(explained)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
-    stalls = not np.isfinite(verdict.removable) or (verdict.removable > _STALLED and after > _VANISHED * before)
+    rounding = _VANISHED * float(jnp.finfo(point.dtype).eps)
+    stalls = verdict.removable > _STALLED and after > max(rounding, 1e-6) * before
     nominal = np.asarray(coordinates.nominal, float)
     return Identification(
         values=coordinates.unravel(values),
@@ -164,14 +167,18 @@ def search(
 class _Program:
     """Residuals and their derivatives by values and offsets, compiled once."""
 
-    def __init__(self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings):
+    def __init__(
+        self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
+    ):
         self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
         self._delay, self._settings = delay, settings
         self.windows = [stack(one.scene, one.recordings) for one in experiments]
         self.num_numbers = sum(int((np.asarray(w) > 0).sum()) for one in self.windows for w in one.weight.values())
         self._evaluate = jax.jit(self._traced)
 
-    def _residuals(self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree) -> Array:
+    def _residuals(
+        self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
+    ) -> Array:
         scene = experiment.apply(experiment.scene, vector, prepared)
         delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
         residual, diverged = residuals(scene, window, offset, delay, **self._settings)
@@ -249,7 +256,9 @@ def _descend(program: _Program, max_steps: int, log: Log | None):
     found = program(point)
     length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
     if not np.isfinite(length):
-        raise DivergedError("the nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
+        raise DivergedError(
+            "the nominal values must give motions that stay finite, got one that diverged: begin elsewhere"
+        )
     first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
@@ -289,10 +298,14 @@ def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
     along = axes.T @ (columns.T @ residual)
     is_clear = sizes > jnp.sqrt(jnp.finfo(sizes.dtype).eps) * jnp.max(sizes)
     total = jnp.sum(residual**2)
-    return jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0)) / jnp.where(total > 0, total, 1.0)
+    return jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0)) / jnp.where(
+        total > 0, total, 1.0
+    )
 
 
-def _linear_model(program: _Program, found: list[tuple[Array, ...]], point: Array, size: float) -> tuple[Array, Array, Array]:
+def _linear_model(
+    program: _Program, found: list[tuple[Array, ...]], point: Array, size: float
+) -> tuple[Array, Array, Array]:
     """Return a point, the residuals there in units of those at the start, and their derivative by the point."""
     count = len(program.coordinates.names)
     _, rate = jax.jvp(program.coordinates.values, (point[:count],), (jnp.ones(count, point.dtype),))
@@ -307,7 +320,7 @@ def _linear_model(program: _Program, found: list[tuple[Array, ...]], point: Arra
 def _without_offsets(found: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, int]:
     """Return residuals, their derivative by the values orthogonal to what offsets do, and how many offsets that takes."""
     parts, count = [], 0
-    for residual, slope, *of_offset in found:
+    for _, slope, *of_offset in found:
         for i, one in enumerate(slope):
             if of_offset:
                 left, sizes, _ = np.linalg.svd(of_offset[0][i], full_matrices=False)

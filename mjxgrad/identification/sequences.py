@@ -30,8 +30,10 @@ from mjxgrad.identification.search import Experiment, Log, search
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.scene.scene import numbers_of
 
+_Column = tuple[np.ndarray, np.ndarray, bool]
 Build = Callable[[Any, mujoco.MjSpec], mujoco.MjModel]
 _BODY = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+_STATE_KINDS = {"MjStateQPos": "qpos", "MjStateQVel": "qvel", "MjStateAct": "act"}
 _STEP = 6e-6  # of the range: the cube root of double precision, for central differences
 # What the compiler notes of a model and a simulation in JAX does not read.
 _NOT_READ = ("sameframe", "simple", "signature", "plugin")
@@ -44,7 +46,6 @@ def identify_sequences(
     build_model: Build | None = None,
     sensor_weights: dict[str, float] | None = None,
     held_out: Sequence[str] = (),
-    delay: None = None,
     free_start: bool = False,
     onset: Onset | None = Onset(),  # noqa: B008, a constant
     gradient: Gradient = "discrete",
@@ -63,7 +64,6 @@ def identify_sequences(
         build_model: from parameters and a spec to a C model; None applies the parameters' modifiers and compiles.
         sensor_weights: by name of a sensor.
         held_out: names of sequences that are only judged by.
-        delay: there is none.
         free_start: as of `identify`.
         onset: as of `identify`; None for the same motion as `mujoco.sysid`'s.
         gradient: as of `identify`.
@@ -80,8 +80,11 @@ def identify_sequences(
     """
     free = {name: p for name, p in parameters.items() if not p.frozen}
     coordinates = Coordinates.of({name: Parameter(p.value, p.min_value, p.max_value) for name, p in free.items()})
-    experiments = [_experiment(parameters, one, coordinates, build_model or _build, sensor_weights or {}, held_out) for one in sequences]
-    settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
+    experiments = [
+        _experiment(parameters, one, coordinates, build_model or _build, sensor_weights or {}, held_out)
+        for one in sequences
+    ]
+    settings = {"delay": None, "free_start": free_start, "onset": onset, "gradient": gradient}
     result = search(experiments, coordinates, {}, max_steps=max_steps, log=log, **settings)
     found = parameters.copy()
     found.update_from_vector(np.concatenate([np.ravel(value) for value in result.values.values()]))
@@ -96,7 +99,12 @@ def _build(parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _experiment(
-    parameters: Any, sequence: Any, coordinates: Coordinates, build: Build, weights: dict[str, float], held_out: Sequence[str]
+    parameters: Any,
+    sequence: Any,
+    coordinates: Coordinates,
+    build: Build,
+    weights: dict[str, float],
+    held_out: Sequence[str],
 ) -> Experiment:
     fields = _CompiledFields(parameters, sequence.spec, coordinates, build)
     # Not that of the start, where a damping of zero would be left out for good.
@@ -132,9 +140,14 @@ class _CompiledFields:
     def choose(self, scene: Scene) -> None:
         """Note which numbers of a scene the parameters change."""
         derived = jax.eval_shape(lambda: constants_of(scene.model)).keys()
-        pairs = {name: (_read(self._first, name), _read(self.inside, name)) for name in numbers_of(scene.model)}
-        changed = [name for name, (one, other) in pairs.items() if one is not None and not np.array_equal(one, other)]
-        moved = [(pairs[name][0] != pairs[name][1]).reshape(len(scene.model.body_mass), -1) for name in _BODY if name in changed]
+        shared = [name for name in numbers_of(scene.model) if _has(self._first, name)]
+        pairs = {name: (_read(self._first, name), _read(self.inside, name)) for name in shared}
+        changed = [name for name, (one, other) in pairs.items() if not np.array_equal(one, other)]
+        moved = [
+            (pairs[name][0] != pairs[name][1]).reshape(len(scene.model.body_mass), -1)
+            for name in _BODY
+            if name in changed
+        ]
         if moved:
             self._bodies = np.flatnonzero(np.concatenate(moved, axis=1).any(axis=1))
         self._names = [name for name in changed if name not in (*_BODY, *derived)]
@@ -152,7 +165,9 @@ class _CompiledFields:
             if before.shape != after.shape or not (is_number or np.array_equal(before, after)):
                 found.append(name)
         if found:
-            raise ValueError(f"parameters must change numbers alone, got one that changes {', '.join(found)}; freeze it")
+            raise ValueError(
+                f"parameters must change numbers alone, got one that changes {', '.join(found)}; freeze it"
+            )
 
     def _numbers(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         model = self._compile(vector)
@@ -164,7 +179,9 @@ class _CompiledFields:
 
     def at(self, vector: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return each number and its derivative by the parameters, the last axis."""
-        width = np.where(np.isfinite(self._upper - self._lower), self._upper - self._lower, np.maximum(np.abs(vector), 1.0))
+        width = np.where(
+            np.isfinite(self._upper - self._lower), self._upper - self._lower, np.maximum(np.abs(vector), 1.0)
+        )
         slopes: dict[str, list] = {}
         for i, step in enumerate(_STEP * width):
             ends = np.clip(vector[i] + np.array([-step, step]), self._lower[i], self._upper[i])
@@ -182,16 +199,18 @@ class _CompiledFields:
         if pseudo is not None:
             for name, part in jax.vmap(body_fields)(pseudo).items():
                 found[name] = getattr(scene.model, name).at[self._bodies].set(part)
-        options = {name: found.pop(name) for name in list(found) if name.startswith("opt.")}
+        options: dict[str, Any] = {name: found.pop(name) for name in list(found) if name.startswith("opt.")}
         changed = scene.with_model(**found) if found else scene
         return eqx.tree_at(lambda s: s.model, changed, changed.model.tree_replace(options)) if options else changed
 
 
-def _read(model: mujoco.MjModel, name: str) -> np.ndarray | None:
-    """Return a number of a C model by the name that it has in MJX's; None if it has none."""
-    is_option = name.startswith("opt.")
-    value = getattr(model.opt if is_option else model, name.removeprefix("opt."), None)
-    return None if value is None else np.asarray(value)
+def _has(model: mujoco.MjModel, name: str) -> bool:
+    """Return whether a C model has what MJX's calls by this name."""
+    return hasattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."))
+
+
+def _read(model: mujoco.MjModel, name: str) -> np.ndarray:
+    return np.asarray(getattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt.")))
 
 
 def _recordings(scene: Scene, name: str, rollout: Any, weights: dict[str, float]) -> list[Recording]:
@@ -203,7 +222,9 @@ def _recordings(scene: Scene, name: str, rollout: Any, weights: dict[str, float]
     control, measured = rollout.control, rollout.sensordata
     num_steps = int(np.ceil((control.times[-1] - control.times[0]) / timestep - 1e-9))
     at = control.times[0] + timestep * np.arange(num_steps)
-    controls = np.column_stack([np.interp(at, control.times, column) for column in control.data.T] or [np.zeros((num_steps, 0))])
+    controls = np.column_stack(
+        [np.interp(at, control.times, column) for column in control.data.T] or [np.zeros((num_steps, 0))]
+    )
     times = measured.times - data.time
     rows = (times > timestep * (1 - 1e-6)) & (times < timestep * (num_steps + 1e-6))
     columns = _columns(scene, model, measured, rows)
@@ -218,12 +239,11 @@ def _recordings(scene: Scene, name: str, rollout: Any, weights: dict[str, float]
     return found
 
 
-def _columns(scene: Scene, model: mujoco.MjModel, measured: Any, rows: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray, bool]]:
+def _columns(scene: Scene, model: mujoco.MjModel, measured: Any, rows: np.ndarray) -> dict[str, _Column]:
     """Return values and sizes of each signal, states as columns of the whole, and whether it is a sensor."""
     if measured.signal_mapping is None:
         raise ValueError("sensordata must say what its columns are, got no mapping: make it by TimeSeries.from_names")
-    found: dict[str, tuple[np.ndarray, np.ndarray, bool]] = {}
-    kinds = {"MjStateQPos": ("qpos", model.nq), "MjStateQVel": ("qvel", model.nv), "MjStateAct": ("act", model.na)}
+    found: dict[str, _Column] = {}
     for name, (kind, place) in measured.signal_mapping.items():
         value = measured.data[rows][:, place]
         size = np.linalg.norm(value, axis=0) / np.sqrt(2)
@@ -231,20 +251,25 @@ def _columns(scene: Scene, model: mujoco.MjModel, measured: Any, rows: np.ndarra
         size = np.where(size > 0, size, 1.0)
         if kind.name == "MjSensor":
             found[name] = (value, size, True)
-        elif kind.name in kinds:
-            key, width = kinds[kind.name]
-            columns, dofs = _state_columns(model, name, kind.name, key)
-            whole, sizes, _ = found.get(key, (np.full((len(value), width), np.nan), np.ones(model.nv if key == "qpos" else width), 0))
-            whole[:, columns] = value
-            # A component of a quaternion changes by half the angle.
-            sizes[dofs] = size if len(dofs) == len(size) else np.append(size[:3], np.full(3, 2 * np.sqrt((size[3:] ** 2).mean())))
-            found[key] = (whole, sizes, False)
-        else:
-            raise ValueError(f"{name} must be a sensor, qpos, qvel or act, got {kind.name}: leave it out of the TimeSeries")
+            continue
+        if kind.name not in _STATE_KINDS:
+            raise ValueError(
+                f"{name} must be a sensor, qpos, qvel or act, got {kind.name}: leave it out of the TimeSeries"
+            )
+        key = _STATE_KINDS[kind.name]
+        columns, dofs = _state_columns(model, name, key)
+        width = getattr(scene.data, key).shape[0]
+        nothing = (np.full((len(value), width), np.nan), np.ones(model.nv if key == "qpos" else width), False)
+        whole, sizes, _ = found.setdefault(key, nothing)
+        whole[:, columns] = value
+        if len(dofs) < len(size):  # a quaternion's components change by half the angle
+            turn = 2 * np.sqrt((size[-4:] ** 2).mean())
+            size = np.append(size[:-4], np.full(3, turn))
+        sizes[dofs] = size
     return found
 
 
-def _state_columns(model: mujoco.MjModel, name: str, kind: str, key: str) -> tuple[np.ndarray, np.ndarray]:
+def _state_columns(model: mujoco.MjModel, name: str, key: str) -> tuple[np.ndarray, np.ndarray]:
     """Return where a joint's, free body's or actuator's part of a state is, and which velocities it is compared as."""
     base = name.removesuffix(f"_{key}")
     if key == "act":
@@ -256,4 +281,4 @@ def _state_columns(model: mujoco.MjModel, name: str, kind: str, key: str) -> tup
         joint = model.body_jntadr[model.body(base).id]
     dofs = np.flatnonzero(model.dof_jntid == joint)
     last = model.jnt_qposadr[joint + 1] if joint + 1 < model.njnt else model.nq
-    return (dofs if kind == "MjStateQVel" else np.arange(model.jnt_qposadr[joint], last)), dofs
+    return (dofs if key == "qvel" else np.arange(model.jnt_qposadr[joint], last)), dofs

@@ -18,7 +18,7 @@ _DRIVE = 2 * np.sin(np.arange(_STEPS) / 5)
 
 
 def _course(gear=3.0, mass=2.0, x=0.0, v=0.0, drive=_DRIVE):
-    """Semi-implicit Euler of a cart without damping, $v \\gets v + h\\,g u / m$, $x \\gets x + h v$."""
+    """Semi-implicit Euler of a cart without damping: v changes by h·g·u/m, then x by h·v."""
     speeds = v + np.concatenate([[0], np.cumsum(_STEP * gear * drive / mass)])
     return x + np.concatenate([[0], np.cumsum(_STEP * speeds[1:])])
 
@@ -35,13 +35,20 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     course = np.interp(times, _STEP * np.arange(_STEPS + 1), _course(gear=1.0))
     measured = 3.3 * course + 0.01 * rng.normal(size=25)
     recording = Recording({"place": measured}, _DRIVE[:, None], times, noise={"place": 0.02})
-    held_out = Recording({"qvel": np.full(3, np.nan), "place": 3.3 * course[:3] + 0.06}, _DRIVE[:, None], times[:3], noise={"place": 0.02})
+    held_out = Recording(
+        {"qvel": np.full(3, np.nan), "place": 3.3 * course[:3] + 0.06},
+        _DRIVE[:, None],
+        times[:3],
+        noise={"place": 0.02},
+    )
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], held_out=[held_out])
     expected = course @ measured / (course @ course)
     spread = np.sqrt(((measured - expected * course) ** 2).sum() / 24 / (course @ course))
     assert result.stopped is Stopped.CONVERGED
     np.testing.assert_allclose(result.values["gear"], expected, rtol=1e-6)
-    np.testing.assert_allclose(result.half_width["gear"], 2.063899 * spread, rtol=1e-5)  # Student's 97.5 % at 24 degrees
+    np.testing.assert_allclose(
+        result.half_width["gear"], 2.063899 * spread, rtol=1e-5
+    )  # Student's 97.5 % at 24 degrees
     np.testing.assert_allclose(result.rms[1], np.sqrt(((measured - expected * course) ** 2).mean()) / 0.02, rtol=1e-6)
     left = (expected * course[:3] - 3.3 * course[:3] - 0.06) / 0.02
     np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-6)
@@ -119,10 +126,10 @@ def test_through_a_bounce_the_search_converges_with_an_onset_and_stalls_without(
 
 
 def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_angle():
-    """A tumbling body: no residual in any window of its own motion, and that of a turn by 0.02 rad where one is measured so."""
-    scene = mg.load_scene("""<mujoco><option timestep="0.01"/><worldbody><body><freejoint/><geom type="box" size=".1 .2 .3"/></body>
-        <body pos="1 0 0"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1"/></body></worldbody>
-        <actuator><motor joint="x"/></actuator></mujoco>""")
+    """A tumbling body: no residual in any window of its own motion; where a turn by 0.02 rad is measured, that turn."""
+    scene = mg.load_scene("""<mujoco><option timestep="0.01"/><worldbody>
+        <body><freejoint/><geom type="box" size=".1 .2 .3"/></body><body pos="1 0 0"><joint name="x" type="slide" axis="1 0 0"/>
+        <geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>""")
     controls = np.cos(np.arange(30) / 4)[:, None]
     start = mg.initial_state(scene, qvel=jnp.array([1.0, 0, 2, 3, -2, 1, 0.5]))
     course = jax.jit(lambda: mg.rollout(scene, start, controls))()
@@ -130,7 +137,12 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     qpos[20:, 3:7] *= -1  # the same turn
     turned = qpos.copy()
     w, x, y, z = qpos[25, 3:7]
-    turned[25, 3:7] = [w - 0.01 * x, x + 0.01 * w, y + 0.01 * z, z - 0.01 * y]  # q ⊗ (1, 0.01, 0, 0): 0.02 rad about its own x
+    turned[25, 3:7] = [
+        w - 0.01 * x,
+        x + 0.01 * w,
+        y + 0.01 * z,
+        z - 0.01 * y,
+    ]  # q ⊗ (1, 0.01, 0, 0): 0.02 rad about its own x
     noise = {"qpos": [1, 1, 1, 0.5, 0.5, 0.5, 1]}
     whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
     windows = stack(scene, whole.cut(0.08, 0.01))
@@ -143,9 +155,11 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
 
 
 @pytest.mark.slow
-def test_intervals_of_whole_searches_cover_as_often_as_they_say(cart):
-    """60 recordings of a damped cart with noise, three parameters: 171 of 180 expected, within three standard errors."""
-    scene = mg.load_scene(_CART.format("").replace('axis="1 0 0"', 'axis="1 0 0" damping="4" armature=".1"'), keep_everything=True)
+def test_intervals_of_whole_searches_cover_as_often_as_they_say():
+    """60 recordings of a damped cart with noise, two parameters: 114 of 120 expected, within three standard errors."""
+    scene = mg.load_scene(
+        _CART.format("").replace('axis="1 0 0"', 'axis="1 0 0" damping="4" armature=".1"'), keep_everything=True
+    )
     truth = mg.rollout(scene, mg.initial_state(scene), _DRIVE[:, None], onset=mg.Onset()).qpos
     parameters = {
         "gear": identification.gear(scene, "motor"),
@@ -162,16 +176,37 @@ def test_intervals_of_whole_searches_cover_as_often_as_they_say(cart):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda cart: Recording({"place": np.zeros(3)}, times=[0, 1]), "measured and times of the recording must have the same number"),
+        (
+            lambda cart: Recording({"place": np.zeros(3)}, times=[0, 1]),
+            "measured and times of the recording must have the same number",
+        ),
         (lambda cart: Recording({"place": np.zeros(2)}, times=[1, 0]), "times of the recording must increase"),
-        (lambda cart: Recording({"place": np.zeros(2)}, noise={"palce": 1}), "noise of the recording must name measured signals"),
+        (
+            lambda cart: Recording({"place": np.zeros(2)}, noise={"palce": 1}),
+            "noise of the recording must name measured signals",
+        ),
         (lambda cart: Recording({"place": np.zeros(9)}).cut(0.1, 0.01), "must have measured qpos and qvel to be cut"),
-        (lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)))]), "controls of the recording must have a row for each of 4"),
-        (lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((9, 2)))]), "must have 1 columns in this scene"),
-        (lambda cart: stack(cart, [Recording({"qvel": np.zeros((5, 2))})]), "qvel of the recording must have 1 columns"),
-        (lambda cart: stack(cart, [Recording({"speed": np.zeros(5)})]), "there is no sensor 'speed'; named sensors are 'place'"),
+        (
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)))]),
+            "controls of the recording must have a row for each of 4",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((9, 2)))]),
+            "must have 1 columns in this scene",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"qvel": np.zeros((5, 2))})]),
+            "qvel of the recording must have 1 columns",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"speed": np.zeros(5)})]),
+            "there is no sensor 'speed'; named sensors are 'place'",
+        ),
         (lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, []), "recordings must hold at least one"),
-        (lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})], delay="b"), "delay must name one"),
+        (
+            lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})], delay="b"),
+            "delay must name one",
+        ),
     ],
 )
 def test_refusals_name_the_remedy(cart, build, message):

@@ -14,9 +14,10 @@ from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 _SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1" friction=".4"/>
   <body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0" damping="2" armature=".3"/>
     <geom name="rod" type="capsule" fromto="0 0 0 0 0 .4" size=".03" mass=".5"/>
-    <body name="ball" pos="0 0 .4"><joint name="slide" type="slide" axis="0 0 1" damping="1"/><geom name="ball" size=".1" mass="2"/>
-    </body></body></worldbody>
-  <actuator><motor name="motor" joint="hinge" gear="3"/><position name="servo" joint="slide" kp="50" kv="4"/></actuator></mujoco>"""
+    <body name="ball" pos="0 0 .4"><joint name="slide" type="slide" axis="0 0 1" damping="1"/>
+      <geom name="ball" size=".1" mass="2"/></body></body></worldbody>
+  <actuator><motor name="motor" joint="hinge" gear="3"/>
+    <position name="servo" joint="slide" kp="50" kv="4"/></actuator></mujoco>"""
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def _random_body(seed):
 
 
 def test_a_pseudo_inertia_comes_back_from_its_ten_numbers_and_from_mujocos_fields():
-    """Second moments of twelve points of mass: $\\sum m_i (x_i, 1) (x_i, 1)^T$ by definition."""
+    """Second moments of twelve points of mass, by definition."""
     pseudo, points, weights = _random_body(0)
     numbers = logarithms(pseudo)
     np.testing.assert_allclose(pseudo_inertia(jnp.asarray(numbers)), pseudo, rtol=1e-12)
@@ -125,7 +126,9 @@ def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
     parameter = identification.inertia(scene, "ball")
     changed = write_all(scene, {"ball": parameter}, {"ball": jnp.asarray(parameter.nominal)})
     for name in ("body_mass", "body_ipos", "body_inertia", "dof_M0"):
-        np.testing.assert_allclose(getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
+        )
 
 
 @pytest.mark.parametrize(
@@ -135,8 +138,14 @@ def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
         (lambda scene: Parameter([1.0, 2.0], [0.0, 0.0, 0.0]), "lower must be one number or of shape"),
         (lambda scene: Parameter(np.nan), "nominal must be finite"),
         (lambda scene: identification.armature(scene, "slide"), "bounds of armature must be given"),
-        (lambda scene: identification.mass(scene, "leg"), "there is no body 'leg'; named bodies are 'world', 'arm', 'ball'"),
-        (lambda scene: identification.softness(scene, "hardness"), "part must be one of stiffness, damping_ratio, width"),
+        (
+            lambda scene: identification.mass(scene, "leg"),
+            "there is no body 'leg'; named bodies are 'world', 'arm', 'ball'",
+        ),
+        (
+            lambda scene: identification.softness(scene, "hardness"),
+            "part must be one of stiffness, damping_ratio, width",
+        ),
         (lambda scene: Coordinates.of({}), "parameters must name at least one"),
     ],
 )

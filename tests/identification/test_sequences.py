@@ -17,8 +17,10 @@ if not hasattr(sysid, "optimize"):
     pytest.skip("mujoco[sysid] is not installed", allow_module_level=True)
 
 _ARM = """<mujoco><option timestep=".004"><flag contact="disable"/></option><worldbody>
-  <body name="upper"><joint name="shoulder" axis="0 1 0" damping=".3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".04" mass="1"/>
-    <body name="lower" pos=".3 0 0"><joint name="elbow" axis="0 1 0"/><geom name="lower" type="box" size=".1 .03 .02" pos=".1 0 0" mass=".5"/>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" damping=".3"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".04" mass="1"/>
+    <body name="lower" pos=".3 0 0"><joint name="elbow" axis="0 1 0"/>
+      <geom name="lower" type="box" size=".1 .03 .02" pos=".1 0 0" mass=".5"/>
     </body></body></worldbody>
   <actuator><motor name="motor" joint="shoulder"/></actuator>
   <sensor><jointpos name="shoulder" joint="shoulder"/><jointvel name="speed" joint="elbow"/></sensor></mujoco>"""
@@ -71,7 +73,9 @@ def test_the_answer_and_its_intervals_are_those_of_mujoco_sysid(tmp_path):
     _, half_width = sysid.calculate_intervals(left, theirs.jac)
     np.testing.assert_allclose(found.as_vector(), expected.as_vector(), atol=0.01 * half_width.min())
     np.testing.assert_allclose(np.concatenate(list(result.half_width.values())), half_width, rtol=1e-3)
-    np.testing.assert_allclose(result.rms[1] * np.sqrt(result.num_numbers), np.sqrt(sum((r**2).sum() for r in left)), rtol=1e-6)
+    np.testing.assert_allclose(
+        result.rms[1] * np.sqrt(result.num_numbers), np.sqrt(sum((r**2).sum() for r in left)), rtol=1e-6
+    )
     np.testing.assert_array_equal(parameters["damping"].value, 0.0)
     result.save(tmp_path / "found.yaml")
     loaded = sysid.ParameterDict.load_from_disk(tmp_path / "found.yaml")
