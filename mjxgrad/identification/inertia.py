@@ -82,7 +82,7 @@ def logarithms(pseudo: np.ndarray) -> np.ndarray:
     return np.array([np.log(root[3, 3]), *np.log(np.diag(unit)[:3]), *shears, *unit[:3, 3]])
 
 
-def second_moments(mass: float, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def second_moments(mass: float | np.ndarray, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the pseudo-inertia of MuJoCo's fields of a body: mass, ipos, inertia and iquat."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, axes)

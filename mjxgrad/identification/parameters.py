@@ -1,15 +1,4 @@
-r"""What is to be found: named numbers between bounds, and what each of them changes in a model.
-
-A search among numbers without bounds is simpler than one that must stop at them. A parameter between two bounds is therefore
-$\theta = m + h \sin u$, with the middle $m$ and half width $h$: smooth, onto the bounds themselves, and without the flat ends
-of a sigmoid. With one bound it is $\theta = l + s (\sqrt{1 + u^2} - 1)$, with none $\theta = \theta_0 + s u$. Derivatives and
-intervals are those by $\theta$, not by $u$.
-
-References:
-    James, Roos. Minuit: a system for function minimization and analysis of the parameter errors and correlations. Computer
-    Physics Communications 10, 1975, which takes the same maps.
-    Rucker, Wensing. Smooth parameterization of rigid-body inertia. IEEE Robotics and Automation Letters 7(2), 2022.
-"""
+"""What is to be found: named numbers between bounds, and what each of them changes in a model."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
@@ -32,7 +21,7 @@ Write = Callable[[mjx.Model, Array], dict[str, Array]]
 Values = dict[str, Array]
 _Object = mujoco.mjtObj
 _FACTOR = 10.0  # a positive number is looked for between a tenth and ten times what the model has
-_INSIDE = 0.01  # a start on a bound has no derivative: it is moved in by this share of the range
+_AT_BOUND = 1e-6  # of the range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +58,7 @@ class Parameter:
 
 
 class Coordinates(eqx.Module):
-    """All parameters as one vector, and the map onto it from numbers without bounds.
+    """All parameters as one vector, and points of the search, in which each is measured by its range.
 
     Attributes:
         names: one for each number, `mass` or `inertia[3]`.
@@ -108,34 +97,26 @@ class Coordinates(eqx.Module):
             start += size
         return found
 
-    def _scale(self) -> Float[Array, " dim"]:
-        """Return how far a parameter that lacks a bound moves with its coordinate."""
+    @property
+    def scale(self) -> Float[Array, " dim"]:
+        """Unit of each number in the search: its range, or the way to its only bound, or its size."""
         above, below = self.nominal - self.lower, self.upper - self.nominal
         reach = jnp.where(jnp.isfinite(above), above, jnp.where(jnp.isfinite(below), below, jnp.abs(self.nominal)))
-        return jnp.where(reach > 0, reach, 1.0)
+        width = self.upper - self.lower
+        return jnp.where(jnp.isfinite(width), width, jnp.where(reach > 0, reach, 1.0))
 
     def values(self, free: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """Return the parameters that belong to numbers without bounds."""
-        has_lower, has_upper, scale = jnp.isfinite(self.lower), jnp.isfinite(self.upper), self._scale()
-        lower, upper = jnp.where(has_lower, self.lower, 0.0), jnp.where(has_upper, self.upper, 0.0)
-        rise = scale * (jnp.sqrt(1 + free**2) - 1)
-        one_sided = jnp.where(has_lower, lower + rise, upper - rise)
-        within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.sin(free)
-        without = self.nominal + scale * free
-        return jnp.where(has_lower & has_upper, within, jnp.where(has_lower | has_upper, one_sided, without))
+        """Return the numbers at a point of the search, which begins at zero; beyond a bound it means the bound."""
+        return jnp.clip(self.nominal + self.scale * free, self.lower, self.upper)
 
-    def start(self) -> Float[Array, " dim"]:
-        """Return the numbers without bounds that belong to the nominal values."""
-        lower, upper, scale = (np.asarray(x) for x in (self.lower, self.upper, self._scale()))
-        nominal = np.asarray(self.nominal)
-        is_between = np.isfinite(lower) & np.isfinite(upper)
-        width = np.where(is_between, upper - lower, 1.0)
-        share = np.clip(np.where(is_between, (nominal - lower) / width, 0.5), _INSIDE, 1 - _INSIDE)
-        gap = np.where(np.isfinite(lower), nominal - lower, upper - nominal)
-        one_sided = np.sqrt((1 + np.maximum(np.where(np.isfinite(gap), gap, 0.0), _INSIDE * scale) / scale) ** 2 - 1)
-        has_one = np.isfinite(lower) ^ np.isfinite(upper)
-        free = np.where(is_between, np.arcsin(2 * share - 1), np.where(has_one, one_sided, 0.0))
-        return jnp.asarray(free, self.nominal.dtype)
+    def box(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+        """Return the bounds of points of the search."""
+        return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
+
+    def is_at_bound(self, values: Float[ArrayLike, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
+        """Return which numbers are at their lower, and which at their upper bound, to rounding."""
+        near = _AT_BOUND * self.scale
+        return values - self.lower < near, self.upper - values < near
 
 
 def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:

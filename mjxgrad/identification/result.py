@@ -25,8 +25,8 @@ from mjxgrad.scene import Scene
 
 _LEVEL = 0.95
 _SMALL_PART = 0.05  # of a combination: what takes part in it with less is not named
+_NOT_TOLD_APART = 1e-6  # of the clearest direction: the data would have to be a million times better along this one
 _NO_PART = 1e-4  # of a direction that is not determined: what has no more is determined all the same
-_NEAR_BOUND = 1e-4  # of the range
 
 
 class Stopped(enum.Enum):
@@ -46,7 +46,6 @@ class Statistics:
     condition_number: float
     without_effect: tuple[str, ...]
     inseparable: tuple[dict[str, float], ...]
-    removable: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +66,8 @@ class Identification:
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         held_out_rms: the same of the recordings that were held out; None without any.
         offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
-        removable: share of the sum of squares that the derivative at the end says could still be removed. About 0 at a minimum of
-            a smooth motion.
+        removable: share of the sum of squares that the derivative at the end could still remove within the bounds. About 0
+            at a minimum of a smooth motion.
         num_numbers: measured numbers that took part.
         num_steps: of the search.
         stopped: why it ended.
@@ -191,8 +190,8 @@ def statistics(
     width = np.asarray(coordinates.upper - coordinates.lower, float)
     effects = lengths * np.where(np.isfinite(width), width, np.maximum(np.abs(values), 1.0))
     is_felt = effects > np.sqrt(rounding) * effects.max(initial=0.0)
-    left, sizes, right = np.linalg.svd(slope[:, is_felt] / lengths[is_felt], full_matrices=False)
-    is_clear = sizes > max(1e-4, rounding**0.4) * sizes.max(initial=0.0)
+    _, sizes, right = np.linalg.svd(slope[:, is_felt] / lengths[is_felt], full_matrices=False)
+    is_clear = sizes > max(_NOT_TOLD_APART, rounding**0.4) * sizes.max(initial=0.0)
     blurred = right[~is_clear]
     spread = np.where(is_clear, 1 / np.where(sizes > 0, sizes, 1.0), 0.0)[:, None] * right / lengths[is_felt]
     freedom = max(num_numbers - num_offsets - int(is_clear.sum()), 1)
@@ -204,14 +203,12 @@ def statistics(
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     half_width = scipy.stats.t.ppf((1 + _LEVEL) / 2, freedom) * np.sqrt(np.diag(covariance))
-    explained = np.linalg.norm(left[:, is_clear].T @ residual) ** 2
     return Statistics(
         covariance,
         half_width,
         float(sizes[0] / sizes[-1]) if sizes.size and sizes[-1] > 0 else np.inf,
         tuple(name for name, felt in zip(coordinates.names, is_felt, strict=True) if not felt),
         _combinations(blurred / lengths[is_felt], values[is_felt], np.array(coordinates.names)[is_felt]),
-        float(explained / max(residual @ residual, np.finfo(float).tiny)),
     )
 
 
@@ -227,14 +224,6 @@ def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) ->
         parts = np.flatnonzero(np.abs(row) > _SMALL_PART * np.abs(row).max())
         found.append({str(names[i]): float(0.01 * row[i] / row[parts[0]]) for i in parts})
     return tuple(found)
-
-
-def at_bounds(coordinates: Coordinates, values: Float[np.ndarray, " dim"]) -> tuple[str, ...]:
-    """Return the names of numbers that lie at a bound."""
-    lower, upper = np.asarray(coordinates.lower, float), np.asarray(coordinates.upper, float)
-    width = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.abs(values), 1.0))
-    is_near = np.minimum(values - lower, upper - values) < _NEAR_BOUND * width
-    return tuple(name for name, near in zip(coordinates.names, is_near, strict=True) if near)
 
 
 def _digits(value: float, half_width: float) -> str:

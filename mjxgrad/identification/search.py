@@ -22,7 +22,7 @@ from mjxgrad._rollout import DivergedError
 from mjxgrad.dynamics import Gradient, Onset
 from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
-from mjxgrad.identification.result import Identification, Stopped, at_bounds, on_host, statistics
+from mjxgrad.identification.result import Identification, Stopped, on_host, statistics
 from mjxgrad.scene import Scene
 
 Apply = Callable[[Scene, Values], Scene]
@@ -30,9 +30,12 @@ Log = Callable[[int, dict[str, float]], None]
 _MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
 _STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
 _VANISHED = 1e3  # roundings of the residuals at the start: what is left is no more
-# Residuals are scaled so that optimistix's first damping, 1, is a thousandth of what the derivative has in its directions.
-_FIRST_SIZE = 30.0
-_NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
+# Residuals are scaled so that optimistix's first damping, 1, is a hundred-thousandth of what the derivative has.
+_FIRST_SIZE = 300.0
+_GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
+# Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
+_TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_NEAR_ENOUGH = 1e-2  # of a standard error: no step that is left would be longer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,15 +135,16 @@ def search(
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     program = _Program(experiments, coordinates, free_start, **settings)
-    point, found, num_steps, ended, first = _descend(program, max_steps, log)
+    point, found, num_steps, ended, first, removable = _descend(program, max_steps, log)
     values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
     numbers, explained = program.num_numbers, on_host(found)
     residual, slope, num_offsets = _without_offsets(explained)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
     rounding = _VANISHED * float(jnp.finfo(point.dtype).eps)
-    stalls = verdict.removable > _STALLED and after > max(rounding, 1e-6) * before
+    stalls = removable > _STALLED and after > max(rounding, 1e-6) * before
     nominal = np.asarray(coordinates.nominal, float)
+    is_at_bound = np.logical_or(*coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype)))
     return Identification(
         values=coordinates.unravel(values),
         start=coordinates.unravel(nominal),
@@ -150,11 +154,11 @@ def search(
         condition_number=verdict.condition_number,
         without_effect=verdict.without_effect,
         inseparable=verdict.inseparable,
-        at_bounds=at_bounds(coordinates, values),
+        at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(first, float(after / np.sqrt(numbers))),
         held_out_rms=program.held_out_rms(nominal, values),
         offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
-        removable=verdict.removable,
+        removable=removable,
         num_numbers=numbers,
         num_steps=num_steps,
         stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if ended else Stopped.STEPS,
@@ -206,10 +210,17 @@ class _Program:
         return self._evaluate(vector, self.offsets(point), prepared)
 
     def start(self) -> Array:
-        """Return the point of the nominal values, without offsets."""
+        """Return the point of the nominal values, without offsets: zero."""
         sizes = [len(w.controls) * 2 * e.scene.model.nv for w, e in zip(self.windows, self.experiments, strict=True)]
-        free = self.coordinates.start()
-        return jnp.concatenate([free, jnp.zeros(sum(sizes) if self.free_start else 0, free.dtype)])
+        return jnp.zeros(
+            len(self.coordinates.names) + (sum(sizes) if self.free_start else 0), self.coordinates.nominal.dtype
+        )
+
+    def box(self) -> tuple[Array, Array]:
+        """Return the bounds of a point; offsets have none."""
+        free = jnp.full(len(self.start()) - len(self.coordinates.names), jnp.inf)
+        lower, upper = self.coordinates.box()
+        return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
     def offsets(self, point: Array) -> list[Array]:
         """Return the part of a point that moves the starts, one array for each experiment."""
@@ -247,39 +258,50 @@ class _Program:
 
 
 def _descend(program: _Program, max_steps: int, log: Log | None):
-    """Return the best point, residuals and derivatives there, steps, whether it ended by itself, and the rms at the start."""
+    """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
+    point, (lower, upper) = program.start(), program.box()
+    found = best = program(point)
+    length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
+    if not np.isfinite(length):
+        reason = "got one that diverged: begin elsewhere"
+        raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
+    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
+    linear = _linear_model(program, found, point, size)
+    state, step = _levenberg_marquardt(point, linear)
+    refusals, slow, removable, total = 0, 0, 1.0, math.inf
+    for count in range(1, max_steps + 1):
+        point, state, _ = step(point, state, linear)
+        is_accepted = int(state.num_steps_since_acceptance) == 0
+        if is_accepted:
+            fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
+            slow = slow + 1 if fell * program.num_numbers < _TOO_LITTLE * total else 0
+            best, refusals, removable = found, 0, float(_removable(linear))
+        else:
+            refusals += 1
+        if log is not None:
+            rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
+            log(count, {"rms": rms, "is_accepted": float(is_accepted)})
+        is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
+        if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
+            return point, best, count, True, first, removable
+        state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
+        found = program(state.y_eval)
+        linear = _linear_model(program, found, state.y_eval, size)
+    return point, best, max_steps, False, first, removable
+
+
+def _levenberg_marquardt(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
+    """Return optimistix's state at the start and its step, which sees linear models alone."""
     try:
         optimistix: Any = importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
-    point = program.start()
-    found = program(point)
-    length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
-    if not np.isfinite(length):
-        raise DivergedError(
-            "the nominal values must give motions that stay finite, got one that diverged: begin elsewhere"
-        )
-    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    linear = _linear_model(program, found, point, size)
+    solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
     struct = jax.eval_shape(lambda: linear[1])
     state = solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
-    step = eqx.filter_jit(lambda y, state, linear: solver.step(_predict, y, linear, {}, state, frozenset()))
-    best, refusals = found, 0
-    for count in range(1, max_steps + 1):
-        point, state, _ = step(point, state, linear)
-        is_accepted = int(state.num_steps_since_acceptance) == 0
-        best, refusals = (found, 0) if is_accepted else (best, refusals + 1)
-        if log is not None:
-            rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
-            log(count, {"rms": rms, "is_accepted": float(is_accepted)})
-        is_near = is_accepted and float(_removable(linear)) * program.num_numbers < _NEAR_ENOUGH**2
-        if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS:
-            return point, best, count, True, first
-        found = program(state.y_eval)
-        linear = _linear_model(program, found, state.y_eval, size)
-    return point, best, max_steps, False, first
+    return state, eqx.filter_jit(lambda y, state, linear: solver.step(_predict, y, linear, {}, state, frozenset()))
 
 
 def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:
@@ -308,9 +330,13 @@ def _linear_model(
 ) -> tuple[Array, Array, Array]:
     """Return a point, the residuals there in units of those at the start, and their derivative by the point."""
     count = len(program.coordinates.names)
-    _, rate = jax.jvp(program.coordinates.values, (point[:count],), (jnp.ones(count, point.dtype),))
     residual = jnp.concatenate([one[0].ravel() for one in found]) / size
-    slope = jnp.concatenate([one[1].reshape(-1, count) for one in found]) * rate / size
+    slope = jnp.concatenate([one[1].reshape(-1, count) for one in found]) / size
+    # A number at a bound that the residuals push against stays there; the others go their way without it.
+    lower, upper = (part[:count] for part in program.box())
+    pull = residual @ slope
+    is_held = ((point[:count] <= lower) & (pull > 0)) | ((point[:count] >= upper) & (pull < 0))
+    slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
     if program.free_start:
         blocks = jax.scipy.linalg.block_diag(*(window for one in found for window in one[2])) / size
         slope = jnp.concatenate([slope, blocks], axis=1)
