@@ -53,6 +53,10 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     left = (expected * course[:3] - 3.3 * course[:3] - 0.06) / 0.02
     np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-6)
     assert "gear" in result.summary()
+    bounded = mg.identify(cart, {"gear": identification.gear(cart, "motor", bounds=(1.0, 3.1))}, [recording])
+    np.testing.assert_allclose(bounded.values["gear"], 3.1)
+    assert bounded.at_bounds == ("gear",)
+    assert bounded.stopped is Stopped.CONVERGED
 
 
 def test_mass_and_gear_are_told_apart_by_a_known_load_alone(cart):

@@ -7,7 +7,7 @@ import scipy.stats
 
 from mjxgrad.identification.parameters import Coordinates, Parameter
 from mjxgrad.identification.result import statistics
-from mjxgrad.identification.search import _removable
+from mjxgrad.identification.search import _removable, _without_offsets
 
 
 def _coordinates(**nominal):
@@ -78,3 +78,17 @@ def test_what_the_derivative_could_still_remove_is_one_at_a_slope_and_zero_at_a_
         assert float(_removable((jnp.zeros(2), jnp.asarray(residual), jnp.asarray(design)))) == pytest.approx(
             expected, abs=1e-12
         )
+
+
+def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
+    """Three windows with two offsets each: the parameters' block of the whole covariance."""
+    rng = np.random.default_rng(6)
+    shared, offsets, residual = rng.normal(size=(3, 9, 2)), rng.normal(size=(3, 9, 2)), rng.normal(size=(3, 9))
+    whole = np.column_stack(
+        [shared.reshape(27, 2), np.kron(np.eye(3), np.ones((9, 2))) * np.tile(offsets.reshape(27, 2), 3)]
+    )
+    flat, slope, count = _without_offsets([(residual, shared, offsets)])
+    found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), flat, slope, 27, count)
+    expected = (residual**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
+    assert count == 6
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-10)
