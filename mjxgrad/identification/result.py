@@ -121,7 +121,7 @@ class Identification:
     def _table(self) -> list[str]:
         parts = (self.values, self.half_width, self.start)
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
-        bounds = zip(np.asarray(self.coordinates.lower), np.asarray(self.coordinates.upper), strict=True)
+        bounds = zip(on_host(self.coordinates.lower), on_host(self.coordinates.upper), strict=True)
         rows = [("parameter", "found", "± 95 %", "start", "bounds")]
         for name, found, half, start, (low, high) in zip(self.names, *columns, bounds, strict=True):
             unit = self.units.get(name.split("[")[0], "")

@@ -158,25 +158,6 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     np.testing.assert_allclose(whole_found[25], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
 
 
-@pytest.mark.slow
-def test_intervals_of_whole_searches_cover_as_often_as_they_say():
-    """60 recordings of a damped cart with noise, two parameters: 114 of 120 expected, within three standard errors."""
-    scene = mg.load_scene(
-        _CART.format("").replace('axis="1 0 0"', 'axis="1 0 0" damping="4" armature=".1"'), keep_everything=True
-    )
-    truth = mg.rollout(scene, mg.initial_state(scene), _DRIVE[:, None], onset=mg.Onset()).qpos
-    parameters = {
-        "gear": identification.gear(scene, "motor"),
-        "damping": identification.damping(scene, "x"),
-    }
-    rng, covered = np.random.default_rng(0), []
-    for _ in range(60):
-        noisy = np.asarray(truth) + 0.002 * rng.normal(size=truth.shape)
-        result = mg.identify(scene, parameters, [Recording({"place": noisy}, _DRIVE[:, None])])
-        covered += [abs(result.values[k] - parameters[k].nominal) < result.half_width[k] for k in parameters]
-    assert abs(np.mean(covered) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(covered))
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
