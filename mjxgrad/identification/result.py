@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import scipy.linalg
-import scipy.stats
+import scipy.special
 from jaxtyping import Float
 
 from mjxgrad.contact.warnings import format_number
@@ -202,7 +202,7 @@ def statistics(
     lost[np.flatnonzero(is_felt)[(blurred**2).sum(axis=0) > _NO_PART**2]] = True
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
-    half_width = scipy.stats.t.ppf((1 + _LEVEL) / 2, freedom) * np.sqrt(np.diag(covariance))
+    half_width = scipy.special.stdtrit(freedom, (1 + _LEVEL) / 2) * np.sqrt(np.diag(covariance))
     return Statistics(
         covariance,
         half_width,

@@ -134,8 +134,12 @@ def search(
     """Run the search over experiments of any kind; see `identify`."""
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    try:  # before anything is compiled
+        optimistix = importlib.import_module("optimistix")
+    except ImportError as error:
+        raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     program = _Program(experiments, coordinates, free_start, **settings)
-    point, found, num_steps, ended, first, removable = _descend(program, max_steps, log)
+    point, found, num_steps, ended, first, removable = _descend(optimistix, program, max_steps, log)
     values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
     numbers, explained = program.num_numbers, on_host(found)
     residual, slope, num_offsets = _without_offsets(explained)
@@ -257,7 +261,7 @@ class _Program:
         return first, last
 
 
-def _descend(program: _Program, max_steps: int, log: Log | None):
+def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None):
     """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
     point, (lower, upper) = program.start(), program.box()
     found = best = program(point)
@@ -267,7 +271,7 @@ def _descend(program: _Program, max_steps: int, log: Log | None):
         raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
     first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
-    state, step = _levenberg_marquardt(point, linear)
+    state, step = _levenberg_marquardt(optimistix, point, linear)
     refusals, slow, removable, total = 0, 0, 1.0, math.inf
     for count in range(1, max_steps + 1):
         point, state, _ = step(point, state, linear)
@@ -290,12 +294,8 @@ def _descend(program: _Program, max_steps: int, log: Log | None):
     return point, best, max_steps, False, first, removable
 
 
-def _levenberg_marquardt(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
+def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
     """Return optimistix's state at the start and its step, which sees linear models alone."""
-    try:
-        optimistix: Any = importlib.import_module("optimistix")
-    except ImportError as error:
-        raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
