@@ -113,7 +113,7 @@ class Coordinates(eqx.Module):
         """Return the bounds of points of the search."""
         return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
 
-    def is_at_bound(self, values: Float[ArrayLike, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
+    def is_at_bound(self, values: Float[Array, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
         """Return which numbers are at their lower, and which at their upper bound, to rounding."""
         near = _AT_BOUND * self.scale
         return values - self.lower < near, self.upper - values < near

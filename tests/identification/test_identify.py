@@ -61,6 +61,14 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     assert bounded.stopped is Stopped.CONVERGED
 
 
+def test_a_search_comes_back_from_a_bound_that_a_step_went_beyond(cart):
+    """Motion goes with 1/m: from 4 kg the first step for 2 kg leads to 0, that is to the bound at 1.9 kg."""
+    mass = Parameter(4.0, 1.9, 5.0, identification.mass(cart, "cart").write)
+    result = mg.identify(cart, {"mass": mass}, [Recording({"place": _course()}, _DRIVE[:, None])])
+    np.testing.assert_allclose(result.values["mass"], 2.0, rtol=1e-6)
+    assert result.at_bounds == ()
+
+
 def test_mass_and_gear_are_told_apart_by_a_known_load_alone(cart):
     """One cart shows their ratio; the second, with 1 kg on it, gives both."""
     parameters = {
