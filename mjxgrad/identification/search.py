@@ -30,12 +30,12 @@ Log = Callable[[int, dict[str, float]], None]
 _MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
 _STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
 _VANISHED = 1e3  # roundings of the residuals at the start: what is left is no more
-# Residuals are scaled so that optimistix's first damping, 1, is a tenth of what the derivative has: a first step too far may not come back.
-_FIRST_SIZE = 3.0
+# Residuals are scaled so that optimistix's first damping, 1, is a tenth of what the derivative has.
+_FIRST_SIZE = 3.0  # with less a first step may go too far to come back
 _GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
 # Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
-_NEAR_ENOUGH = 1e-2  # of a standard error: no step that is left would be longer
+_NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
 
 
 @dataclasses.dataclass(frozen=True)

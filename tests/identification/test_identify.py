@@ -47,13 +47,13 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     expected = course @ measured / (course @ course)
     spread = np.sqrt(((measured - expected * course) ** 2).sum() / 24 / (course @ course))
     assert result.stopped is Stopped.CONVERGED
-    np.testing.assert_allclose(result.values["gear"], expected, rtol=1e-6)
+    np.testing.assert_allclose(result.values["gear"], expected, atol=1e-3 * spread)  # where the search ends
     np.testing.assert_allclose(
         result.half_width["gear"], 2.063899 * spread, rtol=1e-5
     )  # Student's 97.5 % at 24 degrees
     np.testing.assert_allclose(result.rms[1], np.sqrt(((measured - expected * course) ** 2).mean()) / 0.02, rtol=1e-6)
     left = (expected * course[:3] - 3.3 * course[:3] - 0.06) / 0.02
-    np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-6)
+    np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-3)
     assert "gear" in result.summary()
     bounded = mg.identify(cart, {"gear": identification.gear(cart, "motor", bounds=(1.0, 3.1))}, [recording])
     np.testing.assert_allclose(bounded.values["gear"], 3.1)
