@@ -1,6 +1,17 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import baselines, diagnostics, envs, estimators, integration, learning, planning, render, tasks
+from mjxgrad import (
+    baselines,
+    diagnostics,
+    envs,
+    estimators,
+    identification,
+    integration,
+    learning,
+    planning,
+    render,
+    tasks,
+)
 from mjxgrad._rollout import (
     DivergedError,
     State,
@@ -13,6 +24,7 @@ from mjxgrad.contact import Softness
 from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
+from mjxgrad.identification import identify
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -59,6 +71,8 @@ __all__ = [
     "estimated_gradient",
     "estimators",
     "forward",
+    "identification",
+    "identify",
     "initial_state",
     "integration",
     "learning",

@@ -21,7 +21,7 @@ ORDER = (
     ("estimators",),
     ("optimiser",),
     ("baselines",),
-    ("devices", "diagnostics", "integration", "planning", "render"),
+    ("devices", "diagnostics", "identification", "integration", "planning", "render"),
     ("tasks",),
     ("envs", "verdict"),
     ("learning",),

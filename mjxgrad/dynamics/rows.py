@@ -261,12 +261,15 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
 
 
 def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
-    """Return the number of a geom, sensor or site; refuse a name that there is not."""
+    """Return the number of a body, joint, geom, site, sensor or actuator; refuse a name that there is not."""
     word = kind.name.removeprefix("mjOBJ_").lower()
-    names = [mjx.id2name(model, kind, index) for index in range(getattr(model, f"n{word}"))]
+    count = {"joint": "njnt", "actuator": "nu"}.get(word, f"n{word}")
+    names = [mjx.id2name(model, kind, index) for index in range(getattr(model, count))]
     if name not in names:
         listed = ", ".join(repr(one) for one in names if one) or "none"
-        raise ValueError(f"there is no {word} {name!r}; named {word}s are {listed}")
+        raise ValueError(
+            f"there is no {word} {name!r}; named {'bodies' if word == 'body' else f'{word}s'} are {listed}"
+        )
     return names.index(name)
 
 

@@ -1,0 +1,36 @@
+"""Parameters of a scene from recorded motions, through contact."""
+
+from mjxgrad.identification.inertia import inertia
+from mjxgrad.identification.parameters import (
+    Parameter,
+    armature,
+    damping,
+    friction,
+    friction_loss,
+    gains,
+    gear,
+    mass,
+    softness,
+)
+from mjxgrad.identification.recording import Recording
+from mjxgrad.identification.result import Identification, Stopped
+from mjxgrad.identification.search import identify
+from mjxgrad.identification.sequences import identify_sequences
+
+__all__ = [
+    "Identification",
+    "Parameter",
+    "Recording",
+    "Stopped",
+    "armature",
+    "damping",
+    "friction",
+    "friction_loss",
+    "gains",
+    "gear",
+    "identify",
+    "identify_sequences",
+    "inertia",
+    "mass",
+    "softness",
+]

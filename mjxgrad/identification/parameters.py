@@ -1,0 +1,281 @@
+"""What is to be found: named numbers between bounds, and what each of them changes in a model."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.contact import Softness
+from mjxgrad.contact.parameters import contact_parameters, deciding_geoms
+from mjxgrad.dynamics.rows import index_of
+from mjxgrad.scene import Scene
+
+Write = Callable[[mjx.Model, Array], dict[str, Array]]
+"""From a model and the parameter's value to the fields of the model that change."""
+Values = dict[str, Array]
+_Object = mujoco.mjtObj
+_FACTOR = 10.0  # a positive number is looked for between a tenth and ten times what the model has
+_AT_BOUND = 1e-6  # of the range
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A number, or an array of them, to be found.
+
+    Attributes:
+        nominal: where the search begins, in the parameter's unit.
+        lower: least value; minus infinity for none.
+        upper: greatest value; infinity for none.
+        write: from a model and a value to the changed fields, `{"dof_damping": ...}`. What MuJoCo derives from them follows, as
+            in `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
+        unit: for reports.
+    """
+
+    nominal: Any
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    write: Write | None = None
+    unit: str = ""
+
+    def __post_init__(self):
+        nominal = np.asarray(self.nominal, float)
+        for name in ("nominal", "lower", "upper"):
+            value = np.asarray(getattr(self, name), float)
+            if value.ndim and value.shape != nominal.shape:
+                raise ValueError(f"{name} must be one number or of shape {nominal.shape}, got shape {value.shape}")
+            object.__setattr__(self, name, np.broadcast_to(value, nominal.shape))
+        if not np.isfinite(self.nominal).all():
+            raise ValueError(f"nominal must be finite, got {self.nominal.tolist()}")
+        if not ((self.lower < self.upper) & (self.lower <= self.nominal) & (self.nominal <= self.upper)).all():
+            given = f"{self.lower.tolist()}, {self.nominal.tolist()}, {self.upper.tolist()}"
+            raise ValueError(f"lower, nominal and upper must increase, nominal within them, got {given}")
+
+
+class Coordinates(eqx.Module):
+    """All parameters as one vector, and points of the search, in which each is measured by its range.
+
+    Attributes:
+        names: one for each number, `mass` or `inertia[3]`.
+    """
+
+    nominal: Float[Array, " dim"]
+    lower: Float[Array, " dim"]
+    upper: Float[Array, " dim"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    shapes: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, Parameter]) -> "Coordinates":
+        """Return those of named parameters; refuse none."""
+        if not parameters:
+            raise ValueError("parameters must name at least one parameter, got none")
+        nominal, lower, upper = [
+            jnp.asarray(np.concatenate([getattr(p, part).ravel() for p in parameters.values()]))
+            for part in ("nominal", "lower", "upper")
+        ]
+        names = [
+            name + "".join(f"[{i}]" for i in place if p.nominal.size > 1)
+            for name, p in parameters.items()
+            for place in np.ndindex(p.nominal.shape)
+        ]
+        return cls(
+            nominal, lower, upper, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items())
+        )
+
+    def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
+        """Return the parameters by name."""
+        found, start = {}, 0
+        for name, shape in self.shapes:
+            size = int(np.prod(shape))
+            found[name] = vector[start : start + size].reshape(shape)  # pyright: ignore[reportIndexIssue]
+            start += size
+        return found
+
+    @property
+    def scale(self) -> Float[Array, " dim"]:
+        """Unit of each number in the search: its range, or the way to its only bound, or its size."""
+        above, below = self.nominal - self.lower, self.upper - self.nominal
+        reach = jnp.where(jnp.isfinite(above), above, jnp.where(jnp.isfinite(below), below, jnp.abs(self.nominal)))
+        width = self.upper - self.lower
+        return jnp.where(jnp.isfinite(width), width, jnp.where(reach > 0, reach, 1.0))
+
+    def values(self, free: Float[Array, " dim"]) -> Float[Array, " dim"]:
+        """Return the numbers at a point of the search, which begins at zero; beyond a bound it means the bound."""
+        return jnp.clip(self.nominal + self.scale * free, self.lower, self.upper)
+
+    def box(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+        """Return the bounds of points of the search."""
+        return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
+
+    def is_at_bound(self, values: Float[Array, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
+        """Return which numbers are at their lower, and which at their upper bound, to rounding."""
+        near = _AT_BOUND * self.scale
+        return values - self.lower < near, self.upper - values < near
+
+
+def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:
+    """Return the scene in which each parameter has written its value, in their order; traceable."""
+    model, changed = scene.model, {}
+    for name, parameter in parameters.items():
+        if parameter.write is not None:
+            fields = parameter.write(model, values[name])
+            model, changed = model.replace(**fields), changed | fields
+    return scene.with_model(**changed) if changed else scene
+
+
+def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) -> Parameter:
+    """Return the mass of a body, or one for several bodies alike (kg); inertias change by the same factor, as with the density.
+
+    Args:
+        scene: where the nominal value is read.
+        *bodies: by name.
+        bounds: a tenth and ten times the nominal value by default.
+
+    Raises:
+        ValueError: if there is no such body.
+    """
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = np.array([index_of(model, _Object.mjOBJ_BODY, body) for body in bodies])
+        factor = (value / model.body_mass[index])[:, None]
+        inertia = model.body_inertia.at[index].set(factor * model.body_inertia[index])
+        return {"body_mass": model.body_mass.at[index].set(value), "body_inertia": inertia}
+
+    nominal = float(scene.model.body_mass[index_of(scene.model, _Object.mjOBJ_BODY, bodies[0])])
+    return _positive(nominal, bounds, write, "kg", "mass")
+
+
+def friction(
+    scene: Scene,
+    *,
+    pairs: tuple[tuple[str, str], ...] | None = None,
+    bounds: tuple[float, float] = (0.0, 2.0),
+    **subset: Any,
+) -> Parameter:
+    """Return the sliding friction of contacts, one for all that are named; it is written to all geoms that decide it.
+
+    Args:
+        scene: where the nominal value is read.
+        pairs: by the names of their geoms; None for all that can touch.
+        bounds: of the coefficient.
+        **subset: `geoms`, `bodies` or `groups` in place of pairs, as of `Softness`.
+
+    Raises:
+        ValueError: if a name is unknown or can touch nothing.
+    """
+    named = Softness(pairs=pairs, **subset)
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        chosen = named.selected(model)
+        explicit = np.array([p.explicit for p in chosen if p.explicit >= 0], int)
+        geoms = np.array(sorted({g for p in chosen if p.explicit < 0 for g in deciding_geoms(model, p)}), int)
+        found = {}
+        if explicit.size:
+            found["pair_friction"] = model.pair_friction.at[explicit, :2].set(value)
+        if geoms.size:
+            found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
+        return found
+
+    present = contact_parameters(scene.model, named.selected(scene.model)).friction
+    return Parameter(np.clip(float(present[0, 0]), *bounds), *bounds, write=write)
+
+
+def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
+    """Return one part of the contact softness.
+
+    Args:
+        scene: where the nominal value is read.
+        part: "stiffness" (1/s²), "damping_ratio", which decides the restitution (`mjxgrad.contact.bounce`), or "width" (m).
+        bounds: a tenth and ten times the nominal value by default.
+        **subset: `pairs`, `geoms`, `bodies` or `groups`, as of `Softness`; all contacts without one.
+
+    Raises:
+        ValueError: if there is no such part, or as `Softness`.
+    """
+    units = {"stiffness": "1/s²", "damping_ratio": "", "width": "m"}
+    if part not in units:
+        raise ValueError(f"part must be one of {', '.join(units)}, got {part!r}")
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        after = Softness(**{part: value}, **subset).apply(model)
+        fields = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
+        return {name: new for name in fields if (new := getattr(after, name)) is not getattr(model, name)}
+
+    present = contact_parameters(scene.model, Softness(**subset).selected(scene.model))
+    return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
+
+
+def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+    """Return the damping of a joint, or one for several joints alike (N s/m or N m s/rad); as `mass` otherwise."""
+    return _of_joints(scene, "dof_damping", joints, bounds)
+
+
+def armature(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+    """Return the armature of a joint, or one for several joints alike (kg or kg m²); as `mass` otherwise."""
+    return _of_joints(scene, "dof_armature", joints, bounds)
+
+
+def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+    """Return the dry friction of a joint, or one for several joints alike (N or N m); as `mass` otherwise."""
+    return _of_joints(scene, "dof_frictionloss", joints, bounds)
+
+
+def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
+    """Return the first number of the gear of an actuator, or one for several actuators alike; as `mass` otherwise."""
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
+        return {"actuator_gear": model.actuator_gear.at[index, 0].set(value)}
+
+    first = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuators[0])
+    return _positive(float(scene.model.actuator_gear[first, 0]), bounds, write, "", "gear")
+
+
+def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
+    """Return the two gains of a position actuator, `kp` and `kv`.
+
+    Args:
+        scene: where the nominal values are read.
+        actuator: by name.
+        bounds: each a number or one for each gain; a tenth and ten times the nominal values by default.
+
+    Raises:
+        ValueError: if there is no such actuator, or a gain is zero and no bounds are given.
+    """
+    index = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuator)
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = index_of(model, _Object.mjOBJ_ACTUATOR, actuator)
+        bias = model.actuator_biasprm.at[index, 1:3].set(-value)
+        return {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0]), "actuator_biasprm": bias}
+
+    return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
+
+
+def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[float, float] | None) -> Parameter:
+    def dofs(model: mjx.Model) -> np.ndarray:
+        index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
+        return np.flatnonzero(np.isin(model.dof_jntid, index))
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        return {field: getattr(model, field).at[dofs(model)].set(value)}
+
+    nominal = float(getattr(scene.model, field)[dofs(scene.model)[0]])
+    return _positive(nominal, bounds, write, "", field.removeprefix("dof_"))
+
+
+def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: str, name: str) -> Parameter:
+    nominal = np.asarray(nominal, float)
+    if bounds is None:
+        if not (nominal > 0).all():
+            raise ValueError(
+                f"bounds of {name} must be given where the model's is not positive, got {nominal.tolist()}"
+            )
+        bounds = (nominal / _FACTOR, nominal * _FACTOR)
+    return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)

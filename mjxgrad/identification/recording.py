@@ -1,0 +1,268 @@
+"""What was measured: motions of a scene, and all of them as one batch."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mjxgrad._mjx import mjx
+from mjxgrad._rollout import State, initial_state, rollout
+from mjxgrad.dynamics import Gradient, Onset
+from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.scene import Scene, sensor
+
+_STATES = ("qpos", "qvel", "act")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A motion that was measured.
+
+    Attributes:
+        measured: by name of a sensor, or as "qpos", "qvel" or "act": one row for each time. NaN where there is no measurement.
+        controls: what drove it, one row for each time step of the scene, or for each of `control_times`; None for none.
+        times: of the measurements, in s from the start, increasing; None for one at each state, the first and last included.
+        control_times: of the controls, which are then interpolated linearly (s); None for one row for each time step.
+        noise: standard deviation of each signal in its own unit, one number or one for each column, those of "qpos" being one for
+            each velocity (m, rad). Signals without one have 1. Their ratios weigh the signals; the overall size is estimated.
+        start: the state at time 0; None for the first row of "qpos" and "qvel" where that is at time 0, else the scene's pose, at
+            rest.
+        name: for messages.
+    """
+
+    measured: Mapping[str, Any]
+    controls: Any = None
+    times: Any = None
+    control_times: Any = None
+    noise: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    start: State | None = None
+    name: str = "the recording"
+
+    def __post_init__(self):
+        rows = {name: np.asarray(value, float) for name, value in self.measured.items()}
+        object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
+        lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
+        if len(lengths) != 1:
+            raise ValueError(
+                f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
+            )
+        for name in ("times", "control_times"):
+            value = getattr(self, name)
+            if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
+                raise ValueError(
+                    f"{name} of {self.name} must increase from 0 or later, got {np.asarray(value).tolist()}"
+                )
+        if unknown := set(self.noise) - set(rows):
+            raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
+
+    def cut(self, duration: float, timestep: float) -> list["Recording"]:
+        """Return windows of this duration, each of which begins at a measured state; what is left at the end is dropped.
+
+        Short windows keep a motion that is hard to predict close to what was measured. Their starts are as noisy as the
+        measurements: `free_start=True` of `identify` finds them, too.
+
+        Args:
+            duration: of a window (s).
+            timestep: of the scene (s).
+
+        Raises:
+            ValueError: if positions or velocities were not measured, or no window fits.
+        """
+        if not {"qpos", "qvel"} <= set(self.measured):
+            raise ValueError(f"{self.name} must have measured qpos and qvel to be cut, got {sorted(self.measured)}")
+        times = _times(self, timestep)
+        begins = np.arange(times[0], times[-1] - duration + timestep / 2, duration)
+        if not begins.size:
+            raise ValueError(f"duration must be at most that of {self.name}, {times[-1]:g} s, got {duration:g} s")
+        controls, at = self.controls, self.control_times
+        if controls is not None and at is None:
+            at = timestep * np.arange(len(controls))
+        windows = []
+        for begin in begins:
+            rows = np.flatnonzero((times >= begin - timestep / 2) & (times <= begin + duration + timestep / 2))
+            later = {} if controls is None else {"controls": controls, "control_times": at - times[rows[0]]}
+            if controls is not None:
+                kept = later["control_times"] > -timestep / 2
+                later = {
+                    "controls": np.asarray(controls)[kept],
+                    "control_times": np.maximum(later["control_times"][kept], 0),
+                }
+            measured = {name: value[rows] for name, value in self.measured.items()}
+            name = f"{self.name} from {times[rows[0]]:g} s"
+            windows.append(
+                Recording(measured, times=times[rows] - times[rows[0]], noise=self.noise, name=name, **later)
+            )
+        return windows
+
+
+class Windows(eqx.Module):
+    """Recordings of one scene as a batch; shorter ones are continued by rows that weigh nothing.
+
+    Attributes:
+        state: where each begins.
+        controls: one row for each step.
+        index: the state before, or at, each measurement.
+        share: how far from it to the next state the measurement is, of a step.
+        measured: by name.
+        weight: reciprocal of the noise, 0 where nothing was measured.
+    """
+
+    state: State
+    controls: Float[Array, "*windows steps nu"]
+    index: Int[Array, "*windows rows"]
+    share: Float[Array, "*windows rows"]
+    measured: dict[str, Float[Array, "*windows rows _"]]
+    weight: dict[str, Float[Array, "*windows rows _"]]
+
+
+def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:
+    """Return the recordings of a scene as a batch.
+
+    Raises:
+        ValueError: if controls or signals do not have the scene's shapes, or measurements go on after the controls.
+    """
+    timestep = float(scene.model.opt.timestep)
+    steps = [_num_steps(one, timestep) for one in recordings]
+    names = list(dict.fromkeys(name for one in recordings for name in one.measured))
+    num_steps, num_rows = max(steps), max(len(_times(one, timestep)) for one in recordings)
+    parts = [_window(scene, one, names, num_steps, num_rows, timestep) for one in recordings]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+
+
+def _times(recording: Recording, timestep: float) -> np.ndarray:
+    if recording.times is not None:
+        return np.asarray(recording.times, float)
+    return timestep * np.arange(len(next(iter(recording.measured.values()))))
+
+
+def _num_steps(recording: Recording, timestep: float) -> int:
+    """Return how many steps reach the last measurement; refuse more than there are controls for."""
+    needed = max(1, int(np.ceil(_times(recording, timestep)[-1] / timestep - 1e-6)))
+    if recording.controls is not None and recording.control_times is None and needed > len(recording.controls):
+        raise ValueError(
+            f"controls of {recording.name} must have a row for each of {needed} steps up to the last measurement, "
+            f"got {len(recording.controls)}"
+        )
+    return needed
+
+
+def _window(
+    scene: Scene, recording: Recording, names: list[str], num_steps: int, num_rows: int, timestep: float
+) -> Windows:
+    times = _times(recording, timestep)
+    place = np.clip(times / timestep, 0, num_steps)
+    index = np.minimum(np.floor(place + 1e-6).astype(int), num_steps - 1)
+    spare = (0, num_rows - len(times))
+    measured, weight = {}, {}
+    for name in names:
+        width = _width(scene, name)
+        value = recording.measured.get(name, np.full((len(times), width), np.nan))
+        if value.shape[1] != width:
+            raise ValueError(
+                f"{name} of {recording.name} must have {width} columns in this scene, got {value.shape[1]}"
+            )
+        columns = scene.model.nv if name == "qpos" else width
+        noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
+        is_there = np.isfinite(value)
+        if name == "qpos":  # a quaternion without one of its numbers is none
+            value, is_there = (
+                np.where(is_there, value, np.asarray(scene.data.qpos)),
+                _joints_there(scene.model, is_there),
+            )
+        weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
+        measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
+    return Windows(
+        state=_start(scene, recording, times),
+        controls=jnp.asarray(_controls(scene, recording, num_steps, timestep)),
+        index=jnp.asarray(np.pad(index, spare)),
+        share=jnp.asarray(np.pad(place - index, spare)),
+        measured=measured,
+        weight=weight,
+    )
+
+
+def _joints_there(model: mjx.Model, is_there: np.ndarray) -> np.ndarray:
+    """Return for each velocity whether all coordinates of its joint were measured."""
+    joint_of = np.searchsorted(model.jnt_qposadr, np.arange(model.nq), side="right") - 1
+    of_joint = np.stack([is_there[:, joint_of == joint].all(axis=1) for joint in range(model.njnt)], axis=1)
+    return of_joint[:, model.dof_jntid]
+
+
+def _width(scene: Scene, name: str) -> int:
+    if name in _STATES:
+        return getattr(scene.data, name).shape[0]
+    return jax.eval_shape(lambda: sensor(scene.model, scene.data, name)).shape[0]
+
+
+def _start(scene: Scene, recording: Recording, times: np.ndarray) -> State:
+    if recording.start is not None:
+        return recording.start
+    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured}
+    known = {name: row for name, row in first.items() if times[0] == 0 and np.isfinite(row).all()}
+    return initial_state(scene, **known)
+
+
+def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:
+    if recording.controls is None:
+        return np.broadcast_to(np.asarray(scene.data.ctrl), (num_steps, scene.model.nu))
+    controls = np.asarray(recording.controls, float)
+    if controls.ndim != 2 or controls.shape[1] != scene.model.nu:
+        raise ValueError(
+            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got shape {controls.shape}"
+        )
+    if recording.control_times is not None:
+        at = timestep * np.arange(num_steps)
+        return np.column_stack([np.interp(at, recording.control_times, column) for column in controls.T])
+    return np.pad(controls[:num_steps], ((0, max(0, num_steps - len(controls))), (0, 0)), mode="edge")
+
+
+def residuals(
+    scene: Scene,
+    window: Windows,
+    offset: Float[Array, " both"] | None,
+    delay: Float[Array, ""] | None,
+    *,
+    onset: Onset | None,
+    gradient: Gradient,
+) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
+    """Return simulated less measured, in units of the noise, of one window; and whether the motion diverged.
+
+    Args:
+        scene: with the parameters in it.
+        window: one, without its leading axis.
+        offset: of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
+        delay: by how much the controls act later than recorded (s); None for none.
+        onset: as of `rollout`.
+        gradient: as of `rollout`.
+    """
+    model, state, controls = scene.model, window.state, window.controls
+    if offset is not None:
+        qpos = integrate_position(model, state.qpos, offset[: model.nv], 1.0)
+        state = eqx.tree_at(lambda s: (s.qpos, s.qvel), state, (qpos, state.qvel + offset[model.nv :]))
+    if delay is not None:
+        at = jnp.arange(len(controls), dtype=controls.dtype)
+        controls = jax.vmap(lambda u: jnp.interp(at - delay / model.opt.timestep, at, u), 1, 1)(controls)
+    sensors = [name for name in window.measured if name not in _STATES]
+
+    def observe(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
+        return {name: sensor(model, data, name) for name in sensors}
+
+    course = rollout(
+        scene, state, controls, checkpoint=False, onset=onset, gradient=gradient, observe=observe if sensors else None
+    )
+    found = {name: getattr(course, name) for name in _STATES} | (course.observations or {})
+    parts = []
+    for name, measured in window.measured.items():
+        before, after = found[name][window.index], found[name][window.index + 1]
+        simulated = before + window.share[:, None] * (after - before)
+        is_pose = name == "qpos"
+        change = (
+            jax.vmap(position_change, (None, 0, 0))(model, measured, simulated) if is_pose else simulated - measured
+        )
+        parts.append((change * window.weight[name]).ravel())
+    return jnp.concatenate(parts), course.diverged

@@ -1,0 +1,356 @@
+r"""The search: residuals of all recordings in one program, their derivative in forward mode, and Levenberg-Marquardt.
+
+One program rolls out all windows of a scene under `jax.vmap`, with one tangent for each parameter. The unknown start of a window
+concerns that window alone, so its tangents are those of one window, however many there are. Each step of the search asks this
+program for residuals and derivative at one point; optimistix, which sees only their linear model there, accepts or refuses the
+point and chooses the next.
+"""
+
+import dataclasses
+import importlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from mjxgrad._rollout import DivergedError
+from mjxgrad.dynamics import Gradient, Onset
+from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
+from mjxgrad.identification.recording import Recording, Windows, residuals, stack
+from mjxgrad.identification.result import Identification, Stopped, on_host, statistics
+from mjxgrad.scene import Scene
+
+Apply = Callable[[Scene, Values], Scene]
+Log = Callable[[int, dict[str, float]], None]
+_MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
+_STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
+_VANISHED = 1e3  # roundings of the residuals at the start: what is left is no more
+# Residuals are scaled so that optimistix's first damping, 1, is a tenth of what the derivative has.
+_FIRST_SIZE = 3.0  # with less a first step may go too far to come back
+_GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
+# Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
+_TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Motions of one scene.
+
+    Attributes:
+        scene: with nominal values.
+        recordings: to fit.
+        held_out: to judge by.
+        apply: from the scene, all parameters as a vector and what `prepare` returned to the scene with them.
+        prepare: computed outside of the program from the parameters' values, before each call of it.
+    """
+
+    scene: Scene
+    recordings: Sequence[Recording]
+    held_out: Sequence[Recording]
+    apply: Callable[[Scene, Array, PyTree], Scene]
+    prepare: Callable[[np.ndarray], PyTree] = lambda values: None
+
+
+def identify(
+    scene: Scene | Sequence[Scene],
+    parameters: Mapping[str, Parameter],
+    recordings: Sequence[Any],
+    *,
+    held_out: Sequence[Any] = (),
+    apply: Apply | None = None,
+    delay: str | None = None,
+    free_start: bool = False,
+    onset: Onset | None = Onset(),  # noqa: B008, a constant
+    gradient: Gradient = "discrete",
+    max_steps: int = 100,
+    log: Log | None = None,
+) -> Identification:
+    r"""Find parameters of a scene from recorded motions, through contact.
+
+    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with derivatives
+    through the simulation. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+
+    Args:
+        scene: with the model's numbers as far as they are known; or several, that share the parameters.
+        parameters: by name, from `mass`, `inertia`, `friction`, `softness` and the other makers, or `Parameter` with a `write` of
+            one's own.
+        recordings: of the scene; of several scenes a sequence for each of them.
+        held_out: recordings that are only judged by, likewise.
+        apply: called as `apply(scene, values)` after the parameters have written theirs, for what takes several of them.
+        delay: name of the parameter, if any, by which controls act later than recorded (s).
+        free_start: find the start of every recording, too, from where it says; for starts as noisy as the rest.
+        onset: as of `rollout`. Contacts then begin within the step, and the derivative is the slope of the motion. With None the
+            simulation is MuJoCo's to the bit, and a search through impacts may stall.
+        gradient: as of `rollout`.
+        max_steps: simulations with derivatives at most.
+        log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
+
+    Returns:
+        The values, their intervals, and what the recordings cannot tell; `print(result.summary())`.
+
+    Raises:
+        ValueError: if there are no parameters or recordings, or shapes do not fit the scene.
+        DivergedError: if the simulation diverges with the nominal values.
+        ImportError: if optimistix is not installed.
+    """
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    groups = [recordings] if isinstance(scene, Scene) else list(recordings)
+    others = ([held_out] if isinstance(scene, Scene) else list(held_out)) or [()] * len(scenes)
+    if not len(scenes) == len(groups) == len(others) or not all(groups):
+        raise ValueError(
+            f"recordings must hold at least one for each of {len(scenes)} scenes, got {[len(g) for g in groups]}"
+        )
+    if delay is not None and delay not in parameters:
+        raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
+    coordinates = Coordinates.of(parameters)
+
+    def put(scene: Scene, vector: Array, _: None) -> Scene:
+        values = coordinates.unravel(vector)
+        changed = write_all(scene, parameters, values)
+        return changed if apply is None else apply(changed, values)
+
+    experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
+    settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
+    units = {name: parameter.unit for name, parameter in parameters.items()}
+    return search(experiments, coordinates, units, max_steps=max_steps, log=log, **settings)
+
+
+def search(
+    experiments: Sequence[Experiment],
+    coordinates: Coordinates,
+    units: dict[str, str],
+    *,
+    max_steps: int,
+    log: Log | None,
+    free_start: bool,
+    **settings: Any,
+) -> Identification:
+    """Run the search over experiments of any kind; see `identify`."""
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    try:  # before anything is compiled
+        optimistix = importlib.import_module("optimistix")
+    except ImportError as error:
+        raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
+    program = _Program(experiments, coordinates, free_start, **settings)
+    point, found, num_steps, ended, first, removable = _descend(optimistix, program, max_steps, log)
+    values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
+    numbers, explained = program.num_numbers, on_host(found)
+    residual, slope, num_offsets = _without_offsets(explained)
+    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
+    after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
+    rounding = _VANISHED * float(jnp.finfo(point.dtype).eps)
+    stalls = removable > _STALLED and after > max(rounding, 1e-6) * before
+    nominal = np.asarray(coordinates.nominal, float)
+    is_at_bound = np.logical_or(*coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype)))
+    return Identification(
+        values=coordinates.unravel(values),
+        start=coordinates.unravel(nominal),
+        half_width=coordinates.unravel(verdict.half_width),
+        covariance=verdict.covariance,
+        names=coordinates.names,
+        condition_number=verdict.condition_number,
+        without_effect=verdict.without_effect,
+        inseparable=verdict.inseparable,
+        at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
+        rms=(first, float(after / np.sqrt(numbers))),
+        held_out_rms=program.held_out_rms(nominal, values),
+        offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
+        removable=removable,
+        num_numbers=numbers,
+        num_steps=num_steps,
+        stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if ended else Stopped.STEPS,
+        scenes=program.scenes(values),
+        coordinates=coordinates,
+        units=units,
+    )
+
+
+class _Program:
+    """Residuals and their derivatives by values and offsets, compiled once."""
+
+    def __init__(
+        self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
+    ):
+        self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
+        self._delay, self._settings = delay, settings
+        self.windows = [stack(one.scene, one.recordings) for one in experiments]
+        self.num_numbers = sum(int((np.asarray(w) > 0).sum()) for one in self.windows for w in one.weight.values())
+        self._evaluate = jax.jit(self._traced)
+
+    def _residuals(
+        self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
+    ) -> Array:
+        scene = experiment.apply(experiment.scene, vector, prepared)
+        delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
+        residual, diverged = residuals(scene, window, offset, delay, **self._settings)
+        return jnp.where(diverged, jnp.inf, residual)
+
+    def _traced(self, vector: Array, offsets: list[Array], prepared: list[PyTree]) -> list[tuple[Array, ...]]:
+        found = []
+        for i, experiment in enumerate(self.experiments):
+
+            def one(window: Windows, offset: Array | None, experiment=experiment, prepared=prepared[i]):
+                def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
+                    residual = self._residuals(experiment, vector, offset, window, prepared)
+                    return residual, residual
+
+                argnums = (0, 1) if self.free_start else (0,)
+                slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
+                return residual, *slopes
+
+            found.append(jax.vmap(one)(self.windows[i], offsets[i] if self.free_start else None))
+        return found
+
+    def __call__(self, point: Array) -> list[tuple[Array, ...]]:
+        vector = self.coordinates.values(point[: len(self.coordinates.names)])
+        prepared = [one.prepare(np.asarray(vector, float)) for one in self.experiments]
+        return self._evaluate(vector, self.offsets(point), prepared)
+
+    def start(self) -> Array:
+        """Return the point of the nominal values, without offsets: zero."""
+        sizes = [len(w.controls) * 2 * e.scene.model.nv for w, e in zip(self.windows, self.experiments, strict=True)]
+        return jnp.zeros(
+            len(self.coordinates.names) + (sum(sizes) if self.free_start else 0), self.coordinates.nominal.dtype
+        )
+
+    def box(self) -> tuple[Array, Array]:
+        """Return the bounds of a point; offsets have none."""
+        free = jnp.full(len(self.start()) - len(self.coordinates.names), jnp.inf)
+        lower, upper = self.coordinates.box()
+        return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
+
+    def offsets(self, point: Array) -> list[Array]:
+        """Return the part of a point that moves the starts, one array for each experiment."""
+        found, first = [], len(self.coordinates.names)
+        for windows, experiment in zip(self.windows, self.experiments, strict=True) if self.free_start else ():
+            shape = (len(windows.controls), 2 * experiment.scene.model.nv)
+            found.append(point[first : first + shape[0] * shape[1]].reshape(shape))
+            first += shape[0] * shape[1]
+        return found
+
+    def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
+        """Return the experiments' scenes with these values."""
+        vector = jnp.asarray(values, self.coordinates.nominal.dtype)
+        return tuple(one.apply(one.scene, vector, one.prepare(values)) for one in self.experiments)
+
+    def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
+        """Return what is left of the recordings that were held out, at each point; None without any."""
+        judged = [(one, stack(one.scene, one.held_out)) for one in self.experiments if one.held_out]
+        if not judged:
+            return None
+
+        @jax.jit
+        def of_all(vector: Array, prepared: list[PyTree]) -> Array:
+            parts = [
+                jax.vmap(lambda w, e=e, f=f: self._residuals(e, vector, None, w, f))(w).ravel()
+                for (e, w), f in zip(judged, prepared, strict=True)
+            ]
+            return jnp.linalg.norm(jnp.concatenate(parts))
+
+        count = sum(int((np.asarray(w) > 0).sum()) for _, one in judged for w in one.weight.values())
+        dtype = self.coordinates.nominal.dtype
+        found = [of_all(jnp.asarray(p, dtype), [one.prepare(p) for one, _ in judged]) for p in points]
+        first, last = (float(x) / math.sqrt(count) for x in found)
+        return first, last
+
+
+def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None):
+    """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
+    point, (lower, upper) = program.start(), program.box()
+    found = best = program(point)
+    length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
+    if not np.isfinite(length):
+        reason = "got one that diverged: begin elsewhere"
+        raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
+    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
+    linear = _linear_model(program, found, point, size)
+    state, step = _levenberg_marquardt(optimistix, point, linear)
+    refusals, slow, removable, total = 0, 0, 1.0, math.inf
+    for count in range(1, max_steps + 1):
+        point, state, _ = step(point, state, linear)
+        is_accepted = int(state.num_steps_since_acceptance) == 0
+        if is_accepted:
+            fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
+            slow = slow + 1 if fell * program.num_numbers < _TOO_LITTLE * total else 0
+            best, refusals, removable = found, 0, float(_removable(linear))
+        else:
+            refusals += 1
+        if log is not None:
+            rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
+            log(count, {"rms": rms, "is_accepted": float(is_accepted)})
+        is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
+        if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
+            return point, best, count, True, first, removable
+        state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
+        found = program(state.y_eval)
+        linear = _linear_model(program, found, state.y_eval, size)
+    return point, best, max_steps, False, first, removable
+
+
+def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
+    """Return optimistix's state at the start and its step, which sees linear models alone."""
+    tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
+    solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
+    struct = jax.eval_shape(lambda: linear[1])
+    state = solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
+    return state, eqx.filter_jit(lambda y, state, linear: solver.step(_predict, y, linear, {}, state, frozenset()))
+
+
+def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:
+    """Return residuals by their linear model at the point that it was made at; there they are exact."""
+    at, residual, slope = linear
+    return residual + slope @ (point - at), None
+
+
+@jax.jit
+def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
+    """Return the share of the sum of squares that the linear model would remove, as far as its directions are clear."""
+    _, residual, slope = linear
+    lengths = jnp.linalg.norm(slope, axis=0)
+    columns = slope / jnp.where(lengths > 0, lengths, 1.0)
+    sizes, axes = jnp.linalg.eigh(columns.T @ columns)
+    along = axes.T @ (columns.T @ residual)
+    is_clear = sizes > jnp.sqrt(jnp.finfo(sizes.dtype).eps) * jnp.max(sizes)
+    total = jnp.sum(residual**2)
+    return jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0)) / jnp.where(
+        total > 0, total, 1.0
+    )
+
+
+def _linear_model(
+    program: _Program, found: list[tuple[Array, ...]], point: Array, size: float
+) -> tuple[Array, Array, Array]:
+    """Return a point, the residuals there in units of those at the start, and their derivative by the point."""
+    count = len(program.coordinates.names)
+    residual = jnp.concatenate([one[0].ravel() for one in found]) / size
+    slope = jnp.concatenate([one[1].reshape(-1, count) for one in found]) / size
+    # A number at a bound that the residuals push against stays there; the others go their way without it.
+    lower, upper = (part[:count] for part in program.box())
+    pull = residual @ slope
+    is_held = ((point[:count] <= lower) & (pull > 0)) | ((point[:count] >= upper) & (pull < 0))
+    slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
+    if program.free_start:
+        blocks = jax.scipy.linalg.block_diag(*(window for one in found for window in one[2])) / size
+        slope = jnp.concatenate([slope, blocks], axis=1)
+    return point, residual, slope
+
+
+def _without_offsets(found: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return residuals, their derivative by the values orthogonal to what offsets do, and how many offsets that takes."""
+    parts, count = [], 0
+    for _, slope, *of_offset in found:
+        for i, one in enumerate(slope):
+            if of_offset:
+                left, sizes, _ = np.linalg.svd(of_offset[0][i], full_matrices=False)
+                left = left[:, sizes > 1e-8 * sizes.max(initial=0.0)]
+                one, count = one - left @ (left.T @ one), count + left.shape[1]
+            parts.append(one)
+    return np.concatenate([one[0].ravel() for one in found]), np.concatenate(parts), count

@@ -1,0 +1,215 @@
+"""Parameters come back from motions that were made with them, as surely as the noise allows."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import identification
+from mjxgrad.identification import Parameter, Recording, Stopped
+from mjxgrad.identification.recording import residuals, stack
+
+_STEP, _STEPS = 0.01, 40
+_CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
+  <geom size=".1" mass="2"/>{}</body></worldbody><actuator><motor name="motor" joint="x" gear="3"/></actuator>
+  <sensor><jointpos name="place" joint="x"/></sensor></mujoco>"""
+_DRIVE = 2 * np.sin(np.arange(_STEPS) / 5)
+
+
+def _course(gear=3.0, mass=2.0, x=0.0, v=0.0, drive=_DRIVE):
+    """Semi-implicit Euler of a cart without damping: v changes by h·g·u/m, then x by h·v."""
+    speeds = v + np.concatenate([[0], np.cumsum(_STEP * gear * drive / mass)])
+    return x + np.concatenate([[0], np.cumsum(_STEP * speeds[1:])])
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return mg.load_scene(_CART.format(""))
+
+
+def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
+    """The place is the gear times a known course, here between the steps and with noise: a regression through the origin."""
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.uniform(0, 0.4, 25))
+    course = np.interp(times, _STEP * np.arange(_STEPS + 1), _course(gear=1.0))
+    measured = 3.3 * course + 0.01 * rng.normal(size=25)
+    recording = Recording({"place": measured}, _DRIVE[:, None], times, noise={"place": 0.02})
+    held_out = Recording(
+        {"qvel": np.full(3, np.nan), "place": 3.3 * course[:3] + 0.06},
+        _DRIVE[:, None],
+        times[:3],
+        noise={"place": 0.02},
+    )
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], held_out=[held_out])
+    expected = course @ measured / (course @ course)
+    spread = np.sqrt(((measured - expected * course) ** 2).sum() / 24 / (course @ course))
+    assert result.stopped is Stopped.CONVERGED
+    np.testing.assert_allclose(result.values["gear"], expected, atol=1e-3 * spread)  # where the search ends
+    np.testing.assert_allclose(
+        result.half_width["gear"], 2.063899 * spread, rtol=1e-5
+    )  # Student's 97.5 % at 24 degrees
+    np.testing.assert_allclose(result.rms[1], np.sqrt(((measured - expected * course) ** 2).mean()) / 0.02, rtol=1e-6)
+    left = (expected * course[:3] - 3.3 * course[:3] - 0.06) / 0.02
+    np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-3)
+    assert "gear" in result.summary()
+    bounded = mg.identify(cart, {"gear": identification.gear(cart, "motor", bounds=(1.0, 3.1))}, [recording])
+    np.testing.assert_allclose(bounded.values["gear"], 3.1)
+    assert bounded.at_bounds == ("gear",)
+    assert bounded.stopped is Stopped.CONVERGED
+
+
+def test_a_search_comes_back_from_a_bound_that_a_step_went_beyond(cart):
+    """Motion goes with 1/m: from 4 kg the first step for 2 kg leads to 0, that is to the bound at 1.9 kg."""
+    mass = Parameter(4.0, 1.9, 5.0, identification.mass(cart, "cart").write)
+    result = mg.identify(cart, {"mass": mass}, [Recording({"place": _course()}, _DRIVE[:, None])])
+    np.testing.assert_allclose(result.values["mass"], 2.0, rtol=1e-6)
+    assert result.at_bounds == ()
+
+
+def test_mass_and_gear_are_told_apart_by_a_known_load_alone(cart):
+    """One cart shows their ratio; the second, with 1 kg on it, gives both."""
+    parameters = {
+        "mass": identification.mass(cart, "cart", bounds=(0.5, 5.0)),
+        "gear": Parameter(2.0, 0.5, 8.0, identification.gear(cart, "motor").write),
+        "idle": Parameter(1.0, 0.0, 2.0),
+    }
+    parameters["mass"] = Parameter(3.5, 0.5, 5.0, parameters["mass"].write, "kg")
+    alone = Recording({"place": _course()}, _DRIVE[:, None])
+    result = mg.identify(cart, parameters, [alone])
+    np.testing.assert_allclose(result.values["gear"] / result.values["mass"], 1.5, rtol=1e-6)
+    (combination,) = result.inseparable
+    assert combination == pytest.approx({"mass": 0.01, "gear": 0.01})
+    assert result.without_effect == ("idle",)
+    assert np.isinf([result.half_width[name] for name in parameters]).all()
+    assert "Cannot be told apart: mass, gear. +1 % of mass with +1 % of gear" in result.summary()
+    del parameters["idle"]
+    load = '<body name="load"><geom size=".05" mass="1"/></body>'
+    loaded = mg.load_scene(_CART.format(load))
+    both = [[alone], [Recording({"place": _course(mass=3.0)}, _DRIVE[:, None])]]
+    result = mg.identify([cart, loaded], parameters, both)
+    np.testing.assert_allclose([result.values["mass"], result.values["gear"]], [2, 3], rtol=1e-6)
+    np.testing.assert_allclose(result.scenes[1].model.body_mass, [0, 2, 1], rtol=1e-6)
+    assert result.inseparable == ()
+
+
+def test_starts_and_a_delay_are_found_with_the_parameter(cart):
+    """Controls 13 ms late, linear between their times; two recordings that begin elsewhere than they say."""
+    at = _STEP * np.arange(_STEPS)
+    drives = [_DRIVE, 1.5 * np.cos(np.arange(_STEPS) / 3)]
+    starts = [(0.02, -0.3), (-0.05, 0.1)]
+    recordings = [
+        Recording({"place": _course(3.6, 2.0, x, v, np.interp(at - 0.013, at, drive))}, drive[:, None])
+        for drive, (x, v) in zip(drives, starts, strict=True)
+    ]
+    parameters = {"gear": identification.gear(cart, "motor"), "delay": Parameter(0.005, 0.0, 0.03)}
+    result = mg.identify(cart, parameters, recordings, delay="delay", free_start=True)
+    np.testing.assert_allclose(result.values["gear"], 3.6, rtol=1e-6)
+    np.testing.assert_allclose(result.values["delay"], 0.013, rtol=1e-5)
+    np.testing.assert_allclose(result.offsets[0], starts, atol=1e-6)
+
+
+def test_through_a_bounce_the_search_converges_with_an_onset_and_stalls_without():
+    """The height of a drop from where the ball is after the impact, under MuJoCo's default contact.
+
+    The place then moves by −0.14 m per metre of height, and is a sawtooth of −2.4 without an onset. The recorded motion is the
+    simulation's own, so that both could come back to the height exactly.
+    """
+    scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body><joint type="slide" axis="0 0 1"/>
+        <geom size=".05" mass=".2"/><site name="tip"/></body></worldbody>
+        <sensor><framepos name="tip" objtype="site" objname="tip"/></sensor></mujoco>""")
+    times = 0.002 * np.arange(151)
+    late = times > 0.2
+
+    def raised(model, height):
+        return {"body_pos": model.body_pos.at[1, 2].set(height)}
+
+    found = {}
+    for name, onset in (("onset", mg.Onset()), ("discrete", None)):
+        start = mg.initial_state(scene, qvel=jnp.array([-1.0]))
+        course = mg.rollout(scene.with_model(**raised(scene.model, 0.25)), start, horizon=150, onset=onset).qpos + 0.25
+        measured = np.column_stack([np.zeros((151, 2)), course])
+        recording = Recording({"tip": measured[late]}, times=times[late], start=start)
+        found[name] = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], onset=onset)
+    assert found["onset"].stopped is Stopped.CONVERGED
+    np.testing.assert_allclose(found["onset"].values["height"], 0.25, atol=1e-6)
+    assert found["discrete"].stopped is Stopped.STALLED
+    assert abs(found["discrete"].values["height"] - 0.25) > 0.03
+
+
+def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_angle():
+    """A tumbling body: no residual in any window of its own motion; where a turn by 0.02 rad is measured, that turn."""
+    scene = mg.load_scene("""<mujoco><option timestep="0.01"/><worldbody>
+        <body><freejoint/><geom type="box" size=".1 .2 .3"/></body><body pos="1 0 0"><joint name="x" type="slide" axis="1 0 0"/>
+        <geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>""")
+    controls = np.cos(np.arange(30) / 4)[:, None]
+    start = mg.initial_state(scene, qvel=jnp.array([1.0, 0, 2, 3, -2, 1, 0.5]))
+    course = jax.jit(lambda: mg.rollout(scene, start, controls))()
+    qpos = np.array(course.qpos)
+    qpos[20:, 3:7] *= -1  # the same turn
+    turned = qpos.copy()
+    w, x, y, z = qpos[25, 3:7]
+    turned[25, 3:7] = [
+        w - 0.01 * x,
+        x + 0.01 * w,
+        y + 0.01 * z,
+        z - 0.01 * y,
+    ]  # q ⊗ (1, 0.01, 0, 0): 0.02 rad about its own x
+    noise = {"qpos": [1, 1, 1, 0.5, 0.5, 0.5, 1]}
+    whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
+    windows = stack(scene, whole.cut(0.08, 0.01))
+    assert windows.controls.shape == (3, 8, 1)
+    evaluate = jax.jit(jax.vmap(lambda w: residuals(scene, w, None, None, onset=None, gradient="discrete")[0]))
+    found = np.array(evaluate(windows))[:, : 9 * 7].reshape(3, 9, 7)
+    assert np.abs(found).max() < 1e-7
+    whole_found = np.array(evaluate(stack(scene, [whole]))[0][: 31 * 7]).reshape(31, 7)
+    np.testing.assert_allclose(whole_found[25], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
+
+
+def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optimistix", None)
+    with pytest.raises(ImportError, match=r"pip install 'mjxgrad\[identify\]'"):
+        mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (
+            lambda cart: Recording({"place": np.zeros(3)}, times=[0, 1]),
+            "measured and times of the recording must have the same number",
+        ),
+        (lambda cart: Recording({"place": np.zeros(2)}, times=[1, 0]), "times of the recording must increase"),
+        (
+            lambda cart: Recording({"place": np.zeros(2)}, noise={"palce": 1}),
+            "noise of the recording must name measured signals",
+        ),
+        (lambda cart: Recording({"place": np.zeros(9)}).cut(0.1, 0.01), "must have measured qpos and qvel to be cut"),
+        (
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)))]),
+            "controls of the recording must have a row for each of 4",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((9, 2)))]),
+            "must have 1 columns in this scene",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"qvel": np.zeros((5, 2))})]),
+            "qvel of the recording must have 1 columns",
+        ),
+        (
+            lambda cart: stack(cart, [Recording({"speed": np.zeros(5)})]),
+            "there is no sensor 'speed'; named sensors are 'place'",
+        ),
+        (lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, []), "recordings must hold at least one"),
+        (
+            lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})], delay="b"),
+            "delay must name one",
+        ),
+    ],
+)
+def test_refusals_name_the_remedy(cart, build, message):
+    with pytest.raises(ValueError, match=message):
+        build(cart)

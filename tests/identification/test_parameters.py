@@ -1,0 +1,155 @@
+"""Parameters: bounds as coordinates, makers that write what they say, and inertias as ten numbers."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import identification
+from mjxgrad.identification.inertia import body_fields, logarithms, pseudo_inertia, second_moments
+from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
+
+_SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1" friction=".4"/>
+  <body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0" damping="2" armature=".3"/>
+    <geom name="rod" type="capsule" fromto="0 0 0 0 0 .4" size=".03" mass=".5"/>
+    <body name="ball" pos="0 0 .4"><joint name="slide" type="slide" axis="0 0 1" damping="1"/>
+      <geom name="ball" size=".1" mass="2"/></body></body></worldbody>
+  <actuator><motor name="motor" joint="hinge" gear="3"/>
+    <position name="servo" joint="slide" kp="50" kv="4"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return mg.load_scene(_SCENE, keep_everything=True)
+
+
+def test_the_search_begins_at_the_nominal_values_and_stays_within_the_bounds():
+    """Between two bounds, above one, below one, without, on one."""
+    inf = np.inf
+    rows = [(1.0, 0.5, 4.0), (3.0, 1.0, inf), (-2.0, -inf, 1.0), (0.7, -inf, inf), (0.5, 0.5, 4.5)]
+    coordinates = Coordinates.of({str(i): Parameter(*row) for i, row in enumerate(rows)})
+    values = jax.jit(jax.vmap(coordinates.values))(jnp.linspace(-3, 3, 61)[:, None].repeat(5, axis=1))
+    np.testing.assert_allclose(values[30], [1.0, 3.0, -2.0, 0.7, 0.5])
+    np.testing.assert_allclose(values[31] - values[30], 0.1 * np.array([3.5, 2.0, 3.0, 0.7, 4.0]))
+    np.testing.assert_allclose(values[0], [0.5, 1.0, -11.0, -1.4, 0.5])
+    np.testing.assert_allclose(values[60], [4.0, 9.0, 1.0, 2.8, 4.5])
+    lower, upper = coordinates.is_at_bound(values[0])
+    np.testing.assert_array_equal(lower, [True, True, False, False, True])
+    assert not upper.any()
+
+
+def test_makers_write_what_they_say(scene):
+    """Each of them at twice its nominal value, read from the model."""
+    made = {
+        "mass": identification.mass(scene, "ball"),
+        "friction": identification.friction(scene, pairs=(("floor", "ball"),)),
+        "damping": identification.damping(scene, "hinge"),
+        "armature": identification.armature(scene, "hinge"),
+        "gear": identification.gear(scene, "motor"),
+        "gains": identification.gains(scene, "servo"),
+        "zeta": identification.softness(scene, "damping_ratio"),
+    }
+    expected = {"mass": 2.0, "friction": 1.0, "damping": 2.0, "armature": 0.3, "gear": 3.0, "gains": [50.0, 4.0]}
+    for name, value in expected.items():
+        np.testing.assert_allclose(made[name].nominal, value, err_msg=name)
+    changed = write_all(scene, made, {name: jnp.asarray(2 * one.nominal) for name, one in made.items()})
+    before, after = scene.model, changed.model
+    np.testing.assert_allclose(after.body_mass, [0, 0.5, 4])
+    np.testing.assert_allclose(after.body_inertia[2], 2 * before.body_inertia[2])
+    np.testing.assert_allclose(after.dof_damping, [4, 1])
+    np.testing.assert_allclose(after.dof_armature, [0.6, 0])
+    np.testing.assert_allclose(after.actuator_gear[:, 0], [6, 1])
+    np.testing.assert_allclose(after.actuator_gainprm[1, 0], 100)
+    np.testing.assert_allclose(after.actuator_biasprm[1, 1:3], [-100, -8])
+    index = next(i for i, pair in enumerate(scene.pairs) if set(pair.names) == {"floor", "ball"})
+    parameters, present = changed.contact_parameters(), scene.contact_parameters()
+    np.testing.assert_allclose(parameters.friction[index, 0], 2)
+    np.testing.assert_allclose(parameters.damping_ratio, 2 * present.damping_ratio)
+    np.testing.assert_allclose(parameters.stiffness, present.stiffness)
+
+
+def test_what_follows_from_a_mass_follows_as_when_recompiled(scene):
+    """The inverse weights of contact rows, against MuJoCo's own compiler."""
+    mass = identification.mass(scene, "ball")
+    found = write_all(scene, {"mass": mass}, {"mass": jnp.asarray(5.0)}).model
+    recompiled = mujoco.MjModel.from_xml_string(_SCENE.replace('mass="2"', 'mass="5"'))
+    for name in ("body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"):
+        np.testing.assert_allclose(getattr(found, name), getattr(recompiled, name), rtol=1e-9, err_msg=name)
+
+
+def _random_body(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(12, 3)) * [0.1, 0.2, 0.3] + [0.05, -0.1, 0.2]
+    weights = rng.uniform(0.1, 1, 12)
+    homogeneous = np.column_stack([points, np.ones(12)])
+    return homogeneous.T @ (weights[:, None] * homogeneous), points, weights
+
+
+def test_a_pseudo_inertia_comes_back_from_its_ten_numbers_and_from_mujocos_fields():
+    """Second moments of twelve points of mass, by definition."""
+    pseudo, points, weights = _random_body(0)
+    numbers = logarithms(pseudo)
+    np.testing.assert_allclose(pseudo_inertia(jnp.asarray(numbers)), pseudo, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(2 * numbers[0]), weights.sum())
+    np.testing.assert_allclose(numbers[7:], weights @ points / weights.sum())
+    fields = [np.asarray(x, float) for x in body_fields(jnp.asarray(pseudo)).values()]
+    np.testing.assert_allclose(second_moments(*fields), pseudo, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("body", ["irregular", "ball"])
+def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
+    """A ball has equal moments, whose axes have no derivative; there and back the tensor has one, the identity."""
+    ball = np.diag([0.02, 0.02, 0.02, 3.0])
+    start = logarithms(_random_body(1)[0] if body == "irregular" else ball)
+
+    def there_and_back(numbers):
+        fields = body_fields(pseudo_inertia(numbers))
+        w, x, y, z = fields["body_iquat"]
+        rotation = jnp.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        about = rotation @ jnp.diag(jnp.sum(fields["body_inertia"]) / 2 - fields["body_inertia"]) @ rotation.T
+        offset = jnp.append(fields["body_ipos"], 1.0)
+        return fields["body_mass"] * jnp.outer(offset, offset) + jnp.pad(about, (0, 1))
+
+    found, expected = (jax.jacfwd(f)(jnp.asarray(start)) for f in (there_and_back, pseudo_inertia))
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
+    """The motion is that of the scene, to the share by which principal moments are kept apart (1.5e-8)."""
+    parameter = identification.inertia(scene, "ball")
+    changed = write_all(scene, {"ball": parameter}, {"ball": jnp.asarray(parameter.nominal)})
+    for name in ("body_mass", "body_ipos", "body_inertia", "dof_M0"):
+        np.testing.assert_allclose(
+            getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
+        )
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda scene: Parameter(3.0, 0.0, 1.0), "lower, nominal and upper must increase"),
+        (lambda scene: Parameter([1.0, 2.0], [0.0, 0.0, 0.0]), "lower must be one number or of shape"),
+        (lambda scene: Parameter(np.nan), "nominal must be finite"),
+        (lambda scene: identification.armature(scene, "slide"), "bounds of armature must be given"),
+        (
+            lambda scene: identification.mass(scene, "leg"),
+            "there is no body 'leg'; named bodies are 'world', 'arm', 'ball'",
+        ),
+        (
+            lambda scene: identification.softness(scene, "hardness"),
+            "part must be one of stiffness, damping_ratio, width",
+        ),
+        (lambda scene: Coordinates.of({}), "parameters must name at least one"),
+    ],
+)
+def test_refusals_name_the_remedy(scene, build, message):
+    with pytest.raises(ValueError, match=message):
+        build(scene)

@@ -1,0 +1,94 @@
+"""What residuals and their derivative say of parameters: intervals, what has no effect, what cannot be told apart."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from mjxgrad.identification.parameters import Coordinates, Parameter
+from mjxgrad.identification.result import statistics
+from mjxgrad.identification.search import _removable, _without_offsets
+
+
+def _coordinates(**nominal):
+    return Coordinates.of({name: Parameter(value, -10.0, 10.0) for name, value in nominal.items()})
+
+
+def _judge(slope, residual, **nominal):
+    values = np.array(list(nominal.values()), float)
+    return statistics(_coordinates(**nominal), values, residual, slope, len(residual), 0)
+
+
+def test_intervals_cover_as_often_as_they_say():
+    """600 regressions on 12 numbers, so few that Student's distribution is not the normal one (2.3 in place of 2.0 errors)."""
+    rng = np.random.default_rng(0)
+    design = rng.normal(size=(12, 3)) @ np.array([[1, 0.9, 0], [0, 1, 0], [0, 0.3, 2]])
+    truth, covered = np.array([1.0, -2.0, 0.5]), []
+    for _ in range(600):
+        measured = design @ truth + 0.3 * rng.normal(size=12)
+        fit = np.linalg.lstsq(design, measured, rcond=None)[0]
+        found = _judge(design, design @ fit - measured, a=fit[0], b=fit[1], c=fit[2])
+        covered.append(np.abs(fit - truth) < found.half_width)
+    share = np.mean(covered, axis=0)
+    error = np.sqrt(0.95 * 0.05 / 600)
+    np.testing.assert_allclose(share, 0.95, atol=3.5 * error)
+
+
+def test_the_covariance_is_the_textbooks():
+    rng = np.random.default_rng(1)
+    design, residual = rng.normal(size=(30, 2)), rng.normal(size=30)
+    found = _judge(design, residual, a=1.0, b=2.0)
+    expected = residual @ residual / 28 * np.linalg.inv(design.T @ design)
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-10)
+    np.testing.assert_allclose(found.half_width, scipy.stats.t.ppf(0.975, 28) * np.sqrt(np.diag(expected)))
+
+
+def test_what_has_no_effect_is_named_and_leaves_the_others_their_intervals():
+    rng = np.random.default_rng(2)
+    design = rng.normal(size=(20, 2))
+    residual = rng.normal(size=20)
+    with_idle = np.column_stack([design[:, 0], np.zeros(20), design[:, 1]])
+    found, alone = _judge(with_idle, residual, a=1.0, idle=1.0, b=1.0), _judge(design, residual, a=1.0, b=1.0)
+    assert found.without_effect == ("idle",)
+    assert found.inseparable == ()
+    np.testing.assert_allclose(found.half_width, [alone.half_width[0], np.inf, alone.half_width[1]])
+    assert found.condition_number == pytest.approx(alone.condition_number)
+
+
+def test_combinations_that_cannot_be_told_apart_are_named_with_their_shares():
+    """Only a/b² and c·d are seen, and e: a by 1 % with b by half of it, c by 1 % with d by −1 %."""
+    rng = np.random.default_rng(3)
+    first, second, third = rng.normal(size=(3, 25))
+    a, b, c, d, e = 2.0, 3.0, -0.5, 4.0, 1.0
+    slope = np.column_stack([first / b**2, -2 * a * first / b**3, second * d, second * c, third])
+    found = _judge(slope, rng.normal(size=25), a=a, b=b, c=c, d=d, e=e)
+    named = {tuple(sorted(one)): one for one in found.inseparable}
+    assert set(named) == {("a", "b"), ("c", "d")}
+    assert named["a", "b"]["b"] / named["a", "b"]["a"] == pytest.approx(0.5)
+    assert named["c", "d"]["d"] / named["c", "d"]["c"] == pytest.approx(-1.0)
+    np.testing.assert_array_equal(np.isfinite(found.half_width), [False, False, False, False, True])
+
+
+def test_what_the_derivative_could_still_remove_is_one_at_a_slope_and_zero_at_a_minimum():
+    rng = np.random.default_rng(4)
+    design = rng.normal(size=(15, 2))
+    outside = rng.normal(size=15)
+    outside -= design @ np.linalg.lstsq(design, outside, rcond=None)[0]
+    for residual, expected in ((outside, 0.0), (design @ np.array([1.0, 3.0]), 1.0)):
+        assert float(_removable((jnp.zeros(2), jnp.asarray(residual), jnp.asarray(design)))) == pytest.approx(
+            expected, abs=1e-12
+        )
+
+
+def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
+    """Three windows with two offsets each: the parameters' block of the whole covariance."""
+    rng = np.random.default_rng(6)
+    shared, offsets, residual = rng.normal(size=(3, 9, 2)), rng.normal(size=(3, 9, 2)), rng.normal(size=(3, 9))
+    whole = np.column_stack(
+        [shared.reshape(27, 2), np.kron(np.eye(3), np.ones((9, 2))) * np.tile(offsets.reshape(27, 2), 3)]
+    )
+    flat, slope, count = _without_offsets([(residual, shared, offsets)])
+    found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), flat, slope, 27, count)
+    expected = (residual**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
+    assert count == 6
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-10)
