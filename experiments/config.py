@@ -72,13 +72,14 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     for varied in combinations:
         candidate = json.loads(json.dumps(table, default=str))
         for key, value in varied.items():
-            _assign(candidate, key.split("."), value)
+            if wrong := _assign(candidate, key.split("."), value):
+                problems.append(f"sweep.{wrong}")
         _choose_size(candidate)
         settings, found = _validate(candidate, swept=set(sweep))
         problems += found
         runs.append(Run(path.stem, settings, question or path.stem, expected, varied))
     if problems or sweep_problems:
-        raise ConfigurationError(path.name, problems + sweep_problems)
+        raise ConfigurationError(path.name, list(dict.fromkeys(problems + sweep_problems)))
     return runs
 
 

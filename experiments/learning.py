@@ -184,7 +184,7 @@ def _course(
         settings=how,
         log=log,
         log_every=_every(settings),
-        checkpoint=workspace.kept / f"{method}-{stiffness:g}",
+        checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
     )
     judge = jax.vmap(
         lambda policy, key: learning.evaluate(stiffer, policy, key, num_episodes=settings.sizes.num_episodes),

@@ -81,11 +81,8 @@ def _toml_lines(table: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def keeping(folder: Path, fingerprint: str) -> Path:
-    """Return a folder beside an output folder for what is finished of a run, by all that decides its result."""
-    kept = folder.with_name(f".{folder.name}.kept-{fingerprint[:16]}")
-    with writing(folder):
-        kept.mkdir(parents=True, exist_ok=True)
-    return kept
+    """Name a folder beside an output folder for what is finished of a run, by all that decides its result."""
+    return folder.with_name(f".{folder.name}.kept-{fingerprint[:16]}")
 
 
 def forget(folder: Path) -> None:

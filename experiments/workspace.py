@@ -15,16 +15,18 @@ if TYPE_CHECKING:
 
 
 class Workspace:
-    """An output folder under construction, with the time of its stages and what a reader must know of its scenes.
-
-    What is written under `kept` outlives an interruption, and is there again when the same run is begun anew.
-    """
+    """An output folder under construction, with the time of its stages and what a reader must know of its scenes."""
 
     def __init__(self, folder: Path, kept: Path | None = None):
         self.folder = folder
-        self.kept = folder / "kept" if kept is None else kept
+        self._kept = folder / "kept" if kept is None else kept
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
+
+    def keep(self, name: str) -> Path:
+        """Return where to write what outlives an interruption, and is there again when the same run is begun anew."""
+        self._kept.mkdir(parents=True, exist_ok=True)
+        return self._kept / name
 
     def check(self, scene: "Scene", *, speed: float | None = None, name: str | None = None) -> None:
         """Note what the time step of a scene, whose bodies meet at a speed (m/s), does not follow, for the report."""

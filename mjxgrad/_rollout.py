@@ -19,6 +19,7 @@ from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.dynamics.onset import reach
 from mjxgrad.scene import Scene, SceneWarning
+from mjxgrad.scene.scene import numbers_of
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 """From its parameters and what it sees to controls."""
@@ -58,7 +59,7 @@ class Trajectory(eqx.Module):
             (of the last step for the last state); None without it.
         seen: what a policy that sees observations was called with, stacked; None for others.
         final: the last state, to continue from.
-        diverged: whether some step gave a non-finite or runaway state.
+        diverged: whether some step gave a non-finite or runaway state, or the model holds what is no number.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
         unsolved: number of steps before it whose solve ran into the model's limit of iterations, short of its tolerance, or
             whose forces, by an estimate of rounding, this precision does not resolve to a thousandth. There the motion is not
@@ -232,7 +233,8 @@ def rollout(
         state, before, first_bad, unsolved, crowded, tangent, growth = carry
         index, row, disturbance = inputs
         seen = None if before is None else look(state, before)
-        ctrl = (row if policy is None else policy(params, state if before is None else seen)) + disturbance
+        chosen = row if policy is None else _one_each(policy(params, state if before is None else seen), nu)
+        ctrl = chosen + disturbance
         data = data_of(scene, state, ctrl)
         if measure_growth:
 
@@ -263,7 +265,7 @@ def rollout(
     start = (
         state,
         scene.data.ctrl if policy_looks else None,  # the control before, under which a policy looks
-        jnp.full((), -1, jnp.int32),
+        jnp.where(_has_numbers(scene), jnp.int32(-1), jnp.int32(0)),
         jnp.zeros((), jnp.int32),
         jnp.zeros((), jnp.int32),
         _direction(state) if measure_growth else None,
@@ -291,6 +293,20 @@ def rollout(
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
+
+
+def _one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
+    """Refuse what a policy chose unless it is one control per actuator: others would be added up, or shared out, in silence."""
+    if chosen is None or jnp.shape(chosen) != (num_controls,):
+        given = "None" if chosen is None else f"shape {jnp.shape(chosen)}"
+        raise ValueError(f"the policy must return one control per actuator, shape ({num_controls},), got {given}")
+    return jnp.asarray(chosen)
+
+
+def _has_numbers(scene: Scene) -> Bool[Array, ""]:
+    """Whether what only the running program knows of a model are numbers: a contact of NaN would not be felt at all."""
+    traced = [x for x in numbers_of(scene.model).values() if isinstance(x, jax.core.Tracer)]
+    return jnp.array(True) if not traced else ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced]))
 
 
 def _check_engine(engine: str, given: list[str]) -> None:

@@ -170,3 +170,23 @@ def test_mistakes_are_named(scene, arguments, message):
 def test_a_state_of_the_wrong_size_is_named(scene):
     with pytest.raises(ValueError, match=r"qpos must have shape \(2,\) in this scene, got \(3,\)"):
         mg.initial_state(scene, qpos=jnp.zeros(3))
+
+
+@pytest.mark.parametrize("chosen", [None, jnp.array(1.0), 100 * jnp.arange(4.0)], ids=["nothing", "a number", "four"])
+def test_a_policy_gives_one_control_per_actuator(scene, chosen):
+    """Four would be added up by the one motor, a number shared out."""
+    with pytest.raises(ValueError, match=r"must return one control per actuator, shape \(1,\), got"):
+        mg.rollout(scene, mg.initial_state(scene), lambda params, state: chosen, horizon=2)
+
+
+@pytest.mark.parametrize("stiffness", [jnp.nan, -1e3, 0.0])
+def test_a_contact_without_a_stiffness_is_flagged_where_only_the_program_knows_it(scene, stiffness):
+    """Outside of jit it is refused; inside the ball would fall through the floor in silence."""
+
+    @jax.jit
+    def land(stiffness):
+        softer = scene.with_softness(mg.Softness(stiffness=stiffness))
+        return mg.rollout(softer, mg.initial_state(scene), horizon=2)
+
+    assert bool(land(stiffness).diverged)
+    assert not bool(land(1e3).diverged)

@@ -1,5 +1,7 @@
 """The answer of a bias and variance experiment, computed from its numbers, and its pictures."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +21,44 @@ from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 
 
+@dataclass(frozen=True)
+class Words:
+    """What the numbers of a problem are called."""
+
+    knob: str  # what is swept
+    per: str  # its unit, after a space; nothing if it has none
+    place: str  # the parameter
+    at: str  # its unit, likewise
+    cost: str  # with its unit
+    gradient: str  # unit of the gradient, after a comma
+    shown: str  # what the landscape shows
+    lead: str = ""  # before a value of what is swept
+
+
+_WORDS = {
+    "ball_wall": Words(
+        "contact stiffness", " 1/s²", "angle of the throw", " rad", "cost, m²", ", m²/rad",
+        "where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer the wall the sharper",
+    ),
+    "ramp": Words(
+        "slope of the ramp", "", "parameter", "", "cost", "", "a ramp from 0 to −1, and the steeper the more it is a step",
+        "slope ",
+    ),
+}  # fmt: skip
+
+
+def _words(outcome: Outcome) -> Words:
+    return _WORDS[outcome.settings.task]
+
+
+def _titled(name: str, unit: str) -> str:
+    """Name an axis."""
+    return f"{name},{unit}" if unit else name
+
+
 def verdict(outcome: Outcome) -> str:
     """Say where each estimate is to be used."""
-    choice = f"With {outcome.settings.rollouts_per_gradient} rollouts per gradient {_choice(outcome.swept)}."
+    choice = f"With {outcome.settings.rollouts_per_gradient} rollouts per gradient {_choice(outcome.swept, _words(outcome))}."
     return " ".join([choice, _bias(outcome), *_default(outcome)])
 
 
@@ -44,19 +81,18 @@ def tables(outcome: Outcome) -> list[Table]:
                 "first" if one.first_wins else "zeroth" if one.zeroth_wins else "either",
             ]
         )
-    columns = (
-        "stiffness, 1/s²", "angle, rad", "first order", "zeroth order", "reference", "bias of first order",
-        "variance ratio", "use",
-    )  # fmt: skip
+    words = _words(outcome)
+    heads = _titled(words.knob, words.per), _titled(words.place, words.at)
+    found = "first order", "zeroth order", "reference", "bias of first order", "variance ratio", "use"
     settings = outcome.settings
     caption = (
-        f"Gradients in m²/rad with half the width of their {settings.confidence:.0%} intervals, from {settings.num_samples} "
-        "rollouts each; † marks means of first order that surely have the wrong sign. A bias in bold differs from zero beyond "
-        "chance over the whole table. The ratio is the variance of a sample of first order over that of zeroth order. The "
-        "last column is the estimate with the clearly smaller expected error at "
+        f"Gradients{words.gradient.replace(',', ' in')} with half the width of their {settings.confidence:.0%} intervals, from "
+        f"{settings.num_samples} rollouts each; † marks means of first order that surely have the wrong sign. A bias in bold "
+        "differs from zero beyond chance over the whole table. The ratio is the variance of a sample of first order over that of "
+        "zeroth order. The last column is the estimate with the clearly smaller expected error at "
         f"{settings.rollouts_per_gradient} rollouts per gradient."
     )
-    return [Table(columns, rows, caption, frozenset(emphasised))]
+    return [Table((*heads, *found), rows, caption, frozenset(emphasised))]
 
 
 def _with_half_width(one: xr.Dataset, name: str) -> str:
@@ -65,49 +101,50 @@ def _with_half_width(one: xr.Dataset, name: str) -> str:
     return quantity(value) if half < 1e-3 * abs(value) else quantity(value, half)
 
 
-def _choice(swept: xr.Dataset) -> str:
+def _choice(swept: xr.Dataset, words: Words) -> str:
     """Say up to which stiffness zeroth order is nowhere closer, by angle, and what comes beyond."""
     zeroth, last = swept.zeroth_wins.values, swept.stiffness.size
     until = np.where(zeroth.any(axis=0), zeroth.argmax(axis=0), last)
     beyond = np.arange(last)[:, None] >= until
     if (until == last).all():
-        return "first order is as close or closer at every stiffness and angle"
+        return f"first order is as close or closer at every {words.knob} and {words.place}"
     if (until == 0).all() and zeroth.all():
-        return "zeroth order is closer at every stiffness and angle"
+        return f"zeroth order is closer at every {words.knob} and {words.place}"
     parts = []
     for end in np.unique(until)[::-1]:
-        limit = f"up to {power(swept.stiffness.values[end - 1])} 1/s²"
+        limit = f"up to {words.lead}{power(swept.stiffness.values[end - 1])}{words.per}"
         where = "nowhere" if end == 0 else "everywhere" if end == last else limit
-        parts.append(f"{where} {_angles(swept.angle[until == end])}")
+        parts.append(f"{where} {_angles(swept.angle[until == end], words)}")
     count = f"{int((zeroth & beyond).sum())} of {int(beyond.sum())}"
     return f"first order is as close or closer {joined(parts)}, and beyond that zeroth order is closer in {count} cases"
 
 
-def _angles(angles: xr.DataArray) -> str:
-    return f"at {joined(f'{angle:g}' for angle in angles.values)} rad"
+def _angles(angles: xr.DataArray, words: Words) -> str:
+    return f"at {joined(f'{angle:g}' for angle in angles.values)}{words.at}"
 
 
-def _range(stiffness: xr.DataArray, rows: ArrayLike) -> str:
+def _range(stiffness: xr.DataArray, rows: ArrayLike, words: Words) -> str:
     """Words for the stiffnesses of some rows of the sweep: a range if they are neighbours, else a list."""
     picked = np.flatnonzero(np.asarray(rows))
     labels = [power(k) for k in stiffness.values[picked]]
     is_range = len(picked) > 2 and (np.diff(picked) == 1).all()
-    return f"from {labels[0]} to {labels[-1]} 1/s²" if is_range else f"at {joined(labels)} 1/s²"
+    ends = f"from {words.lead}{labels[0]} to {labels[-1]}{words.per}"
+    return ends if is_range else f"at {words.lead}{joined(labels)}{words.per}"
 
 
 def _bias(outcome: Outcome) -> str:
-    swept = outcome.swept
+    swept, words = outcome.swept, _words(outcome)
     biased = swept.is_biased.any("angle")
     if not biased.any():
         return f"No bias of the first-order estimate is seen in the sweep ({outcome.settings.confidence:.0%} over all cases)."
-    parts = [f"The first-order estimate is measurably biased {_range(swept.stiffness, biased)}"]
+    parts = [f"The first-order estimate is measurably biased {_range(swept.stiffness, biased, words)}"]
     # No bias seen is no bias only where one of half the gradient's own size would have been seen.
     half_width = (swept.bias_high - swept.bias_low) / 2
     is_blind = (half_width > abs(swept.reference).max("stiffness") / 2).any("angle") & ~biased
     if is_blind.any():
-        parts.append(f"{_range(swept.stiffness, is_blind)} it is too noisy to tell")
+        parts.append(f"{_range(swept.stiffness, is_blind, words)} it is too noisy to tell")
     if (is_clean := ~biased & ~is_blind).any():
-        parts.append(f"{_range(swept.stiffness, is_clean)} no bias is seen")
+        parts.append(f"{_range(swept.stiffness, is_clean, words)} no bias is seen")
     return "; ".join(parts) + "."
 
 
@@ -120,9 +157,6 @@ def _default(outcome: Outcome) -> list[str]:
         return [f"Under MuJoCo's default contact no bias is seen at any of the {count} angles."]
     sign = f", and has the wrong sign at {wrong}" if wrong else ""
     return [f"Under MuJoCo's default contact it is biased at {biased} of {count} angles{sign}."]
-
-
-UNIT = "1/s²"
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -141,26 +175,26 @@ def landscape(outcome: Outcome):
         else {"color": next(colours), "label": power(stiffness)}
         for stiffness, is_default in zip(table.stiffness.values, table.is_default.values, strict=True)
     ]
-    titles = ("Without noise", f"Mean under noise of {outcome.settings.stddev:g} rad")
+    words = _words(outcome)
+    titles = ("Without noise", f"Mean under noise of {outcome.settings.stddev:g}{words.at}")
     for axis, costs, title in zip(axes[0], (found.cost, found.smoothed), titles, strict=True):
         for cost, look in zip(costs, looks, strict=True):
             axis.plot(costs[costs.dims[1]], cost, lw=1.3, **look)
         for angle in table.angle.values:
             axis.axvline(angle, color=MUTED, lw=0.8, ls=(0, (2, 3)), zorder=0)
-        axis.set(title=title, xlabel="angle of the throw, rad", xlim=found.smooth_grid.values[[0, -1]])
+        axis.set(title=title, xlabel=_titled(words.place, words.at), xlim=found.smooth_grid.values[[0, -1]])
     # The landscape goes on to both sides, where costs that nobody sees would set the scale.
     seen = found.cost.sel(grid=slice(*found.smooth_grid.values[[0, -1]]))
     low, high = float(seen.min()), float(seen.max())
     axes[0, 0].set_ylim(low - 0.04 * (high - low), high + 0.06 * (high - low))
-    axes[0, 0].set_ylabel("cost, m²")
+    axes[0, 0].set_ylabel(words.cost)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", title=f"stiffness, {UNIT}")
+    figure.legend(handles, labels, loc="outside right upper", title=_titled(words.knob, words.per))
     caption = (
-        "Left, one rollout per angle: where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer "
-        "the wall the sharper. Right, what noise makes of it, and what both estimates are to differentiate. Dotted lines mark "
-        "the angles examined below."
+        f"Left, the cost by {words.place}: {words.shown}. Right, what noise makes of it, and what both estimates are to "
+        "differentiate. Dotted lines mark the places examined below."
     )
-    return figure, "The cost against the angle of the throw", caption
+    return figure, f"The cost against the {words.place}", caption
 
 
 def gradient(outcome: Outcome):
@@ -179,10 +213,10 @@ def gradient(outcome: Outcome):
         margin = 0.15 * (np.nanmax(ends) - np.nanmin(ends) or 1.0)
         axis.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
         axis.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useMathText=True)
-    axes[0, 0].set_ylabel("gradient, m²/rad")
+    axes[0, 0].set_ylabel(f"gradient{_words(outcome).gradient}")
     theme.legend_below(figure, axes[0, 0], 3)
     caption = (
-        f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each angle. "
+        f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each place. "
         "The reference comes from rollouts of its own; the grey band is its interval. Intervals that leave a panel are "
         f"cut.{_diamond(outcome)}"
     )
@@ -208,8 +242,9 @@ def bias_variance(outcome: Outcome):
         _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
         _bars(below, one, "first_order_variance", FIRST, "o", "first order")
         below.set_yscale("log")
-    axes[0, 0].set_ylabel("bias of first order, m²/rad")
-    axes[1, 0].set_ylabel("variance of one sample, (m²/rad)²")
+    words = _words(outcome)
+    axes[0, 0].set_ylabel(f"bias of first order{words.gradient}")
+    axes[1, 0].set_ylabel(f"variance of one sample{', (m²/rad)²' if words.gradient else ''}")
     theme.legend_below(figure, axes[1, 0], 2)
     percent = f"{outcome.settings.confidence:.0%}"
     caption = (
@@ -242,7 +277,8 @@ def choice(outcome: Outcome):
         axis.axvline(count - 0.5, color="white", lw=6)
     axis.set_xticks(range(len(names)), names)
     axis.set_yticks(range(table.angle.size), [f"{angle:g}" for angle in table.angle.values])
-    axis.set(xlabel=f"contact stiffness, {UNIT}", ylabel="angle, rad")
+    words = _words(outcome)
+    axis.set(xlabel=_titled(words.knob, words.per), ylabel=_titled(words.place, words.at))
     axis.set_title(f"Expected error with {budget} rollouts: first order over zeroth order")
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
@@ -273,7 +309,7 @@ def video(outcome: Outcome, workspace: Workspace, wanted: ThrowsSettings) -> tup
         for i in range(len(wanted.stiffness))
         for qpos in throw(jax.tree.map(lambda leaf, i=i: leaf[i], knob), jnp.asarray(wanted.angles))
     ]
-    titles = [f"{angle:g} rad, stiffness {power(k)} {UNIT}" for k in wanted.stiffness for angle in wanted.angles]
+    titles = [f"{angle:g} rad, stiffness {power(k)} 1/s²" for k in wanted.stiffness for angle in wanted.angles]
     caption = f"Throws without noise, by angle (columns) and stiffness of the wall (rows), {shown_speed(wanted.speed)}."
     return film(workspace, motions, wanted, camera="side", caption=caption, titles=titles, columns=len(wanted.angles))
 
@@ -284,7 +320,7 @@ def _diamond(outcome: Outcome) -> str:
 
 
 def _panels(outcome: Outcome, *, rows: int, height: float):
-    table = outcome.table
+    table, words = outcome.table, _words(outcome)
     figure, axes = subplots(rows, table.angle.size, height=height, sharex=True, sharey="row" if rows > 1 else False)
     first, last = np.log10(outcome.swept.stiffness.values[[0, -1]])
     ticks = 10.0 ** np.arange(np.ceil(first - 1e-9), last + 1e-9, 1 if last - first <= 3 else 2)
@@ -295,8 +331,8 @@ def _panels(outcome: Outcome, *, rows: int, height: float):
         for stiffness in table.stiffness.values[table.is_default.values]:
             axis.axvline(stiffness, color=MUTED, lw=1.0, ls=(0, (4, 3)), zorder=0)
     for top, bottom, angle in zip(axes[0], axes[-1], table.angle.values, strict=True):
-        top.set_title(f"{angle:g} rad")
-        bottom.set_xlabel(f"stiffness, {UNIT}")
+        top.set_title(f"{angle:g}{words.at}" if words.at else f"{words.place} {angle:g}")
+        bottom.set_xlabel(_titled(words.knob, words.per))
     return figure, axes
 
 

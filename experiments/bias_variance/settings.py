@@ -22,11 +22,11 @@ class Settings(RunSettings):
     task: Literal["ball_wall", "ramp"]
     """What is differentiated."""
     stddev: Positive
-    """Of the noise on the angle, in rad."""
+    """Of the noise on the angle, in rad (on the ramp without a unit)."""
     angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=6)]
     """Where gradients are estimated, in rad."""
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=2)]
-    """Contact stiffness to sweep, in 1/s² (for the ramp its slope, in 1/rad)."""
+    """Contact stiffness to sweep, in 1/s² (for the ramp its slope, without a unit)."""
     damping_ratio: Positive = 1.0
     """Of the contacts, the same at every stiffness; 1 is critical."""
     include_default: bool = True

@@ -4,10 +4,13 @@ The numbers are those of `contact.parameters`, with $b = 2 \zeta \omega_0$. Rais
 it yield less to a sustained force. With a margin the force begins at that distance from the surface.
 """
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -34,6 +37,16 @@ _Pairs = tuple[ContactPair, ...]
 # As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
 _ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
+
+
+_REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "stiffness": (lambda x: x > 0, "positive"),
+    "damping_ratio": (lambda x: x >= 0, "at least 0"),
+    "impedance": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+    "width": (lambda x: x > 0, "positive"),
+    "margin": (lambda x: (x >= 0) & (x < np.inf), "finite and at least 0"),
+    "rest_acceleration": (lambda x: x > 0, "positive"),
+}
 
 
 class Softness(eqx.Module):
@@ -86,14 +99,7 @@ class Softness(eqx.Module):
             raise ValueError(f"Softness takes either geoms or pairs, bodies or groups, got {' and '.join(given)}")
         if self.rest_acceleration is not None and self.margin is None:
             raise ValueError("rest_acceleration must come with a margin, got none; give Softness a margin, too")
-        for name, is_valid, requirement in (
-            ("stiffness", lambda x: x > 0, "positive"),
-            ("damping_ratio", lambda x: x >= 0, "at least 0"),
-            ("impedance", lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
-            ("width", lambda x: x > 0, "positive"),
-            ("margin", lambda x: (x >= 0) & np.isfinite(x), "finite and at least 0"),
-            ("rest_acceleration", lambda x: x > 0, "positive"),
-        ):
+        for name, (is_valid, requirement) in _REQUIREMENTS.items():
             value = getattr(self, name)
             if is_known(value) and not np.all(is_valid(np.asarray(value))):
                 raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
@@ -192,6 +198,7 @@ class Softness(eqx.Module):
                 raise ValueError(
                     f"{name} must be one value to be applied, got shape {shape}; apply a sweep under jax.vmap"
                 )
+        self = self._with_nan_for_what_is_refused()
         selected = self.selected(model)
         before = contact_parameters(model, selected)
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
@@ -214,6 +221,15 @@ class Softness(eqx.Module):
                 pair_solref=_write(model.pair_solref, explicit, solref),
             )
         return model
+
+    def _with_nan_for_what_is_refused(self) -> "Softness":
+        """Return the same with NaN in place of traced values out of range, by which a rollout is flagged as diverged."""
+        parts = {}
+        for name, (is_valid, _) in _REQUIREMENTS.items():
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer):
+                parts[name] = jnp.where(is_valid(value), value, jnp.nan)
+        return dataclasses.replace(self, **parts)
 
     def _solref(self, model: mjx.Model, pairs: tuple[ContactPair, ...], before: ContactParameters) -> Array:
         """The direct format for each pair, from a model that has the other parts."""

@@ -10,7 +10,7 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -66,7 +66,7 @@ def identify(
     apply: Apply | None = None,
     delay: str | None = None,
     free_start: bool = False,
-    onset: Onset | None = Onset(),  # noqa: B008, a constant
+    onset: Onset | Literal["default"] | None = "default",
     gradient: Gradient = "discrete",
     max_steps: int = 100,
     log: Log | None = None,
@@ -85,8 +85,8 @@ def identify(
         apply: called as `apply(scene, values)` after the parameters have written theirs, for what takes several of them.
         delay: name of the parameter, if any, by which controls act later than recorded (s).
         free_start: find the start of every recording, too, from where it says; for starts as noisy as the rest.
-        onset: as of `rollout`. Contacts then begin within the step, and the derivative is the slope of the motion. With None the
-            simulation is MuJoCo's to the bit, and a search through impacts may stall.
+        onset: as of `rollout`; by default `mg.Onset()`. Contacts then begin within the step, and the derivative is the slope of
+            the motion. With None the simulation is MuJoCo's to the bit, and a search through impacts may stall.
         gradient: as of `rollout`.
         max_steps: simulations with derivatives at most.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
@@ -129,9 +129,12 @@ def search(
     max_steps: int,
     log: Log | None,
     free_start: bool,
+    onset: Onset | Literal["default"] | None,
     **settings: Any,
 ) -> Identification:
     """Run the search over experiments of any kind; see `identify`."""
+    # Not made with the signature: that would use a device when the package is imported.
+    settings["onset"] = Onset() if isinstance(onset, str) else onset
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     try:  # before anything is compiled

@@ -10,7 +10,7 @@ Principal moments and axes of inertia are differenced as the pseudo-inertia: the
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ def identify_sequences(
     sensor_weights: dict[str, float] | None = None,
     held_out: Sequence[str] = (),
     free_start: bool = False,
-    onset: Onset | None = Onset(),  # noqa: B008, a constant
+    onset: Onset | Literal["default"] | None = "default",
     gradient: Gradient = "discrete",
     max_steps: int = 100,
     log: Log | None = None,

@@ -19,7 +19,7 @@ from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
 from mjxgrad.scene.omissions import LeaveOut, omit, switch_off
 from mjxgrad.scene.refusals import refusal_messages
-from mjxgrad.scene.scene import Scene, SceneWarning
+from mjxgrad.scene.scene import Scene, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
@@ -76,6 +76,9 @@ def load_scene(
         if not (math.isfinite(timestep) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
         mj_model.opt.timestep = timestep
+    elif not (math.isfinite(mj_model.opt.timestep) and mj_model.opt.timestep > 0):
+        remedy = "set it in <option>, or give load_scene a timestep"
+        raise SceneError(f"{name} must have a positive time step, got {mj_model.opt.timestep:g} s: {remedy}")
     if mj_model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
@@ -88,6 +91,8 @@ def load_scene(
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped)
     model, data = _put(stepped, name, max_contacts)
+    if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:
+        raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
     messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:

@@ -141,6 +141,12 @@ def test_a_mistake_in_a_sweep_is_told_once_and_by_its_path(write):
     }
 
 
+def test_a_sweep_below_a_value_is_refused(write):
+    """It would be swept in name alone: every run the same."""
+    found = mistakes(write(VALID + "[sweep]\nstddev.x = [1, 2]\n"))
+    assert found == ("sweep.stddev.x: stddev is a value, not a table",)
+
+
 def test_a_missing_file_is_answered_with_those_there_are():
     assert mistakes("ball_wal") == ('there is no such file; did you mean "ball_wall"?',)
 

@@ -146,7 +146,8 @@ def test_the_report_shows_question_verdict_and_settings_as_text(finished):
     verdict = json.loads((finished / "runs" / "steep" / "summary.json").read_text())["verdict"]
     assert "<h1>Does a &lt;steep&gt; step mislead?</h1>" in text
     assert verdict in text
-    assert "measurably biased at 10⁵ 1/s²" in verdict
+    assert "measurably biased at slope 10⁵" in verdict
+    assert not re.search(r"throw|wall|stiffness of|1/s²|m²", re.sub(r'"data:[^"]*"', "", text)), "it is a ramp"
     assert "<dt>reference_samples</dt><dd>500</dd>" in text
     assert str(finished) not in verdict
 

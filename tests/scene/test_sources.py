@@ -127,3 +127,16 @@ def test_float32_asks_for_no_more_than_it_resolves():
     np.testing.assert_allclose([float(raised), float(kept)], [1e-6, 1e-8], rtol=1e-6)
     # Digits that float32 has rounded, and nobody has changed, come back as they were.
     assert output[1] == "['tolerance'] True"
+
+
+@pytest.mark.parametrize("timestep", ["0", "-0.01", "nan"])
+def test_a_time_step_that_is_none_is_refused_in_a_file_too(timestep):
+    with pytest.raises(SceneError, match="must have a positive time step, got"):
+        load_scene(FALLING.replace("<mujoco>", f"<mujoco><option timestep='{timestep}'/>"))
+
+
+def test_what_is_no_number_is_named():
+    with pytest.raises(SceneError, match="must hold numbers, got NaN in geom_friction"):
+        load_scene(
+            "<mujoco><worldbody><body><freejoint/><geom size='.1' friction='nan 0 0'/></body></worldbody></mujoco>"
+        )
