@@ -189,7 +189,7 @@ def check(
         say("compiling three kinds of derivative")
         started = time.perf_counter()
         size = _BATCHES[scene.model.nv > _SMALL]
-        programs = Programs(scene, size, outcomes, tuple(KINDS))
+        programs = Programs(scene, size, outcomes, KINDS)
         programs.wait()
         spent["compiling"] = time.perf_counter() - started
         started = time.perf_counter()
