@@ -203,7 +203,9 @@ def recommend(
     found = slopes(measured)
     discrete, event, onset = found
     needs_none = not touches or (discrete.num_off == 0 and not discrete.error > _CLOSE)
-    best = discrete if needs_none else onset if onset.share_off <= event.share_off else event
+    # Where contacts chatter an event gradient has no bound, so it must be better beyond chance, of two counts.
+    is_event_better = onset.num_off - event.num_off > 2 * math.sqrt(onset.num_off + event.num_off)
+    best = discrete if needs_none else event if is_event_better else onset
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
