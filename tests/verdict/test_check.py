@@ -225,4 +225,5 @@ def test_gymnasiums_scenes_get_a_verdict_without_a_false_alarm(name):
     verdict = mg.check(ASSETS / f"{name}.xml")
     assert not kinds(verdict) & {"no_effect", "not_finite", "time_step", "no_contact"}
     discrete, _, onset = slopes(verdict.measured)
-    assert onset.num_off <= discrete.num_off
+    # Where nothing lands, both are the same to rounding.
+    assert not onset.error > 1.01 * discrete.error
