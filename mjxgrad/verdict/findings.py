@@ -150,11 +150,9 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     if not found[0].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
-    parts = [f"{words[one.kind]} {percent(one.error)} ({one.num_readings - one.num_off} are right)" for one in found]
-    count = found[0].num_readings
-    return Finding(
-        "slope", f"How far the mean derivative is from the slope, typical of {count} readings: {', '.join(parts)}."
-    )
+    parts = [f"{words[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in found]
+    lead = f"How far the mean derivative is from the slope, typical of {found[0].num_readings} readings."
+    return Finding("slope", f"{lead} {' '.join(parts)}")
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
