@@ -3,14 +3,14 @@
 import dataclasses
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, model_validator
 
 import mjxgrad as mg
 from experiments.report import Table
@@ -35,13 +35,12 @@ NAMES = {
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped"]
-_LOADERS = {
-    "cartpole": lambda _: envs.diffrl.cartpole(),
-    "quadruped": lambda _: envs.quadruped(),
-    **{name: getattr(envs.diffrl, name) for name in ("hopper", "half_cheetah", "ant", "humanoid")},
+_LOADERS: dict[str, Callable[..., Environment]] = {
+    "quadruped": envs.quadruped,
+    **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name != "quadruped"},
 }
+_OWN_STEPS = ("cartpole", "quadruped")  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
-_CAMERAS = {"cartpole": "side", "hopper": "track", "half_cheetah": "track", "ant": "track", "humanoid": "track"}
 
 
 class Sizes(SettingsTable):
@@ -80,6 +79,12 @@ class Settings(RunSettings):
     """The numbers that go with the size: those of the file's table of that name."""
     video: VideoSettings | None = None
     """Of the best policy."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Settings":
+        if self.num_substeps is not None and self.environment in _OWN_STEPS:
+            raise ValueError(f"num_substeps must be left out for the {self.environment}, whose time step is its own")
+        return self
 
     @property
     def num_steps(self) -> int:
@@ -152,10 +157,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 
 def _environment(settings: Settings) -> Environment:
-    loader = _LOADERS[settings.environment]
-    if settings.environment in ("cartpole", "quadruped"):
-        return loader(None)
-    return loader() if settings.num_substeps is None else loader(num_substeps=settings.num_substeps)
+    substeps = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
+    return _LOADERS[settings.environment](**substeps)
 
 
 def _course(
@@ -385,7 +388,7 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
         "episode at most."
     )
     model = with_coarse_shadows(environment.scene.to_mujoco())
-    camera = _CAMERAS.get(outcome.settings.environment, "")
+    camera = "side" if outcome.settings.environment == "cartpole" else "track"
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
 
 

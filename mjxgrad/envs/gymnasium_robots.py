@@ -35,8 +35,8 @@ class Robot(Environment):
         healthy_rest: most that all angles and speeds but those of the way may be (rad, m/s, rad/s).
         num_unseen: leading positions that are not observed, where it is.
         speed_limit: what observed speeds are clipped to.
-        position_noise, velocity_noise: uniform about the reference pose at the start; `is_normal` draws velocities from a normal
-            distribution.
+        noise: of positions and velocities at the start, uniform about the reference pose at rest.
+        is_normal: whether that of the velocities is normal instead.
         by_mass: whether the speed is that of the centre of mass.
     """
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.estimators.moments import Moments, as_real
+from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.rules import Evidence, Rule, Weights
 from mjxgrad.learning.networks import Network, Normaliser
 
@@ -201,11 +201,7 @@ def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments st
     Returns:
         The mixture, the weights by step and action, and what they were made of.
     """
-
-    def moments(samples: Float[Array, "environments nu"], mask: Bool[Array, " environments"]) -> Moments:
-        return Moments.of(samples, mask)
-
-    by_step = jax.vmap(moments, in_axes=1)
+    by_step = jax.vmap(Moments.of, in_axes=1)
     first = by_step(gradients.first, gradients.is_finite)
     zeroth = by_step(gradients.zeroth, jnp.ones_like(gradients.is_finite))
     difference = by_step(gradients.zeroth - gradients.first, gradients.is_finite)
@@ -219,6 +215,7 @@ def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments st
 
 def _evidence(first: Moments, zeroth: Moments, difference: Moments) -> Evidence:
     """Return what a rule may look at, of each step and action."""
+    variance = jax.vmap(Moments.variance)
     zero, unknown = jnp.zeros_like(first.offset), jnp.full_like(first.offset, jnp.nan)
     return Evidence(
         count=jnp.broadcast_to(first.count[:, None], zero.shape),
@@ -226,16 +223,12 @@ def _evidence(first: Moments, zeroth: Moments, difference: Moments) -> Evidence:
         first_norm=jnp.abs(first.mean),
         zeroth_norm=jnp.abs(zeroth.mean),
         difference_norm=jnp.abs(difference.mean),
-        first_variance=_variance(first),
-        zeroth_variance=_variance(zeroth),
-        difference_variance=_variance(difference),
+        first_variance=variance(first),
+        zeroth_variance=variance(zeroth),
+        difference_variance=variance(difference),
         inconsistency=zero,
         relative_bias_bound=unknown,
         cost_variance=unknown,
         scaled_first_variance=unknown,
         scaled_first_norm=unknown,
     )
-
-
-def _variance(moments: Moments) -> Float[Array, "steps nu"]:
-    return moments.squares / as_real(jnp.maximum(moments.count - 1, 1), moments.squares)[:, None]

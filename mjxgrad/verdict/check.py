@@ -41,10 +41,8 @@ Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
 MOST_PAIRS = 20_000
 """Pairs of geoms beyond which loading takes minutes and a scene is refused."""
-_SMALL, _BATCHES = (
-    12,
-    (64, 32),
-)  # degrees of freedom up to which a batch has the first number of motions, else the second
+_SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, beyond the second
+_BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
