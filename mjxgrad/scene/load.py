@@ -22,6 +22,8 @@ from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
+MOST_PAIRS = 20_000
+"""Pairs of geoms beyond which loading takes minutes and a scene is refused."""
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -30,7 +32,7 @@ class SceneError(ValueError):
 
 
 def load_scene(
-    source: str | os.PathLike[str] | mujoco.MjModel,
+    source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel,
     *,
     softness: Softness | None = None,
     leave_out: LeaveOut | None = None,
@@ -45,7 +47,7 @@ def load_scene(
     with are not resolved below, and the solver would only run into its iteration limit.
 
     Args:
-        source: path of an MJCF file, MJCF as a string, or a C model, which is not changed.
+        source: path of an MJCF file, MJCF as a string, a `MjSpec` or a C model; neither is changed.
         softness: contact softness to set, instead of that in the file.
         leave_out: contacts and limits to do without on top of that; see `LeaveOut`.
         keep_everything: leave out nothing, and keep the solver tolerance and the storage of
@@ -61,17 +63,18 @@ def load_scene(
     Raises:
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if the path is a folder.
-        TypeError: if the source is none of the three.
+        TypeError: if the source is none of these.
         ValueError: if `timestep` or `max_contacts` is not positive, `leave_out` does not fit the scene or is given beside
             `keep_everything`, or as `Softness.apply`.
-        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or MJX cannot simulate
-            it; all unsupported features are named at once.
+        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, so many geoms can touch that
+            loading would take minutes, or MJX cannot simulate it; all unsupported features are named at once.
     """
     if keep_everything and leave_out is not None:
         raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     mj_model, name = _compile(source)
+    _refuse_many_pairs(mj_model, name)
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
@@ -103,11 +106,13 @@ def load_scene(
     return scene
 
 
-def _compile(source: str | os.PathLike[str] | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:
+def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:
     """The C model of a source, ours to change, and how messages call it."""
     if isinstance(source, mujoco.MjModel):
         return copy.deepcopy(source), "the model"
-    accepted = "an MJCF file, MJCF as a string (starting with '<') or a mujoco.MjModel"
+    if isinstance(source, mujoco.MjSpec):
+        return _parse(lambda spec: spec.copy().compile(), source, "the MjSpec")
+    accepted = "an MJCF file, MJCF as a string (starting with '<'), a mujoco.MjSpec or a mujoco.MjModel"
     if not isinstance(source, str | os.PathLike):
         raise TypeError(f"source must be {accepted}, got {type(source).__name__}")
     if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
@@ -121,12 +126,37 @@ def _compile(source: str | os.PathLike[str] | mujoco.MjModel) -> tuple[mujoco.Mj
     return _parse(mujoco.MjModel.from_xml_path, str(path), path.name)
 
 
-def _parse(read, argument: str, name: str) -> tuple[mujoco.MjModel, str]:
+def _parse(read, argument: str | mujoco.MjSpec, name: str) -> tuple[mujoco.MjModel, str]:
     try:
         return read(argument), name
     except ValueError as error:
         message = " ".join(str(error).split())
         raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (error)
+
+
+def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
+    count = count_pairs(model)
+    if count > MOST_PAIRS:
+        raise SceneError(
+            f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
+            "touch contype and conaffinity that do not match; then max_contacts bounds those that do"
+        )
+
+
+def count_pairs(model: mujoco.MjModel) -> int:
+    """Count pairs of geoms of different bodies whose contype and conaffinity match, without listing them."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return 0
+    keys = np.stack([model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]], axis=1)
+
+    def matching(columns: np.ndarray) -> int:
+        kinds, counts = np.unique(columns, axis=0, return_counts=True)
+        first, second = kinds[:, :1], kinds[:, 1:2]
+        match = ((first & second.T) | (second & first.T)) != 0
+        return int(counts @ match @ counts)
+
+    own = sum(matching(keys[keys[:, 2] == body, :2]) for body in np.unique(keys[:, 2]))
+    return (matching(keys[:, :2]) - own) // 2
 
 
 def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:

@@ -21,6 +21,7 @@ from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.omissions import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.scene import Scene, SceneError, load_scene
+from mjxgrad.scene.load import count_pairs
 from mjxgrad.verdict.findings import (
     MANY_PAIRS,
     Finding,
@@ -39,8 +40,6 @@ from mjxgrad.verdict.programs import KINDS, Outcomes, Programs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
-MOST_PAIRS = 20_000
-"""Pairs of geoms beyond which loading takes minutes and a scene is refused."""
 _SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, beyond the second
 _BATCHES = (64, 32)
 _MOST_TREES = 3
@@ -232,7 +231,7 @@ def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
 
 
 def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) -> None:
-    """Say how many geoms can touch, or refuse more than can be loaded; what cannot be read is left to `load_scene`."""
+    """Say how many geoms can touch; what cannot be read or loaded is left to `load_scene`."""
     try:
         model = read(argument)
     except ValueError:
@@ -240,25 +239,6 @@ def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) ->
     count = count_pairs(model)
     if count >= MANY_PAIRS:
         say(f"about {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
-    if count > MOST_PAIRS:
-        raise SceneError(
-            f"the scene must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
-            "touch contype and conaffinity that do not match, or <contact><exclude>; then max_contacts bounds those that do"
-        )
-
-
-def count_pairs(model: mujoco.MjModel) -> int:
-    """Count pairs of geoms of different bodies whose contype and conaffinity match, without listing them."""
-    keys = np.stack([model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]], axis=1)
-
-    def matching(columns: np.ndarray) -> int:
-        kinds, counts = np.unique(columns, axis=0, return_counts=True)
-        first, second = kinds[:, :1], kinds[:, 1:2]
-        match = ((first & second.T) | (second & first.T)) != 0
-        return int(counts @ match @ counts)
-
-    own = sum(matching(keys[keys[:, 2] == body, :2]) for body in np.unique(keys[:, 2]))
-    return (matching(keys[:, :2]) - own) // 2
 
 
 def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:

@@ -14,7 +14,7 @@ import mjxgrad as mg
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
-from mjxgrad.verdict.check import count_pairs
+from mjxgrad.scene.load import count_pairs
 from mjxgrad.verdict.findings import measured_findings, slopes
 from mjxgrad.verdict.measure import Line, Measured, _estimates
 from mjxgrad.verdict.programs import change_of_poses
