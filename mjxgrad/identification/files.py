@@ -38,7 +38,7 @@ _NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss
 _ALONE = {"inertia": inertia, "gains": gains}
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
 """Of parameters that can be named in a word."""
-_SMALLEST_SIZE = 0.01  # of the largest column of a kind: what moves less is weighed as if it moved so much
+_SMALLEST_SIZE = 0.1  # of the largest column of a kind: what hardly moves is noise, and weighed as if it moved so much
 
 
 def parameter(scene: Scene, text: str) -> Parameter:
