@@ -1,4 +1,4 @@
-"""The command line: check a scene, begin a program of one's own, draw it, look at it, run experiments."""
+"""The command line: check a scene, find its parameters, begin a program of one's own, draw it, look at it, run experiments."""
 
 import functools
 import importlib
@@ -70,7 +70,11 @@ app = cyclopts.App(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; the exit status is 0, 1 for faults that `check` found, 2 for a refusal, 130 for an interruption."""
+    """Run the command line.
+
+    The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
+    interruption.
+    """
     # Whatever asks to stop is answered as Ctrl-C is.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -84,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     except cyclopts.CycloptsError as error:
         _say(f"{error}; mjxgrad --help lists the commands")
     # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
-    except (CommandError, ValueError, OSError, FloatingPointError, MemoryError, RuntimeError) as error:
+    except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
     return 2
 
@@ -127,6 +131,74 @@ def check(
         log(f"wrote {html}")
     print(verdict.as_json() if as_json else verdict.summary())
     return 1 if verdict.faults else 0
+
+
+@app.command
+def identify(
+    scene: str,
+    *recordings: str,
+    parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
+    held_out: float = 0.2,
+    window: float | None = None,
+    free_start: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+    output: Path = Path("identified"),
+    as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
+
+    A recording is a CSV with a line of names, or an NPZ. It has a column time (s). The others are named by joints (positions),
+    sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator, act:actuator. Of several
+    numbers each has its place, qpos:root[0], or qpos[7] in the whole. The controls of all actuators are needed.
+
+    Args:
+        scene: an MJCF file.
+        recordings: CSV or NPZ files, before the options.
+        parameter: kind:name, kind:name=low..high, or YAML of mujoco.sysid with such names. Kinds are mass, inertia (bodies),
+            friction, stiffness, damping_ratio, width (geoms, geom/geom or nothing for all), damping, armature, friction_loss
+            (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
+        held_out: share that is only judged by: every so many recordings or windows, or the end of a single one.
+        window: cut recordings into windows of so many seconds, each from its measured state.
+        free_start: find where each motion begins, too.
+        output: folder for params_x_hat.yaml, identified.xml and report.html.
+        as_json: write JSON.
+    """
+    mg, started = _library(), time.monotonic()
+    files, page = (
+        importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "verdict.identified")
+    )
+
+    def log(text: str) -> None:
+        _say(f"{time.monotonic() - started:4.0f} s  {text}")
+
+    if not recordings:
+        raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
+    loaded = mg.load_scene(_existing(scene), keep_everything=True)
+    wanted = files.parameters(loaded, parameter)
+    motions = []
+    for path in recordings:
+        one, unknown = files.recording(loaded, _existing(path))
+        if unknown:
+            log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
+        motions += [one] if window is None else one.cut(window, float(loaded.model.opt.timestep))
+    fitted, judged = files.hold_out(loaded, motions, held_out)
+    log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
+    result = mg.identify(
+        loaded,
+        wanted,
+        fitted,
+        held_out=judged,
+        delay="delay" if "delay" in wanted else None,
+        free_start=free_start,
+        log=lambda step, metrics: log(f"step {step}: error {100 * metrics['rms']:.3g} % of the motion"),
+    )
+    found = page.Identified(Path(scene).name, loaded, result, fitted, judged, time.monotonic() - started)
+    output.mkdir(parents=True, exist_ok=True)
+    result.save(output / "params_x_hat.yaml")
+    files.write_xml(loaded, result.scene, scene, output / "identified.xml")
+    (output / "report.html").write_text(found.as_html(), encoding="utf-8")
+    log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
+    print(found.as_json() if as_json else f"{found.headline}\n\n{result.summary()}")
+    return 0 if found.is_sound else 1
 
 
 @app.command

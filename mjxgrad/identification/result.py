@@ -114,11 +114,12 @@ class Identification:
                 f"{rms}.",
                 "",
                 *self._table(),
-                *[f"\n{line}" for line in self._warnings()],
+                *[f"\n{line}" for line in self.warnings()],
             ]
         )
 
-    def _table(self) -> list[str]:
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return the values as a table of text, its head first: name and unit, value, interval, start, bounds."""
         parts = (self.values, self.half_width, self.start)
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
         bounds = zip(on_host(self.coordinates.lower), on_host(self.coordinates.upper), strict=True)
@@ -129,10 +130,15 @@ class Identification:
             rows.append(
                 (f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}")
             )
+        return rows
+
+    def _table(self) -> list[str]:
+        rows = self.rows()
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
-    def _warnings(self) -> list[str]:
+    def warnings(self) -> list[str]:
+        """Say what to beware of, a sentence or two each: a search that stalled, numbers that cannot be told."""
         found = []
         if self.stopped is Stopped.STALLED:
             found.append(

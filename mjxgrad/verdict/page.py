@@ -23,6 +23,10 @@ svg { width: 100%; max-width: 34rem; height: auto; display: block; }
 svg text { font: 12px system-ui, sans-serif; fill: var(--ink); }
 svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); }
 svg .slope { stroke: var(--soft); fill: none; opacity: .6; } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
+table { border-collapse: collapse; font-size: .9rem; } td, th { padding: .2rem .7rem .2rem 0; text-align: right; }
+td:first-child, th:first-child { text-align: left; } .scroll { overflow-x: auto; } video { width: 100%; }
+svg .measured { fill: var(--ink); opacity: .45; } svg .before { stroke: var(--plain); fill: none; stroke-dasharray: 5 3; }
+svg .after { stroke: var(--smooth); fill: none; stroke-width: 1.6; } svg .out { fill: var(--line); opacity: .5; }
 li { margin: .35rem 0; overflow-wrap: anywhere; } .fault { font-weight: 600; } ul { padding-left: 1.2rem; }
 pre { overflow-x: auto; border: 1px solid var(--line); border-radius: .4rem; padding: .7rem; font-size: .8rem; }
 summary { cursor: pointer; padding: .3rem 0; }
@@ -40,19 +44,24 @@ def page(
 ) -> str:
     """Write the page as HTML that needs nothing beside it."""
     sentences = "".join(f"<li{' class=fault' if one.is_fault else ''}>{_text(one.text)}</li>" for one in findings)
-    folded = "".join(
-        f"<details><summary>{_text(title)}</summary><pre>{_text(body)}</pre></details>"
-        for title, body in details.items()
-    )
     body = (
-        f'<p class="kicker">mjxgrad check {_text(name)}</p><h1>{_text(headline)}</h1>'
         f"{'' if measured is None else _figure(measured, outcomes)}<ul>{sentences}</ul>"
-        f"<h2>To paste</h2><pre>{_text(code)}</pre>{folded}"
+        f"<h2>To paste</h2><pre>{_text(code)}</pre>"
+    )
+    return document(f"mjxgrad check {name}", headline, body, details)
+
+
+def document(kicker: str, headline: str, body: str, details: dict[str, str]) -> str:
+    """Write any page: what it is, the answer in bold, its body as HTML, and what is folded, by its title."""
+    folded = "".join(
+        f"<details><summary>{_text(title)}</summary><pre>{_text(text)}</pre></details>"
+        for title, text in details.items()
     )
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{_text(name)}: {_text(headline)}</title><style>{_STYLE}</style></head><body><main>{body}</main></body></html>\n"
+        f"<title>{_text(kicker)}: {_text(headline)}</title><style>{_STYLE}</style></head><body><main>"
+        f'<p class="kicker">{_text(kicker)}</p><h1>{_text(headline)}</h1>{body}{folded}</main></body></html>\n'
     )
 
 

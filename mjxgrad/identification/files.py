@@ -1,0 +1,365 @@
+"""Recordings and parameters from files, and what was found as MJCF."""
+
+import csv
+import dataclasses
+import difflib
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._rollout import initial_state, rollout
+from mjxgrad.identification.inertia import inertia
+from mjxgrad.identification.parameters import (
+    Parameter,
+    armature,
+    damping,
+    friction,
+    friction_loss,
+    gains,
+    gear,
+    mass,
+    softness,
+)
+from mjxgrad.identification.recording import Recording, Windows
+from mjxgrad.scene import Scene, sensor
+from mjxgrad.scene.scene import numbers_of
+
+_Object = mujoco.mjtObj
+_SOFTNESS = ("stiffness", "damping_ratio", "width")
+_NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
+_ALONE = {"inertia": inertia, "gains": gains}
+KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
+"""Of parameters that can be named in a word."""
+_SMALLEST_SIZE = 0.1  # of the largest column of a kind: what hardly moves is noise, and weighed as if it moved so much
+
+
+def parameter(scene: Scene, text: str) -> Parameter:
+    """Return the parameter that is named, such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
+
+    Args:
+        scene: where the nominal value is read.
+        text: one of `KINDS`, then names, several of which share one value, then bounds. Friction and softness take geoms, or
+            a pair as `floor/foot`, or nothing for all contacts.
+
+    Raises:
+        ValueError: if it is none of that, or a name is unknown.
+    """
+    match = re.fullmatch(r"(\w+)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
+    if match is None or match[1] not in KINDS:
+        raise ValueError(
+            f"a parameter must be kind:name or kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}"
+        )
+    kind, names = match[1], tuple((match[2] or "").split(",")) if match[2] else ()
+    try:
+        bounds = None if match[3] is None else (float(match[3]), float(match[4]))
+    except ValueError as error:
+        raise ValueError(f"bounds must be numbers, low..high, got {text!r}") from error
+    if kind == "delay":
+        low, high = bounds or (0.0, 0.05)
+        return Parameter(low, low, high, unit="s")
+    if kind == "friction" or kind in _SOFTNESS:
+        pairs = tuple(tuple(name.split("/")) for name in names if "/" in name)
+        if pairs and (len(pairs) < len(names) or any(len(pair) != 2 for pair in pairs)):
+            raise ValueError(f"contacts must be named by geoms, or by pairs geom/geom, got {text!r}")
+        subset: dict[str, Any] = {"pairs": pairs} if pairs else {"geoms": names} if names else {}
+        if bounds is not None:
+            subset["bounds"] = bounds
+        return friction(scene, **subset) if kind == "friction" else softness(scene, kind, **subset)
+    if not names:
+        raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
+    if kind in _NAMED:
+        return _NAMED[kind](scene, *names, bounds=bounds)
+    if len(names) > 1 or (bounds is not None and kind == "inertia"):
+        raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
+    return _ALONE[kind](scene, *names, **({} if bounds is None else {"bounds": bounds}))
+
+
+def parameters(scene: Scene, given: Iterable[str]) -> dict[str, Parameter]:
+    """Return parameters by name, as `parameter` takes them, or from YAML as `mujoco.sysid` and `Identification.save` write it.
+
+    The names in YAML are those of `parameter`, without bounds. Frozen ones are left out; the search begins at their values.
+
+    Raises:
+        ValueError: as of `parameter`, or if a file is no such YAML.
+        ImportError: if there is YAML, and PyYAML is not installed.
+    """
+    found: dict[str, Parameter] = {}
+    for text in given:
+        if not text.endswith((".yaml", ".yml")):
+            found[text.partition("=")[0]] = parameter(scene, text)
+            continue
+        try:
+            import yaml
+        except ImportError as error:
+            raise ImportError(
+                "parameters in YAML need PyYAML, not installed: pip install 'mjxgrad[identify]'"
+            ) from error
+        try:
+            table = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
+            rows = {n: [np.ravel(row[k]) for k in ("value", "min_value", "max_value")] for n, row in table.items()}
+            frozen = {name for name, row in table.items() if row.get("frozen")}
+        except (yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{text} must be YAML as mujoco.sysid's ParameterDict.save_to_disk writes it: {error}"
+            ) from error
+        for name in rows.keys() - frozen:
+            made = parameter(scene, name)
+            value, low, high = (np.asarray(part, float).reshape(made.nominal.shape) for part in rows[name])
+            found[name] = Parameter(value, low, high, made.write, made.unit)
+    return found
+
+
+def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
+    """Return a recorded motion, and the names of the columns that are nothing of the scene's.
+
+    Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
+    `act:actuator`, readings `sensor:name`. The kind may be left out where one thing only has the name: a joint is then its
+    position, an actuator its control. Of several numbers each has its place, `qpos:root[0]`, or `qpos[7]` in the whole. An NPZ
+    has the same names, each with an array of one row for each time, of one number or all of them.
+
+    Each signal is weighed by how much it varies. The motion begins at its first row; the rest is the scene's pose, at rest.
+
+    Args:
+        scene: that was recorded.
+        path: CSV with a line of names, or NPZ. Empty cells and NaN were not measured.
+
+    Raises:
+        ValueError: if the file is not so, has no time, nothing that was measured, or lacks the control of an actuator.
+    """
+    columns = _read(Path(path))
+    times = columns.pop("time", None)
+    if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
+        raise ValueError(
+            f"{path} must have a column named time, which increases (s), got {', '.join(columns) or 'nothing'}"
+        )
+    places, unknown = _places(scene.mj_model), []
+    widths = {key: getattr(scene.data, key).shape[0] for key in ("qpos", "qvel", "act", "ctrl")}
+    found: dict[str, np.ndarray] = {}
+    for name, column in columns.items():
+        place = places.get(name, ())
+        if len(place) > 1:
+            raise ValueError(
+                f"{name} of {path} must say what it is, as one of {', '.join(sorted(f'{k}:{name}' for k, *_ in place))}"
+            )
+        if not place:
+            unknown.append(name)
+            continue
+        key, signal, index, width = place[0]
+        whole = found.setdefault(signal, np.full((len(times), widths.get(key, width)), np.nan))
+        whole[:, index] = column
+    controls = found.pop("ctrl", None)
+    if scene.model.nu and (controls is None or not np.isfinite(controls).all()):
+        bad = range(scene.model.nu) if controls is None else np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist()
+        names = ", ".join(_name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
+        raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
+    if not found:
+        near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
+        raise ValueError(
+            f"{path} must have columns of the scene's joints or sensors, got {', '.join(unknown) or 'none'}"
+            + f"; did you mean {', '.join(near)}?" * bool(near)
+        )
+    start = _first(scene, found)
+    noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
+    at = times - times[0]
+    made = Recording(found, controls, at, None if controls is None else at, noise, start, name=str(path))
+    return made, tuple(unknown)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a file by name."""
+    if path.suffix == ".npz":
+        with np.load(path) as arrays:
+            wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+        wholes = {
+            name: value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value for name, value in wholes.items()
+        }
+        found = {name: value for name, value in wholes.items() if value.ndim == 1}
+        found |= {f"{n}[{i}]": v[:, i] for n, v in wholes.items() if v.ndim == 2 for i in range(v.shape[1])}
+    else:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names, *rows = [row for row in csv.reader(file) if row] or [[]]
+        try:
+            table = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows]
+            found = dict(zip((name.strip() for name in names), np.array(table, float).T, strict=True))
+        except ValueError as error:
+            raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
+    if len({len(column) for column in found.values()}) > 1:
+        raise ValueError(
+            f"all of {path} must have the same number of rows, got { ({n: len(c) for n, c in found.items()}) }"
+        )
+    return found
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str | None:
+    return mujoco.mj_id2name(model, kind, index)
+
+
+def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
+    """Return by column name what it may be: its kind, the signal, its place in that, and the signal's width."""
+    whole: dict[str, list] = {}
+    own: list[tuple[str, str | None, str, Sequence[int], int]] = []
+    ends = [*model.jnt_qposadr[1:], model.nq]
+    for joint in range(model.njnt):
+        name = _name(model, _Object.mjOBJ_JOINT, joint)
+        own.append(("qpos", name, "qpos", range(model.jnt_qposadr[joint], ends[joint]), model.nq))
+        own.append(("qvel", name, "qvel", np.flatnonzero(model.dof_jntid == joint).tolist(), model.nv))
+    for actuator in range(model.nu):
+        name = _name(model, _Object.mjOBJ_ACTUATOR, actuator)
+        own.append(("ctrl", name, "ctrl", [actuator], model.nu))
+        first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
+        own.append(("act", name, "act", range(first, first + count) if first >= 0 else [], model.na))
+    for index in range(model.nsensor):
+        name, width = _name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
+        own.append(("sensor", name, name or "", range(width), width))
+    for kind, name, signal, indices, width in own:
+        for i, index in enumerate(indices):
+            place, number = (kind, signal, int(index), width), f"[{i}]" * (len(indices) > 1)
+            if kind != "sensor":
+                # The same place may be named by a joint and by its number; of one number `qpos` is the whole.
+                whole[f"{kind}[{index}]" if width > 1 else kind] = [place]
+            if name:
+                whole[f"{kind}:{name}{number}"] = [place]
+                if kind in ("qpos", "ctrl", "sensor"):
+                    whole.setdefault(f"{name}{number}", []).append(place)
+    return whole
+
+
+def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
+    """Return the state of the first row; what it lacks is the scene's pose, at rest."""
+    given = {}
+    for key in ("qpos", "qvel", "act"):
+        if key in found:
+            row, default = found[key][0], np.asarray(getattr(scene.data, key))
+            given[key] = jnp.asarray(np.where(np.isfinite(row), row, default))
+    return initial_state(scene, **given)
+
+
+def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
+    """Return how much each column varies, of positions each velocity's."""
+    if name == "qpos":
+        first = np.where(np.isfinite(value[0]), value[0], model.qpos0)
+        moves = np.zeros((len(value), model.nv))
+        for move, row in zip(moves, np.where(np.isfinite(value), value, first), strict=True):
+            mujoco.mj_differentiatePos(model, move, 1.0, first, row)
+        value = moves
+    known = np.isfinite(value)
+    count = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, value, 0).sum(axis=0) / count
+    size = np.sqrt((np.where(known, value - mean, 0) ** 2).sum(axis=0) / count)
+    return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
+
+
+def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+    """Return recordings to fit and to judge by: every so many of several, of a single one its end.
+
+    Args:
+        scene: of the recordings.
+        recordings: all of them.
+        share: to judge by, below 1; 0 holds out nothing.
+
+    Raises:
+        ValueError: if the share is negative or leaves nothing to fit.
+    """
+    if not 0 <= share < 1:
+        raise ValueError(f"held_out must be a share from 0 to below 1, got {share}")
+    if share == 0:
+        return list(recordings), []
+    if len(recordings) > 1:
+        count = min(max(1, round(share * len(recordings))), len(recordings) - 1)
+        chosen = set(np.linspace(0, len(recordings) - 1, count + 2).round().astype(int)[1:-1].tolist())
+        chosen = chosen or {len(recordings) - 1}
+        groups = ([], [])
+        for i, one in enumerate(recordings):
+            groups[i in chosen].append(one)
+        return groups
+    (whole,) = recordings
+    times = np.asarray(whole.times, float)
+    is_late = times > (1 - share) * times[-1]
+    early = {name: value[~is_late] for name, value in whole.measured.items()}
+    # The end goes on from the same start: positions and speeds in the middle may not have been measured.
+    late = {name: np.where(is_late[:, None], value, np.nan) for name, value in whole.measured.items()}
+    return [dataclasses.replace(whole, measured=early, times=times[~is_late])], [
+        dataclasses.replace(whole, measured=late)
+    ]
+
+
+def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) -> None:
+    """Write the MJCF of a scene with the numbers that were found; all else stays as in the file.
+
+    Args:
+        scene: as loaded.
+        found: the same with other numbers.
+        source: its MJCF file.
+        path: of the MJCF to write.
+    """
+    spec = mujoco.MjSpec.from_file(str(source))
+    spec.compile()  # which numbers its elements
+    before, after = numbers_of(scene.model), numbers_of(found.model)
+    changed = {n: np.asarray(v, float) for n, v in after.items() if not np.array_equal(v, before[n])}
+
+    def rows(*fields: str) -> list[int]:
+        parts = [
+            np.asarray(before[f] != changed[f]).reshape(len(changed[f]), -1).any(axis=1) for f in fields if f in changed
+        ]
+        return np.flatnonzero(np.any(parts, axis=0)).tolist() if parts else []
+
+    inertial = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    bodies = rows(*inertial)
+    parts = {
+        "geom": (("friction", "solref", "solimp"), spec.geoms, "geom_"),
+        "pair": (("friction", "solref", "solimp"), spec.pairs, "pair_"),
+        "actuator": (("gear", "gainprm", "biasprm"), spec.actuators, "actuator_"),
+    }
+    for fields, elements, prefix in parts.values():
+        for field in fields:
+            for row in rows(prefix + field):
+                target = next(one for one in elements if one.id == row)
+                value = changed[prefix + field][row]
+                setattr(target, field, value[: len(np.ravel(getattr(target, field)))])
+    for body in (one for one in spec.bodies if one.id in bodies):
+        values = [np.asarray(after[name], float)[body.id] for name in inertial]
+        body.explicitinertial = True
+        body.mass, body.ipos, body.inertia, body.iquat = float(values[0]), *values[1:]
+        body.fullinertia[:] = np.nan
+    for field in ("damping", "armature", "frictionloss"):
+        for dof in rows(f"dof_{field}"):
+            joint = next(one for one in spec.joints if one.id == scene.mj_model.dof_jntid[dof])
+            value = float(changed[f"dof_{field}"][dof])
+            present = getattr(joint, field)
+            setattr(joint, field, value if np.ndim(present) == 0 else np.array([value, *np.ravel(present)[1:]]))
+    for folder in ("meshdir", "texturedir"):
+        there = Path(source).parent / (getattr(spec, folder) or "")
+        setattr(spec, folder, os.path.relpath(there, Path(path).parent))
+    Path(path).write_text(spec.to_xml(), encoding="utf-8")
+
+
+def simulated(scene: Scene, windows: Windows, delay: Float[Array, ""] | float, onset: Any) -> dict[str, Array]:
+    """Return all signals as a scene has them at its own steps, and its positions as `qpos`; traceable.
+
+    Args:
+        scene: with the parameters in it.
+        windows: of one recording, by `stack`.
+        delay: by how much the controls act later than recorded (s).
+        onset: as of `rollout`.
+    """
+    names = [name for name in windows.measured if name not in ("qpos", "qvel", "act")]
+    (controls,), state = windows.controls, jax.tree.map(lambda leaf: leaf[0], windows.state)
+    at = jnp.arange(len(controls), dtype=controls.dtype)
+    late = jax.vmap(lambda u: jnp.interp(at - delay / scene.model.opt.timestep, at, u), 1, 1)(controls)
+    course = rollout(
+        scene,
+        state,
+        late,
+        checkpoint=False,
+        onset=onset,
+        observe=lambda m, d: {name: sensor(m, d, name) for name in names},
+    )
+    return {"qpos": course.qpos, "qvel": course.qvel, "act": course.act} | dict(course.observations or {})

@@ -1,0 +1,148 @@
+"""Recordings, parameters and scenes as files; and the command that takes and writes them."""
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import cli
+from mjxgrad.identification import files
+from mjxgrad.identification.parameters import write_all
+
+_SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+  <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>
+  <body name="cart" pos="2 0 1"><joint name="x" type="slide" axis="1 0 0" damping=".1"/><geom name="cart" size=".1" mass="2"/>
+  </body></worldbody><actuator><motor name="x" joint="x" gear="3"/><position name="servo" joint="x" kp="5" kv="1"/></actuator>
+  <sensor><jointpos name="place" joint="x"/><framepos name="tip" objtype="body" objname="cart"/></sensor></mujoco>"""
+_CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping=".1"/>
+  <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x" gear="3"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return mg.load_scene(_SCENE, keep_everything=True)
+
+
+def _write(path, **columns):
+    rows = zip(*columns.values(), strict=True)
+    Path(path).write_text("\n".join(",".join(map(str, row)) for row in [columns.keys(), *rows]) + "\n")
+
+
+def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
+    """The first row is the start, and what it lacks the scene's pose; CSV and NPZ say the same."""
+    columns = {
+        "time": [1.0, 1.02, 1.03],
+        "qpos:x": [0.5, 0.6, ""],
+        "qpos:root[2]": [2.5, 2.4, 2.3],
+        "qvel[6]": [0.7, 0.8, 0.9],
+        "tip[0]": [2.5, 2.6, 2.7],
+        "ctrl:x": [1, 2, 3],
+        "servo": [4, 5, 6],
+        "camera": [0, 0, 0],
+    }
+    _write(tmp_path / "a.csv", **columns)
+    arrays = {name: np.array([np.nan if v == "" else v for v in column]) for name, column in columns.items()}
+    del arrays["ctrl:x"], arrays["servo"], arrays["qvel[6]"]
+    arrays["ctrl"] = np.array([[1, 4], [2, 5], [3, 6]])
+    arrays["qvel"] = np.column_stack([np.full((3, 6), np.nan), [0.7, 0.8, 0.9]])
+    np.savez(tmp_path / "a.npz", **arrays)
+    for name in ("a.csv", "a.npz"):
+        found, unknown = files.recording(scene, tmp_path / name)
+        assert unknown == ("camera",)
+        np.testing.assert_allclose(found.times, [0, 0.02, 0.03])
+        np.testing.assert_allclose(found.controls, [[1, 4], [2, 5], [3, 6]])
+        np.testing.assert_allclose(found.measured["qpos"][:, [2, 7]], [[2.5, 0.5], [2.4, 0.6], [2.3, np.nan]])
+        np.testing.assert_allclose(found.measured["tip"][:, 0], [2.5, 2.6, 2.7])
+        np.testing.assert_allclose(found.start.qpos, [0, 0, 2.5, 1, 0, 0, 0, 0.5])
+        np.testing.assert_allclose(found.start.qvel, [0, 0, 0, 0, 0, 0, 0.7])
+        np.testing.assert_allclose(found.noise["tip"][0], np.std([2.5, 2.6, 2.7]))
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"x": [1, 2]}, "must have a column named time"),
+        ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
+        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
+        ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
+        ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_path, columns, said):
+    _write(tmp_path / "a.csv", **columns)
+    with pytest.raises(ValueError, match=said):
+        files.recording(scene, tmp_path / "a.csv")
+
+
+def test_parameters_are_named_in_a_word_and_come_back_from_yaml(scene, tmp_path):
+    given = ["mass:cart=0.5..3", "inertia:ball", "friction:floor/ball", "damping:x", "gains:servo", "delay=0..0.1"]
+    found = files.parameters(scene, given)
+    assert list(found) == [text.partition("=")[0] for text in given]
+    assert (found["mass:cart"].nominal, found["mass:cart"].upper, found["delay"].upper) == (2.0, 3.0, 0.1)
+    path = tmp_path / "start.yaml"
+    rest = "nominal: [2.], min_value: [1.], max_value: [4.], value: [2.5]}"
+    path.write_text(f"mass:cart: {{frozen: false, {rest}\ndamping:x: {{frozen: true, {rest}\n")
+    (again,) = files.parameters(scene, [str(path)]).values()
+    assert (again.nominal, again.lower, again.upper) == (2.5, 1.0, 4.0)
+    for wrong, said in (("weight:cart", "kind one of mass"), ("mass", "must say of what"), ("gear:no", "no")):
+        with pytest.raises(ValueError, match=said):
+            files.parameter(scene, wrong)
+
+
+def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
+    """Every kind at once, compiled again: each field as in the scene."""
+    source = tmp_path / "scene.xml"
+    source.write_text(_SCENE)
+    given = ["inertia:cart", "mass:ball", "friction", "damping:x", "armature:x=0..1", "friction_loss:x=0..1", "gear:x"]
+    wanted = files.parameters(scene, [*given, "gains:servo", "damping_ratio", "stiffness", "width"])
+    values = {name: jnp.asarray(0.1 + 0.9 * one.nominal) for name, one in wanted.items()}
+    found = write_all(scene, wanted, values)
+    (tmp_path / "out").mkdir()
+    files.write_xml(scene, found, source, tmp_path / "out" / "found.xml")
+    again, expected = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "found.xml")), found.to_mujoco()
+    for field in (
+        "body_mass", "body_ipos", "dof_damping", "dof_armature", "dof_frictionloss", "geom_friction", "geom_solref",
+        "geom_solimp", "actuator_gear", "actuator_gainprm", "actuator_biasprm",
+    ):  # fmt: skip
+        np.testing.assert_allclose(getattr(again, field), getattr(expected, field), rtol=1e-4, atol=1e-6, err_msg=field)
+
+
+def test_held_out_is_the_end_of_one_motion_or_some_of_several(scene):
+    one = files.Recording({"place": np.arange(10.0)}, np.zeros((10, 2)), 0.01 * np.arange(10), 0.01 * np.arange(10))
+    (early,), (late,) = files.hold_out(scene, [one], 0.3)
+    assert len(early.times) == 7
+    np.testing.assert_array_equal(np.isfinite(late.measured["place"][:, 0]), np.arange(10) > 6)
+    fitted, judged = files.hold_out(scene, [one] * 10, 0.2)
+    assert (len(fitted), len(judged)) == (8, 2)
+
+
+def test_the_command_finds_a_mass_and_writes_what_it_found(tmp_path, monkeypatch, capsys):
+    """2 kg pushed by 3 N times the control: written is the motion of 3 kg. With the gear beside it only the ratio is seen."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    Path("cart.xml").write_text(_CART.replace(' damping=".1"', ""))
+    drive = np.sin(np.arange(40) / 5)
+    speed = np.concatenate([[0], np.cumsum(0.01 * 3 * drive / 3)])
+    place = np.concatenate([[0], np.cumsum(0.01 * speed[1:])])
+    _write("motion.csv", **{"time": 0.01 * np.arange(40), "x": place[:40], "motor": drive, "other": drive})
+    command = ["identify", "cart.xml", "motion.csv", "--json", "--parameter", "mass:cart"]
+    assert cli.main(command) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert found["parameters"]["mass:cart"]["value"] == pytest.approx(3.0, rel=1e-6)
+    assert found["held_out_rms"][1] < 1e-5
+    assert "left out of motion.csv: other" in said.err
+    assert len(found["headline"].split()) <= 15
+    assert mujoco.MjModel.from_xml_path("identified/identified.xml").body("cart").mass == pytest.approx(3.0, rel=1e-4)
+    page = Path("identified/report.html").read_text()
+    assert page.count("<svg") == 1
+    assert "http" not in page.replace("http://www.w3.org", "")
+    assert cli.main([*command, "gear:motor"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert set(found["inseparable"][0]) == {"mass:cart", "gear:motor"}
+    assert found["headline"].startswith("0 of 2 numbers found")
+    assert cli.main(["identify", "cart.xml", "motion.csv", "--parameter", "weight"]) == 2
