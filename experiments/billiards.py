@@ -232,6 +232,13 @@ def _objective(
     return objective
 
 
+def answer(outcome: Outcome) -> str:
+    """Count what finds the stroke from balls that do not touch."""
+    apart = [run for run in outcome.runs if not run.touches_at_start]
+    solved = sum(run.is_solved for run in apart)
+    return f"{solved} of {len(apart)} methods find the stroke when the balls do not touch."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say what solves the stroke from balls that do not touch, and what does not."""
     apart = [run for run in outcome.runs if not run.touches_at_start]

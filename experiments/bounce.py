@@ -209,6 +209,13 @@ _FINE, _COARSE, _COARSE_TOLERANCE = 5e-4, 2e-3, 0.3
 _ORDER = (CONTINUOUS, EVENT, DISCRETE)
 
 
+def answer(outcome: Outcome) -> str:
+    """Say how often the derivative is the slope, without and with the event."""
+    fine = outcome.grid.isel(timestep=outcome.grid.timestep.values <= _FINE)
+    shares = [f"{int(fine.holds.sel(arm=arm).sum())} ({arm})" for arm in _ORDER]
+    return f"Right at {joined(shares)} of {int(fine.judged.sum())} contacts and time steps."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say how often each derivative is the slope."""
     grid = outcome.grid

@@ -244,6 +244,11 @@ def _smooth(values: Float[np.ndarray, "updates seeds"]) -> Float[np.ndarray, "up
     return (sums[ends] - sums[starts]) / (ends - starts)[:, None]
 
 
+def answer(outcome: Outcome) -> str:
+    """Name the gradient whose policy is worth most."""
+    return f"The highest return in C MuJoCo is that of {NAMES[outcome.best.method]}: {quantity(outcome.best.judged.mean())}."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say which gradient is worth most in C MuJoCo, and how far the next one is."""
     settings, best = outcome.settings, outcome.best

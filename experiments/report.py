@@ -13,6 +13,7 @@ from experiments.config import Run
 from experiments.words import capitalised
 
 STYLE = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+_LONG_TABLE = 12  # rows; longer ones are folded
 
 
 @dataclass(frozen=True)
@@ -50,24 +51,29 @@ class Report:
     summary: Table | None = None  # a table to stand before the figures, if there is one
     # Heading -> cell, the run's columns in the page over a sweep.
     headline: dict[str, str] = field(default_factory=dict)
+    answer: str = ""  # the title's question answered, in at most 15 words
 
 
 def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
     """Write a report as one HTML page that needs nothing beside it; `about` are headed lists of settings and circumstances."""
+    figures = [_figure(figure, folder, number) for number, figure in enumerate(report.figures, start=1)]
     body = [
         f'<header><p class="kicker">{_text(name)}</p><h1>{_text(question)}</h1></header>',
-        f'<section class="verdict" aria-label="Verdict"><p>{_text(report.verdict)}</p>',
+        f'<p class="answer">{_prose(report.answer)}</p>' if report.answer else "",
+        # Who reads for ten seconds sees the answer and the picture of it.
+        *(figures[:1] if report.answer else []),
+        f'<section class="verdict" aria-label="Verdict"><p>{_prose(report.verdict)}</p>',
         _items(report.findings),
         "</section>",
-        f'<p class="expected"><b>Expected beforehand.</b> {_text(capitalised(expected))}</p>' if expected else "",
+        f'<p class="expected"><b>Expected beforehand.</b> {_prose(capitalised(expected))}</p>' if expected else "",
         _warnings(report.warnings),
         _video(report, folder),
         _table(report.summary) if report.summary is not None else "",
-        *(_figure(figure, folder, number) for number, figure in enumerate(report.figures, start=1)),
+        *(figures[1:] if report.answer else figures),
         *(_table(table) for table in report.tables),
-        '<section class="about">',
+        '<details><summary>Settings, time and versions</summary><div class="about">',
         *(_definitions(heading, entries) for heading, entries in about.items()),
-        "</section>",
+        "</div></details>",
     ]
     return _document(f"{name}: {question}", "\n".join(part for part in body if part))
 
@@ -106,35 +112,41 @@ def _text(text: object) -> str:
     return html.escape(str(text))
 
 
+def _prose(text: str) -> str:
+    """Write a sentence, with what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", _text(text))
+
+
 def _data_uri(path: Path, media_type: str) -> str:
     return f"data:{media_type};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def _items(sentences: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{_text(sentence)}</li>" for sentence in sentences) + "</ul>" if sentences else ""
+    return "<ul>" + "".join(f"<li>{_prose(sentence)}</li>" for sentence in sentences) + "</ul>" if sentences else ""
 
 
 def _warnings(sentences: Sequence[str]) -> str:
     if not sentences:
         return ""
-    return f'<section class="warnings"><h2>Before you trust the numbers</h2>{_items(sentences)}</section>'
+    return f'<section class="warnings"><h2>Before you trust the numbers</h2>{_items(list(dict.fromkeys(sentences)))}</section>'
 
 
 def _figure(figure: Figure, folder: Path, number: int) -> str:
     source = _data_uri(folder / figure.file, "image/png")
     return (
-        f'<figure><img src="{source}" alt="{_text(figure.title)}"><figcaption><b>Figure {number}. '
-        f"{_text(figure.title)}.</b> {_text(figure.caption)}</figcaption></figure>"
+        f'<figure><div class="scroll"><img src="{source}" alt="{_text(figure.title)}" title="Click for full size" '
+        "onclick=\"this.classList.toggle('full')\"></div>"
+        f"<figcaption><b>Figure {number}. {_text(figure.title)}.</b> {_prose(figure.caption)}</figcaption></figure>"
     )
 
 
 def _video(report: Report, folder: Path) -> str:
     if report.video is None:
-        return f'<p class="missing"><b>No video.</b> {_text(report.video_caption)}</p>' if report.video_caption else ""
+        return f'<p class="missing"><b>No video.</b> {_prose(report.video_caption)}</p>' if report.video_caption else ""
     source = _data_uri(folder / report.video, "video/mp4")
     return (
         f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
-        f"<figcaption><b>Video.</b> {_text(report.video_caption)}</figcaption></figure>"
+        f"<figcaption><b>Video.</b> {_prose(report.video_caption)}</figcaption></figure>"
     )
 
 
@@ -143,7 +155,10 @@ def _table(table: Table) -> str:
         "".join(f"<td{_class(table, (i, j), cell)}>{_text(cell)}</td>" for j, cell in enumerate(row))
         for i, row in enumerate(table.rows)
     )
-    return f'<figure class="table"><figcaption>{_text(table.caption)}</figcaption>{_grid(table.columns, rows)}</figure>'
+    grid = _grid(table.columns, rows)
+    if len(table.rows) > _LONG_TABLE:
+        grid = f"<details><summary>{len(table.rows)} rows</summary>{grid}</details>"
+    return f'<figure class="table"><figcaption>{_prose(table.caption)}</figcaption>{grid}</figure>'
 
 
 def _grid(columns: Iterable[str], rows: Iterable[str]) -> str:

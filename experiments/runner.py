@@ -25,7 +25,7 @@ from experiments.workspace import CompileClock, Workspace
 ROOT = Path(__file__).parent.parent
 _PACKAGES = ("mjxgrad", "jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "numpy", "scipy", "matplotlib", "mediapy")
 # What a kind may say of its outcome, each by a function of that name.
-_SAID = ("verdict", "findings", "tables", "summary", "warnings", "headline")
+_SAID = ("answer", "verdict", "findings", "tables", "summary", "warnings", "headline")
 
 
 def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> Path:
@@ -119,7 +119,7 @@ def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> Non
     write_toml(folder / "config.toml", run.settings.model_dump(mode="json"), header)
     write_csv(folder / "metrics.csv", report.metrics)
     (folder / "environment.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    summary = json.dumps({"verdict": report.verdict, "headline": report.headline}, indent=2)
+    summary = json.dumps({"answer": report.answer, "verdict": report.verdict, "headline": report.headline}, indent=2)
     write_text(folder / "summary.json", summary + "\n")
     name = " · ".join([run.name, *(f"{key} = {value}" for key, value in run.varied.items())])
     text = page(report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts))

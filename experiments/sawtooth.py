@@ -297,6 +297,14 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     return course(name, one.title, one.labels, timestep, times, arms, reference)
 
 
+def answer(outcome: Outcome) -> str:
+    """Say how much smaller the teeth are."""
+    smaller = _pooled(outcome, "smaller")
+    if not smaller.size:
+        return "Nothing touches in these motions: there are no teeth."
+    return f"When contacts begin within the step, the sawtooth is {np.median(smaller):.0f} times smaller."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say whether teeth are gone, and whose mean derivative is the slope."""
     smaller, spread = _pooled(outcome, "smaller"), _pooled(outcome, "spread", CONTINUOUS)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
+from scipy.stats import mannwhitneyu
 
 from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
@@ -13,6 +14,19 @@ from experiments.words import quantity
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
+
+
+def answer(outcome: Outcome) -> str:
+    """Name the method that ends lowest, and whether the seeds can tell it from the next."""
+    best = outcome.best
+    lowest = f"The lowest end is that of {best.method.label}."
+    others = [run for run in outcome.runs if run is not best and run.kept.size]
+    if not others or not best.kept.size:
+        return lowest
+    second = min(others, key=lambda run: run.mean)
+    if mannwhitneyu(best.kept, second.kept).pvalue <= 0.05:
+        return lowest
+    return f"{best.kept.size} seeds cannot tell {best.method.label} from {second.method.label}, the two lowest."
 
 
 def verdict(outcome: Outcome) -> str:

@@ -15,6 +15,17 @@ NEGLIGIBLE = 0.05
 """Of the gradient's norm: a bias below it matters to no descent."""
 
 
+def answer(outcome: Outcome) -> str:
+    """Count where either first-order gradient is biased, among points without a jump of the cost."""
+    smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]
+    discrete, onset = (sum(_is_biased(cell, gradient) for cell in smooth) for gradient in (DISCRETE, ONSET))
+    return (
+        f"It cuts the points with a biased gradient from {discrete} to {onset} of {len(smooth)}."
+        if onset < discrete
+        else (f"It does not help: {onset} of {len(smooth)} points are biased, {discrete} without it.")
+    )
+
+
 def verdict(outcome: Outcome) -> str:
     """Say where which first-order estimate is right."""
     smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]

@@ -29,6 +29,13 @@ _LITTLE_FRICTION = 0.03
 _LINES = {"derivative": "by the start", "derivative_by_parameters": "by parameters", "event_derivative": "event"}
 
 
+def answer(outcome: Outcome) -> str:
+    """Say whether every failure is flagged."""
+    found = outcome.found
+    unflagged = int((found.silent | found.missed).sum())
+    return "Every failure is flagged." if not unflagged else f"{unflagged} failures carry no flag."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
     found, precisions = outcome.found, outcome.settings.precisions
