@@ -2,8 +2,7 @@
 
 import dataclasses
 import itertools
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
@@ -99,10 +98,14 @@ class Course:
     method: str
     stiffness: float
     history: dict[str, Float[np.ndarray, "updates seeds"]]
-    seconds: float  # of an update of all seeds, without compilation
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
     qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
     num_states: int  # of it
+
+    @property
+    def seconds(self) -> float:
+        """Of an update of all seeds, without compilation: the median, for a machine may be busy at times."""
+        return float(np.median(self.history["seconds"]))
 
     @property
     def judged(self) -> Float[np.ndarray, " seeds"]:
@@ -174,18 +177,12 @@ def _course(
         critic_rate=settings.critic_rate,
         rule=rules.get(method, FixedAlpha(1.0)),
     )
-    marks = [(0, time.perf_counter())]
-
-    def log(done: int, _: dict[str, float]) -> None:
-        marks.append((done, time.perf_counter()))
-        advance_to(done)
-
     learned = learning.learn(
         _stepped(stiffer, method),
         jax.random.split(key, settings.sizes.num_seeds),
         num_updates=settings.sizes.num_updates,
         settings=how,
-        log=log,
+        log=lambda done, _: advance_to(done),
         log_every=_every(settings),
         checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
     )
@@ -200,7 +197,6 @@ def _course(
         method=method,
         stiffness=stiffness,
         history=history,
-        seconds=_seconds_per_update(marks),
         returns=found.returns,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
@@ -210,12 +206,6 @@ def _course(
 def _every(settings: Settings) -> int:
     """Updates in one program: twenty of them in a run, so that its course is seen, and few enough to lose little."""
     return max(1, settings.sizes.num_updates // 20)
-
-
-def _seconds_per_update(marks: Sequence[tuple[int, float]]) -> float:
-    """Return the median over programs but the first, which compiles; NaN of a run that went on near its end."""
-    times = [(later - t) / (n - m) for (m, t), (n, later) in itertools.pairwise(marks)][1:]
-    return float(np.median(times)) if times else float("nan")
 
 
 def _stepped(environment: Environment, method: Method) -> Environment:
