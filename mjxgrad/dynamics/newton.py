@@ -51,6 +51,8 @@ _MAX_LINE_STEPS = 40
 # A line search has converged where the slope has fallen to this part of its value at the start. On 512 stiff elliptic
 # problems 0.1, 0.01 and 0.001 took the same number of outer iterations.
 _LINE_TOLERANCE = 1e-2
+# A look this near, as part of the bracket, to where the slope was seen to be too great is one back to there.
+_LINE_MARGIN = 0.01
 # A batch is iterated as a whole until this part of it is left: of 256 states of two bodies that slide about the slowest takes 5.0
 # iterations in the mean over steps, the average one 1.3. It is a second loop to compile, which smaller batches are not worth: a
 # fifth more for the gradient of a hopper, a third for that of elliptic cones.
@@ -493,11 +495,14 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
         curvature = smooth_curvature + linear.dot(problem.bent(x, along), along)
         low, high = jnp.where(value < 0, length, search.low), jnp.where(value < 0, search.high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
-        inside = (newton >= low) & (newton <= high)
-        return _Search(low, high, jnp.where(inside, newton, 0.5 * (low + high)), jnp.abs(value) <= flat)
+        is_flat = jnp.abs(value) <= flat
+        # From below it must not go back to where it came from, or it may go to and fro for ever between two pieces.
+        reach = jnp.where((value < 0) & ~is_flat, high - _LINE_MARGIN * (high - low), high)
+        inside = (newton >= low) & (newton <= reach)
+        return _Search(low, high, jnp.where(inside, newton, 0.5 * (low + high)), is_flat)
 
-    # The inertial part alone bounds the root from above: the rows only add to the slope's growth.
-    high = jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
+    # The inertial part alone bounds the root from above, as the rows only add to the slope's growth; twice that was not looked at.
+    high = 2.0 * jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
     search = (_until_exact if problem.is_piecewise_quadratic else _until_flat)(improve, search)
     return jnp.where(search.is_flat | (search.low == 0), search.length, search.low)
