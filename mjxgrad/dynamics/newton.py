@@ -501,7 +501,7 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
         inside = (newton >= low) & (newton <= reach)
         return _Search(low, high, jnp.where(inside, newton, 0.5 * (low + high)), is_flat)
 
-    # The inertial part alone bounds the root from above, as the rows only add to the slope's growth; twice that was not looked at.
+    # The inertial part alone bounds the root from above, as the rows only add to the slope: twice that was not looked at.
     high = 2.0 * jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
     search = (_until_exact if problem.is_piecewise_quadratic else _until_flat)(improve, search)
