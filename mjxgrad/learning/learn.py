@@ -139,7 +139,7 @@ def learn(
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
 
 
-def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Callable]]:
+def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Any]]:
     """Return how to place arrays, and how to compile what gives arrays, that all devices of all processes are to have."""
     devices = jax.devices()
     if len(devices) == 1:
