@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
 import mjxgrad as mg
+from experiments import ppo
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
@@ -22,7 +24,7 @@ from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
 
-Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth"]
+Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth", "ppo"]
 NAMES = {
     "onset": "first order",
     "discrete": "first order without an onset",
@@ -31,8 +33,9 @@ NAMES = {
     "alpha": "α-order",
     "inverse_variance": "weighed by variance",
     "zeroth": "zeroth order",
+    "ppo": "PPO",
 }
-_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH), strict=True))
+_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
     "quadruped": envs.quadruped,
@@ -61,7 +64,7 @@ class Settings(RunSettings):
     environment: Name
     """What is learned: DiffRL's tasks, or a quadruped that follows commands."""
     methods: Annotated[tuple[Method, ...], Field(min_length=1)]
-    """Which gradients learn."""
+    """Which gradients learn; PPO is brax's."""
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
     """By which contact is stiffer than in the scene."""
     num_substeps: Annotated[int, Field(ge=1)] | None = None
@@ -91,14 +94,18 @@ class Settings(RunSettings):
         return self.sizes.num_environments * self.window
 
 
+History = dict[str, Float[np.ndarray, "updates seeds"]]
+
+
 @dataclass(frozen=True)
 class Course:
     """What one method did at one stiffness, for all seeds."""
 
     method: str
     stiffness: float
-    history: dict[str, Float[np.ndarray, "updates seeds"]]
+    history: History
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
+    terms: dict[str, Float[np.ndarray, "seeds episodes"]]  # of the reward, means per step there
     qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
     num_states: int  # of it
 
@@ -169,6 +176,8 @@ def _course(
 ) -> Course:
     key = jax.random.key(settings.seed)
     stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
+    if method == "ppo":
+        return _judged_course(settings, stiffer, method, stiffness, *_by_ppo(settings, stiffer, advance_to))
     rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
     how = learning.Settings(
         num_environments=settings.sizes.num_environments,
@@ -186,18 +195,63 @@ def _course(
         log_every=_every(settings),
         checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
     )
-    judge = jax.vmap(
-        lambda policy, key: learning.evaluate(stiffer, policy, key, num_episodes=settings.sizes.num_episodes),
-        in_axes=(0, None),
-    )
-    found = jax.tree.map(np.asarray, judge(learned.policy, jax.random.key(settings.seed + 1)))
-    best = int(found.returns.mean(axis=1).argmax())
     history = {name: np.asarray(values) for name, values in learned.history.items()}
+    return _judged_course(settings, stiffer, method, stiffness, learned.policy, _act, history)
+
+
+def _act(policy: learning.Policy, obs):
+    return policy(obs)
+
+
+def _by_ppo(
+    settings: Settings, environment: Environment, advance_to: Callable[[int], None]
+) -> tuple[Any, ppo.Act, History]:
+    """Learn by PPO, a policy after the other, from as many steps as the others; what it does not measure is NaN."""
+    num_seeds, num_updates = settings.sizes.num_seeds, settings.sizes.num_updates
+    learned, acts, rewards, seconds = [], [], [], 0.0
+    for seed in range(num_seeds):
+        params, act, course = ppo.learn_ppo(
+            environment,
+            settings.seed + seed,
+            num_steps=num_updates * settings.num_steps,
+            num_environments=settings.sizes.num_environments,
+            window=settings.window,
+            report=lambda steps, s=seed: advance_to((s * num_updates + steps // settings.num_steps) // num_seeds),
+        )
+        learned.append(params)
+        acts.append(act)
+        seconds += course["seconds"][-1]
+        rewards.append(np.interp(settings.num_steps * np.arange(1, num_updates + 1), course["steps"], course["reward"]))
+    reward = np.stack(rewards, axis=1)
+    known = {"reward": reward, "seconds": np.full_like(reward, seconds / num_updates)}
+    counts = {name: np.zeros_like(reward) for name in ("not_finite", "skipped", "diverged", "shortened")}
+    unknown = {name: np.full_like(reward, np.nan) for name in ("alpha", "first_variance", "zeroth_variance")}
+    return jax.tree.map(lambda *x: jnp.stack(x), *learned), acts[0], {**known, **counts, **unknown}
+
+
+def _judged_course(
+    settings: Settings,
+    environment: Environment,
+    method: str,
+    stiffness: float,
+    learned: Any,
+    act: Callable[[Any, Any], Any],
+    history: History,
+) -> Course:
+    """Judge what was learned, with an axis for seeds, in C MuJoCo."""
+    num_episodes = settings.sizes.num_episodes
+
+    def judge(learned: Any, key):
+        return learning.evaluate(environment, lambda obs: act(learned, obs), key, num_episodes=num_episodes)
+
+    found = jax.tree.map(np.asarray, jax.vmap(judge, in_axes=(0, None))(learned, jax.random.key(settings.seed + 1)))
+    best = int(found.returns.mean(axis=1).argmax())
     return Course(
         method=method,
         stiffness=stiffness,
         history=history,
         returns=found.returns,
+        terms=found.terms,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
     )
@@ -257,15 +311,31 @@ def findings(outcome: Outcome) -> list[str]:
     for course in outcome.courses:
         lost = float(course.history["not_finite"].mean())
         skipped, diverged = int(course.history["skipped"].sum()), int(course.history["diverged"].sum())
+        shortened = float(course.history["shortened"].mean())
+        if shortened and course.method != "zeroth":
+            sentences.append(
+                f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were shortened to five "
+                "times the median over environments."
+            )
         if lost or skipped or diverged:
             named = capitalised(_label(course, outcome))
             sentences.append(
                 f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
                 f"{skipped} updates were skipped."
             )
-    if not sentences:
+    if not any("no numbers" in sentence for sentence in sentences):
         sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")
-    ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in outcome.courses]
+    if outcome.settings.environment == "quadruped":
+        for course in outcome.courses:
+            speed, turning = (np.sqrt(-course.terms[name].mean(axis=1)) for name in ("speed", "turning"))
+            sentences.append(
+                f"{capitalised(_label(course, outcome))} is off its command by {quantity(speed.mean(), _spread(speed))} m/s and "
+                f"{quantity(turning.mean(), _spread(turning))} rad/s, root mean squares in C MuJoCo, pushes included."
+            )
+    measured = [course for course in outcome.courses if course.method != "ppo"]
+    if not measured:
+        return sentences
+    ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in measured]
     sentences.append(
         f"The variance of the zeroth-order gradient is {min(ratio):.2g} to {max(ratio):.2g} times that of the first order, "
         "by actions, in the median over updates."
@@ -280,8 +350,7 @@ def tables(outcome: Outcome) -> list[Table]:
             _label(course, outcome),
             _judged(course),
             quantity(float(course.reward[-1].mean()), _spread(course.reward[-1])),
-            quantity(float(course.history["alpha"].mean())),
-            quantity(float(np.median(course.history["zeroth_variance"] / course.history["first_variance"]))),
+            *_of_gradients(course),
             quantity(course.seconds * outcome.settings.sizes.num_updates),
         ]
         for course in outcome.courses
@@ -292,6 +361,14 @@ def tables(outcome: Outcome) -> list[Table]:
         "first order. Seconds: of all seeds together, without compilation."
     )
     return [Table(heads, rows, caption)]
+
+
+def _of_gradients(course: Course) -> tuple[str, str]:
+    """Return α and the ratio of variances, dashes for PPO."""
+    if course.method == "ppo":
+        return "–", "–"
+    ratio = np.median(course.history["zeroth_variance"] / course.history["first_variance"])
+    return quantity(float(course.history["alpha"].mean())), quantity(float(ratio))
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -348,7 +425,7 @@ def by_stiffness(outcome: Outcome):
 def quality(outcome: Outcome):
     """Variance of both gradients, bias of the first, and α, against updates."""
     settings = outcome.settings
-    shown = [course for course in outcome.courses if course.stiffness == settings.stiffness[0]]
+    shown = [c for c in outcome.courses if c.stiffness == settings.stiffness[0] and c.method != "ppo"]
     figure, axes = subplots(1, 3, height=3.4)
     updates = np.arange(1, settings.sizes.num_updates + 1)
     for course in shown:

@@ -112,6 +112,10 @@ class Environment(InEngine):
         """Return what it keeps in mind after a step; by default the same."""
         return memory
 
+    def disturbed(self, state: State, memory: PyTree) -> State:
+        """Return where a step really begins, pushes included; by default the same."""
+        return state
+
     def control(self, action: Float[Array, " nu"]) -> Float[Array, " nu"]:
         """Return the controls of an action: −1 and 1 are the ends of `ctrlrange`; without a range it is the control itself."""
         low, high = self.scene.ctrlrange.T
@@ -164,11 +168,11 @@ class Environment(InEngine):
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
         action = jnp.clip(action, -self.action_limit, self.action_limit)
         key, memory_key, bundle_key = jax.random.split(state.key, 3)
-        ctrl = self.control(action)
-        course = self._move(state.physics, ctrl)
+        ctrl, begun = self.control(action), self.disturbed(state.physics, state.memory)
+        course = self._move(begun, ctrl)
         after = course.final
         if self.bundle is not None:
-            after = self.bundle.average(lambda *at: self._move(*at).final, self.scene, state.physics, ctrl, bundle_key)
+            after = self.bundle.average(lambda *at: self._move(*at).final, self.scene, begun, ctrl, bundle_key)
         terms = self.rewards(state.physics, action, after, state.memory)
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1

@@ -1,8 +1,11 @@
 """A quadruped that follows velocity commands, blind: it sees its joints, its turning and which way is down, not its speed.
 
 References:
-    Open-DiffLoco, arXiv:2608.02069 (rewards, commands, ends and the spread of the models, there on another robot).
+    Open-DiffLoco, arXiv:2608.02069 (rewards, commands, pushes, ends and the spread of the models, there on another robot
+    and without a reward for not falling).
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +20,16 @@ from mjxgrad.tasks.action_task import scene_path
 Memory = dict[str, Float[Array, "..."]]
 MOST_COMMAND = (2.0, 1.0, 1.5)  # m/s forward, m/s to the left, rad/s about the vertical
 _CHANGE = 0.004  # chance per action of a new command: after 5 s on average
+_PUSH = 1.0  # m/s, at most along either axis
+_PUSHED = 0.005  # chance per action of a push: after 4 s on average
 _REACH = 0.5  # rad that an action of 1 moves a joint's target
 _HEIGHT = 0.3  # m, of the trunk
 _LOWEST = 0.18
+_ALIVE = 4.0  # without it a policy that cannot follow yet earns least charges by falling at once
 
 
 class Quadruped(Environment):
-    """Twelve position servos, 50 actions a second; the command changes every 5 s on average."""
+    """Twelve position servos, 50 actions a second; every 5 s on average the command changes, every 4 s something pushes."""
 
     def start(self, key: PRNGKeyArray) -> State:
         joints, speeds = jax.random.split(key)
@@ -33,12 +39,16 @@ class Quadruped(Environment):
         return initial_state(self.scene, jnp.concatenate([rest.qpos[:7], posture]), speed)
 
     def first_memory(self, key: PRNGKeyArray) -> Memory:
-        return {"command": _command(key), "action": jnp.zeros(12)}
+        return {"command": _command(key), "push": jnp.zeros(2), "action": jnp.zeros(12)}
 
     def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
-        change, draw = jax.random.split(key)
+        change, draw, push, where = jax.random.split(key, 4)
         command = jnp.where(jax.random.bernoulli(change, _CHANGE), _command(draw), memory["command"])
-        return {"command": command, "action": action}
+        kick = jax.random.uniform(where, (2,), minval=-_PUSH, maxval=_PUSH)
+        return {"command": command, "push": jnp.where(jax.random.bernoulli(push, _PUSHED), kick, 0.0), "action": action}
+
+    def disturbed(self, state: State, memory: Memory) -> State:
+        return dataclasses.replace(state, qvel=state.qvel.at[:2].add(memory["push"]))
 
     def control(self, action: Float[Array, " nu"]) -> Float[Array, " nu"]:
         return self.scene.data.qpos[7:] + _REACH * action
@@ -63,6 +73,7 @@ class Quadruped(Environment):
             "posture": -0.3 * ((after.qpos[7:] - self.scene.data.qpos[7:]) ** 2).sum(),
             "change": -0.02 * ((action - memory["action"]) ** 2).sum(),
             "action": -0.05 * (action**2).sum(),
+            "alive": jnp.full_like(speed[0], _ALIVE),
         }
 
     def is_over(self, state: State) -> Bool[Array, ""]:

@@ -19,14 +19,14 @@ class Evaluation(eqx.Module):
         lengths: actions until the end.
         terminated: whether an episode ended before its time.
         qpos: positions at each action and after the last; from an end on they stay.
-        obs: likewise, what the policy saw.
+        terms: of the reward by name, their means per step.
     """
 
     returns: Float[Array, "*episodes"]
     lengths: Int[Array, "*episodes"]
     terminated: Bool[Array, "*episodes"]
     qpos: Float[Array, "*episodes states nq"]
-    obs: Float[Array, "*episodes states obs"]
+    terms: dict[str, Float[Array, "*episodes"]]
 
 
 def evaluate(
@@ -56,16 +56,19 @@ def evaluate(
     def one(key: PRNGKeyArray) -> Evaluation:
         start = judge.reset(key)
 
-        def advance(carry: tuple[EnvState, Array, Array], _):
-            state, total, length = carry
+        def advance(carry: tuple[EnvState, dict[str, Array], Array], _):
+            state, totals, length = carry
             stepped = judge.step(state, policy(state.obs))
             following = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, stepped)
-            total = total + jnp.where(state.done, 0.0, stepped.reward)
-            return (following, total, length + ~state.done), (following.physics.qpos, following.obs)
+            now = stepped.metrics | {"reward": stepped.reward}
+            totals = {name: total + jnp.where(state.done, 0.0, now[name]) for name, total in totals.items()}
+            return (following, totals, length + ~state.done), following.physics.qpos
 
-        first = (start, jnp.zeros_like(start.reward), jnp.zeros((), jnp.int32))
-        (final, total, length), (qpos, obs) = jax.lax.scan(advance, first, length=judge.episode_length)
-        qpos = jnp.concatenate([start.physics.qpos[None], qpos])
-        return Evaluation(total, length, final.terminated, qpos, jnp.concatenate([start.obs[None], obs]))
+        zeros = dict.fromkeys([*start.metrics, "reward"], jnp.zeros_like(start.reward))
+        first = (start, zeros, jnp.zeros((), jnp.int32))
+        (final, totals, length), qpos = jax.lax.scan(advance, first, length=judge.episode_length)
+        total = totals.pop("reward")
+        terms = {name: value / length for name, value in totals.items()}
+        return Evaluation(total, length, final.terminated, jnp.concatenate([start.physics.qpos[None], qpos]), terms)
 
     return jax.jit(jax.vmap(one))(jax.random.split(key, num_episodes))

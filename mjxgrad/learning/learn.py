@@ -71,7 +71,8 @@ def learn(
     - `first_variance`, `zeroth_variance` of one environment's gradient by its actions; `squared_bias`, of the difference of
       their means, less what noise explains, so that it may be negative;
     - `ended`, share of windows in which an episode ended for good: no derivative sees across that;
-    - `not_finite`, share of first-order gradients that were not numbers; `diverged`, steps without a meaningful next state;
+    - `not_finite`, share of first-order gradients that were not numbers; `shortened`, of those that were too large, see
+      `Settings.largest_sample`; `diverged`, steps without a meaningful next state;
       `skipped`, 1 if the mixture was not finite and nothing was changed;
     - `critic_loss`;
     - `seconds`, of the clock for an update of all policies, without compilation.

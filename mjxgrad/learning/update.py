@@ -88,6 +88,7 @@ def _improve(
 ) -> tuple[Policy, optax.OptState, Metrics]:
     """Move the policy along the mixture, unless that is not finite; and say what it was made of."""
     policy = learner.policy
+    gradients, is_shortened = gradients.shortened(settings.largest_sample)
     mixture, weights, evidence = mix(gradients, settings.rule)
 
     def acted(actor: Network) -> Float[Array, "environments steps nu"]:
@@ -108,6 +109,7 @@ def _improve(
         "zeroth_variance": evidence.zeroth_variance.sum(),
         "squared_bias": (evidence.difference_norm**2 - evidence.difference_variance / evidence.real_count).sum(),
         "not_finite": 1 - gradients.is_finite.mean(),
+        "shortened": is_shortened.mean(),
         "skipped": 1 - is_finite.astype(norm.dtype),
     }
     return Policy(actor, policy.normaliser), moments, found

@@ -16,6 +16,7 @@ References:
     Onoda et al., arXiv:2604.18161 (the mixture by step).
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -71,6 +72,18 @@ class Gradients(eqx.Module):
     first: Float[Array, "*environments steps nu"]
     zeroth: Float[Array, "*environments steps nu"]
     is_finite: Bool[Array, "*environments steps"]
+
+    def shortened(self, most: float) -> tuple["Gradients", Bool[Array, "environments steps"]]:
+        """Shorten first-order gradients to so many times the median norm over environments, and say which were.
+
+        Their tails are so heavy that a mean over any batch is that of a few; a shortened one has a small bias, which the rules
+        see, and a variance. Where the median is zero none is.
+        """
+        norms = jnp.linalg.norm(self.first, axis=-1)
+        limit = most * jnp.nanmedian(jnp.where(self.is_finite, norms, jnp.nan), axis=0)
+        is_long = self.is_finite & (norms > limit) & (limit > 0)
+        scale = jnp.where(is_long, limit / jnp.where(is_long, norms, 1.0), 1.0)
+        return dataclasses.replace(self, first=scale[..., None] * self.first), is_long
 
 
 def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
