@@ -108,9 +108,9 @@ def _improve(
         "first_variance": evidence.first_variance.sum(),
         "zeroth_variance": evidence.zeroth_variance.sum(),
         "squared_bias": (evidence.difference_norm**2 - evidence.difference_variance / evidence.real_count).sum(),
-        "not_finite": 1 - gradients.is_finite.mean(),
+        "not_finite": (~gradients.is_finite).mean(),
         "shortened": is_shortened.mean(),
-        "skipped": 1 - is_finite.astype(norm.dtype),
+        "skipped": (~is_finite).astype(norm.dtype),
     }
     return Policy(actor, policy.normaliser), moments, found
 
