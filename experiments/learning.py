@@ -314,8 +314,8 @@ def findings(outcome: Outcome) -> list[str]:
         shortened = float(course.history["shortened"].mean())
         if shortened and course.method != "zeroth":
             sentences.append(
-                f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were shortened to five "
-                "times the median over environments."
+                f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were longer than "
+                "zeroth-order noise, and shortened to it."
             )
         if lost or skipped or diverged:
             named = capitalised(_label(course, outcome))

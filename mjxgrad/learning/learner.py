@@ -33,8 +33,8 @@ class Settings:
         critic_batches: parts of such a pass.
         target_rate: share by which the target value function follows the value function.
         largest_norm: to which gradients are clipped.
-        largest_sample: to which the first-order gradient of one environment's step is shortened, in medians over environments.
-            Through contact a few are a million times the others, and would be all that the mean shows. Infinity shortens none.
+        largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
+            zeroth-order one over environments, see `window.Gradients.shortened`. Infinity shortens none.
         is_episodic: whether every window begins anew and there is no value function.
     """
 
@@ -52,7 +52,7 @@ class Settings:
     critic_batches: int = 4
     target_rate: float = 0.8
     largest_norm: float = 1.0
-    largest_sample: float = 5.0
+    largest_sample: float = 1.0
     is_episodic: bool = False
 
     def __post_init__(self):

@@ -74,14 +74,14 @@ class Gradients(eqx.Module):
     is_finite: Bool[Array, "*environments steps"]
 
     def shortened(self, most: float) -> tuple["Gradients", Bool[Array, "environments steps"]]:
-        """Shorten first-order gradients to so many times the median norm over environments, and say which were.
+        """Shorten first-order gradients to so many times the zeroth-order ones' root mean square, and say which were.
 
-        Their tails are so heavy that a mean over any batch is that of a few; a shortened one has a small bias, which the rules
-        see, and a variance. Where the median is zero none is.
+        Through contact a few are a million times the others, so that a mean over any batch is that of a few. One that is longer
+        than zeroth-order noise tells no more than that does; shortened it has a small bias, which the rules see.
         """
         norms = jnp.linalg.norm(self.first, axis=-1)
-        limit = most * jnp.nanmedian(jnp.where(self.is_finite, norms, jnp.nan), axis=0)
-        is_long = self.is_finite & (norms > limit) & (limit > 0)
+        limit = most * jnp.sqrt((self.zeroth**2).sum(axis=-1).mean(axis=0))
+        is_long = self.is_finite & (norms > limit)
         scale = jnp.where(is_long, limit / jnp.where(is_long, norms, 1.0), 1.0)
         return dataclasses.replace(self, first=scale[..., None] * self.first), is_long
 
