@@ -72,15 +72,18 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if task is not None:
         workspace.check(task.scene)
     with workspace.stage("gradients", "stiffnesses", len(stiffness)) as advance_to:
-        measured = bias_variance(
-            objective,
-            jnp.asarray(settings.angles)[:, None],
-            jax.random.key(settings.seed),
-            softness=knob,
-            num_samples=settings.num_samples,
-            num_reference=settings.reference_samples,
-            confidence=settings.confidence,
-            progress=lambda done, _: advance_to(done),
+        measured = workspace.once(
+            "gradients",
+            lambda: bias_variance(
+                objective,
+                jnp.asarray(settings.angles)[:, None],
+                jax.random.key(settings.seed),
+                softness=knob,
+                num_samples=settings.num_samples,
+                num_reference=settings.reference_samples,
+                confidence=settings.confidence,
+                progress=lambda done, _: advance_to(done),
+            ),
         )
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
         raise ExperimentError(
