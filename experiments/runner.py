@@ -85,6 +85,8 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
         with writing(folder):
             _write(run, report, partial, facts)
     print(f"{report.verdict}\n{folder / 'report.html'}")
+    if facts["lacks_video"]:
+        print(f"no video: {report.video_caption}", file=sys.stderr)
 
 
 def _can_draw() -> bool:

@@ -86,9 +86,15 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             ),
         )
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
+        name, remedy = "slope", "take smaller angles, less noise or a smaller slope"
+        if task is not None:
+            name, remedy = (
+                "stiffness",
+                "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)",
+            )
         raise ExperimentError(
-            f"stiffness {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
-            "derivatives, are finite; leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
+            f"{name} {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
+            f"derivatives, are finite; {remedy}"
         )
     table = _table(measured, stiffness, settings)
     for i in np.flatnonzero((table.finite_share < 1).any("angle")):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -222,7 +223,10 @@ def test_rollouts_that_are_all_nan_are_a_sentence_that_names_the_stiffness(copie
     """A slope of 1e200 times an angle that overflows: the cost is finite nowhere that counts."""
     (copied / "nan.toml").write_text(SETTINGS.replace("angles = [0.05, 0.12]", "angles = [1e160, 2e160]"))
     assert run(copied / "nan.toml", copied / "runs") == 2
-    assert "gives no estimate" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "gives no estimate" in err
+    assert "smaller angles" in err
+    assert "time step" not in err, "a ramp has none"
     assert not (copied / "runs" / "nan").exists()
 
 
@@ -289,6 +293,40 @@ def test_an_empty_report_is_none_and_an_unchanged_run_clears_what_a_killed_one_l
     assert run(copied / "steep.toml", copied / "runs") == 2
 
 
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."),
+            "take fewer samples (RES",
+        ),
+        (np._core._exceptions._ArrayMemoryError((10**13,), np.dtype(float)), "Unable to allocate"),
+    ],
+)
+def test_too_little_memory_is_a_sentence(copied, monkeypatch, capsys, error, sentence):
+    def exhaust(*_):
+        raise error
+
+    monkeypatch.setattr(measure, "measure", exhaust)
+    assert run(copied / "steep.toml", copied / "runs", "--force") == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_another_error_of_the_runtime_is_a_mistake_in_the_program(copied, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("a mistake")
+
+    monkeypatch.setattr(measure, "measure", fail)
+    with pytest.raises(RuntimeError, match="a mistake"):
+        run(copied / "steep.toml", copied / "runs", "--force")
+
+
+def test_an_output_without_a_name_is_refused(finished, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", str(finished / "steep.toml"), "--output", ""])
+    assert "must name a folder" in capsys.readouterr().err
+
+
 def _reached(*_):
     raise ValueError("reached")
 
@@ -323,8 +361,8 @@ def measure(settings, workspace):
 def test_after_a_kill_a_run_goes_on_from_its_last_finished_part(tmp_path, monkeypatch, capsys):
     """0.1 + 1.1 by a process that is killed in the second part, and one that follows."""
     head, _, tail = ONE_FILE.partition("def measure(")
-    (tmp_path / "doubling.py").write_text(head + IN_PARTS + tail[tail.index("\n\n\n") :])
-    (tmp_path / "trial.toml").write_text('# How much?\nexperiment = "doubling"\nnumber = 0.1\n')
+    (tmp_path / "in_parts.py").write_text(head + IN_PARTS + tail[tail.index("\n\n\n") :])
+    (tmp_path / "trial.toml").write_text('# How much?\nexperiment = "in_parts"\nnumber = 0.1\n')
     begin = (
         "import sys, pathlib, experiments, experiments.__main__ as command; from experiments import config; "
         "config.FOLDER = pathlib.Path(sys.argv[1]); experiments.__path__.append(sys.argv[1]); command.main(sys.argv[2:])"
