@@ -77,6 +77,12 @@ def load_scene(
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     mj_model, name = _compile(source)
+    try:
+        mj_model.names.decode()
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{name} must have names in UTF-8, got {mj_model.names[error.start :][:1]!r}; save it as UTF-8"
+        ) from None
     _refuse_many_pairs(mj_model, name, leave_out or LeaveOut())
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
@@ -120,6 +126,8 @@ def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) ->
         raise TypeError(f"source must be {accepted}, got {type(source).__name__}")
     if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
         return _parse(mujoco.MjModel.from_xml_string, source.strip("\ufeff \t\r\n"), "the MJCF")
+    if source == "":
+        raise FileNotFoundError(f"source must be {accepted}, got ''")
     path = Path(source)
     if path.is_dir():
         raise IsADirectoryError(f"source must be {accepted}, got the folder {str(path)!r}")
@@ -218,8 +226,14 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
         model.geom_conaffinity[:] = 0
     try:
         # Of several processes each has its own; MJX would take the first of all.
-        mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
+        with np.errstate(over="raise"):
+            mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         return mjx_model, _make_data(model, mjx_model, max_contacts)
+    except FloatingPointError:
+        largest = f"{np.finfo(np.float32).max:.1g}"
+        raise SceneError(
+            f"{name} must hold numbers up to {largest} in single precision, got a larger one; set jax_enable_x64 for those"
+        ) from None
     except NotImplementedError as error:
         raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
 
