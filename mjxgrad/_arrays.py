@@ -33,7 +33,7 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
 
 
-def whole(name: str, value: Any, least: int = 1) -> int:
+def whole(name: str, value: Any, least: float = 1) -> int:
     """Return a count, refusing what is no whole number, too small, or known to the running program alone."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(
