@@ -33,7 +33,7 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
 
 
-def whole(name: str, value: Any, least: float = 1) -> int:
+def whole(name: str, value: Any, least: int | None = 1) -> int:
     """Return a count, refusing what is no whole number, too small, or known to the running program alone."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(
@@ -43,7 +43,7 @@ def whole(name: str, value: Any, least: float = 1) -> int:
         number = operator.index(value)
     except TypeError:
         raise ValueError(f"{name} must be a whole number, got {value!r}") from None
-    if number < least:
+    if least is not None and number < least:
         raise ValueError(f"{name} must be at least {least}, got {number}")
     return number
 
