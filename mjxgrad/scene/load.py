@@ -57,8 +57,9 @@ def load_scene(
         max_contacts: how many contacts of each friction dimension (`condim`) a state has room for: the nearest get it, and
             only they cost anything in the solve. None has room for all that could touch. Where all of them are taken, in
             some step, `Trajectory.crowded` says so.
-        distance_fields: take contacts of cylinders and ellipsoids with each other, spheres and capsules, on your own
-            responsibility. MJX searches them on distance fields: the motion may be good, the gradient is often not, or NaN.
+        distance_fields: take contacts of cylinders and ellipsoids with each other and capsules, and of ellipsoids with
+            spheres, on your own responsibility. MJX searches them on distance fields: the motion may be good, the gradient
+            is often not, or NaN.
 
     Returns:
         The scene. `print(scene.summary())` shows what it has.
