@@ -28,6 +28,12 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(str(error) or type(error).__name__, file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        # JAX's word for what NumPy says by a MemoryError.
+        if options.debug or not str(error).startswith("RESOURCE_EXHAUSTED"):
+            raise
+        print(f"not enough memory; take fewer samples ({str(error).splitlines()[0]})", file=sys.stderr)
+        return 2
     return 0
 
 
@@ -37,7 +43,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     run = commands.add_parser("run", help="run one configuration, or each combination of its sweep")
     run.add_argument("file", help="a TOML file, or the name of one in experiments/")
     run.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, in TOML syntax")
-    run.add_argument("--output", type=Path, default=Path("runs"), help="folder for results (default: runs)")
+    run.add_argument("--output", type=_folder, default=Path("runs"), help="folder for results (default: runs)")
     run.add_argument("--force", action="store_true", help="run even if nothing has changed")
     run.add_argument("--debug", action="store_true", help="show tracebacks")
     commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
@@ -49,6 +55,12 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     else:
         options.overrides += rest
     return options
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("must name a folder, got ''")
+    return Path(text)
 
 
 def _list() -> int:

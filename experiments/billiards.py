@@ -173,7 +173,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("descents", "methods", len(settings.methods)) as advance_to:
         for i, method in enumerate(settings.methods):
             key = jax.random.fold_in(jax.random.key(settings.seed), i)
-            runs.append(_run(method, task, settings, key, play))
+            descend = functools.partial(_run, method, task, settings, key, play)
+            runs.append(workspace.once(f"{i}", descend))
             advance_to(len(runs))
     return Outcome(settings, tuple(runs))
 

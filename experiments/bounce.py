@@ -1,5 +1,6 @@
 """Bounces: the derivative by each way against slope and closed form, over contact parameters and time steps."""
 
+import functools
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -117,10 +118,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     sampled = []
     with workspace.stage("rollouts", "time steps", len(settings.timesteps)) as advance_to:
         for h in settings.timesteps:
-            time, width = (jnp.asarray(h), jnp.int32(round(settings.duration / h))), SPEED * h
-            pairs = [_sample(scene, contacts, starts, *time, arm) for arm in ARMS]
-            ends = [_sample(scene, contacts, starts + side * width / 2, *time, DISCRETE)[0] for side in (1, -1)]
-            sampled.append([*itertools.chain(*pairs), (ends[0] - ends[1]) / width])
+            at_step = functools.partial(_sampled, scene, contacts, starts, settings.duration, h)
+            sampled.append(workspace.once(f"{h}", at_step))
             advance_to(len(sampled))
     *columns, wide = (np.stack(each, axis=1).reshape(len(starts), -1, *shape) for each in zip(*sampled, strict=True))
     heights, derivatives = columns[::2], columns[1::2]
@@ -130,6 +129,16 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("quadrature", "steps", 1):
         truths = np.array([_truth(*cell) for cell in cells]).reshape(*shape, 3)
     return Outcome(settings, grid_of(settings, found, differences, truths))
+
+
+def _sampled(
+    scene: Scene, contacts: tuple[Array, Array], starts: Array, duration: float, timestep: float
+) -> list[Array]:
+    """Give heights and derivatives by every arm at one time step, and differences over the way of one step."""
+    time, width = (jnp.asarray(timestep), jnp.int32(round(duration / timestep))), SPEED * timestep
+    pairs = [_sample(scene, contacts, starts, *time, arm) for arm in ARMS]
+    ends = [_sample(scene, contacts, starts + side * width / 2, *time, DISCRETE)[0] for side in (1, -1)]
+    return [*itertools.chain(*pairs), (ends[0] - ends[1]) / width]
 
 
 def grid_of(

@@ -4,6 +4,7 @@ import difflib
 import importlib
 import itertools
 import json
+import math
 import re
 import tomllib
 import types
@@ -18,6 +19,9 @@ from pydantic_core import ErrorDetails
 from experiments.settings import RunSettings
 
 FOLDER = Path(__file__).parent
+_MOST_SHOWN = 20
+_MOST_RUNS = 10_000
+_LONGEST_HEADER = 5000
 
 
 class ExperimentError(Exception):
@@ -31,7 +35,8 @@ class ConfigurationError(ExperimentError):
         self.source = source
         self.mistakes = tuple(dict.fromkeys(mistakes))
         count = "a mistake" if len(self.mistakes) == 1 else f"{len(self.mistakes)} mistakes"
-        super().__init__("\n  ".join([f"{source} has {count}:", *self.mistakes]))
+        more = [f"and {len(self.mistakes) - _MOST_SHOWN} more"] if len(self.mistakes) > _MOST_SHOWN else []
+        super().__init__("\n  ".join([f"{source} has {count}:", *self.mistakes[:_MOST_SHOWN], *more]))
 
 
 def suggest(given: str, choices: Iterable[str]) -> str:
@@ -59,15 +64,32 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     `ConfigurationError` names every mistake in both.
     """
     path = find_file(file)
-    text = path.read_text(encoding="utf-8")
     try:
-        table = tomllib.loads(text)
+        # Windows' editors begin a file with a mark that TOML has no place for.
+        text = path.read_text(encoding="utf-8-sig")
+        return _load(path, text, _parsed(text), overrides)
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(path.name, [f"not UTF-8, at byte {error.start}; save it as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(path.name, [f"not TOML: {error}"]) from None
+    except RecursionError:
+        raise ConfigurationError(path.name, ["arrays or tables are nested too deeply"]) from None
+
+
+def _load(path: Path, text: str, table: dict[str, Any], overrides: list[str]) -> list[Run]:
     problems = [problem for item in overrides if (problem := _apply(table, item))]
     sweep, sweep_problems = _take_sweep(table)
+    if (count := math.prod(map(len, sweep.values()))) > _MOST_RUNS:
+        raise ConfigurationError(path.name, [f"sweep: must be at most {_MOST_RUNS} runs, got {count}"])
     combinations = [dict(zip(sweep, values, strict=True)) for values in itertools.product(*sweep.values())]
     question, expected = read_header(text)
+    if len(question) + len(expected) > _LONGEST_HEADER:
+        problems.append(
+            f"the comment that opens it must have at most {_LONGEST_HEADER} characters: it is the report's title"
+        )
+    # It is the name of the output folder.
+    if not path.stem.strip(".") or not path.stem.isprintable():
+        problems.append(f"its name must be one for a folder, got {path.name!r}")
     runs = []
     for varied in combinations:
         candidate = json.loads(json.dumps(table, default=str))
@@ -81,6 +103,16 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     if problems or sweep_problems:
         raise ConfigurationError(path.name, list(dict.fromkeys(problems + sweep_problems)))
     return runs
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:
+        # Python's limit on the digits of an integer, where TOML's is 64 bits.
+        raise (
+            error if isinstance(error, tomllib.TOMLDecodeError) else tomllib.TOMLDecodeError("a number is too long")
+        ) from None
 
 
 def find_file(file: str) -> Path:
@@ -130,9 +162,10 @@ def _choose_size(table: dict[str, Any]) -> None:
 def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
     """Check a table against the settings of its kind: these or None, and one sentence per mistake."""
     kind = table.get("experiment")
-    if kind not in kinds():
-        named = f'there is no experiment "{kind}"; ' if kind is not None else "required, and missing; "
-        return None, [f"experiment: {named}{suggest(str(kind), kinds())}"]
+    if kind is None:
+        return None, [f"experiment: required, and missing; choose one of {', '.join(kinds())}"]
+    if not isinstance(kind, str) or kind not in kinds():
+        return None, [f"experiment: there is no experiment {_shown(kind)}; {suggest(str(kind)[:100], kinds())}"]
     settings = part(kind, "settings").Settings
     try:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
@@ -151,9 +184,9 @@ def _follows(detail: ErrorDetails, error: ValidationError) -> bool:
 def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
     # Pydantic puts a union's branch into the path too; only names of settings and positions in arrays help a reader.
     parts, owner = _walk(settings, detail["loc"])
-    path = ".".join(parts)
+    path = ".".join(part or '""' for part in parts)
     swept_path = f"sweep.{path}" if path in swept else path
-    given = json.dumps(detail.get("input"), ensure_ascii=False)
+    given = _shown(detail.get("input"))
     match detail["type"]:
         case "extra_forbidden":
             return f"{swept_path}: unknown key; {suggest(parts[-1], owner.model_fields)}"
@@ -170,6 +203,11 @@ def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) 
             return f"{swept_path}: {reason}" if path else reason
     reason = detail["msg"].removeprefix("Input should be ").removeprefix("a valid ")
     return f"{swept_path}: must be {reason}, got {given}"
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _walk(settings: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel]]:
@@ -200,7 +238,7 @@ def _apply(table: dict[str, Any], override: str) -> str | None:
     if not equals or not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", key):
         return f'{override}: not an override; write key=value, such as seed=1 or softness.stiffness="[1e3, 1e4]"'
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
+        parsed = _parsed(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         # A shell eats the quotes of a TOML string, so a bare word stands for one, alone or in a list.
         words = value[1:-1].split(",") if value.startswith("[") and value.endswith("]") else [value]

@@ -180,7 +180,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")
             points = []
             for name, setting in jobs:
-                points.append(_point(name, task, setting))
+                take = functools.partial(_point, name, task, setting)
+                points.append(workspace.once(f"{contact} {name} {setting}", take))
                 advance_to(len(courses) * (1 + len(jobs)) + 1 + len(points))
             courses.append(Course(contact, np.asarray(reference), tuple(points)))
     return Outcome(tuple(courses))

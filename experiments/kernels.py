@@ -1,6 +1,7 @@
 """Smoothing kernels: the noise that a force at a distance stands for, against samples of it."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -92,10 +93,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     motions, linear, velocities = [], [], (0.0, -settings.speed)
     with workspace.stage("kernels", "kernels", len(settings.kernels)) as advance_to:
         for i, name in enumerate(settings.kernels):
-            motion_key, step_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), i))
-            smoothed = _smoothed_motion(scene, settings, mg.Smoothing(settings.length, name))
-            motions.append([*smoothed, *_sampled_motion(scene, settings, name, motion_key)])
-            linear.append([_linear(scene, settings, name, velocity, step_key) for velocity in velocities])
+            key = jax.random.fold_in(jax.random.key(settings.seed), i)
+            found = workspace.once(name, lambda name=name, key=key: _kernel(scene, settings, name, velocities, key))
+            motions.append(found[0])
+            linear.append(found[1])
             advance_to(i + 1)
     names = ("height", "slope", "sampled", "sampled_error", "sampled_slope", "sampled_slope_error")
     time = settings.timestep * np.arange(settings.horizon + 1)
@@ -107,6 +108,16 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     table = xr.Dataset({"value": (list(dims), value), "error": (list(dims), error)}, coords=dims)
     deviation = abs(table.value - table.value.isel(way=0)) / table.error.where(table.error > 0, np.inf)
     return Outcome(settings, *_profiles(settings), motion, table.assign(deviation=deviation))
+
+
+def _kernel(
+    scene: mg.Scene, settings: Settings, name: str, velocities: Sequence[float], key: Array
+) -> tuple[list, list]:
+    """Give motion and derivatives under one kernel, smoothed and sampled."""
+    motion_key, step_key = jax.random.split(key)
+    smoothed = _smoothed_motion(scene, settings, mg.Smoothing(settings.length, name))
+    motion = [*smoothed, *_sampled_motion(scene, settings, name, motion_key)]
+    return motion, [_linear(scene, settings, name, velocity, step_key) for velocity in velocities]
 
 
 def _scene(settings: Settings, first: float, last: float, margin: float = 0.0) -> mg.Scene:

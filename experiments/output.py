@@ -2,12 +2,15 @@
 
 import contextlib
 import csv
+import errno
+import fcntl
+import glob
 import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from experiments.config import ExperimentError
 
@@ -16,19 +19,33 @@ from experiments.config import ExperimentError
 def building(folder: Path) -> Iterator[Path]:
     """Build an output folder beside its place, and put it there only once it is complete.
 
-    If the block raises, what it wrote is removed and the folder's former content stays.
+    If the block raises, what it wrote is removed and the folder's former content stays. Another run that is at work on the same
+    folder is an `ExperimentError`.
     """
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
-    previous = folder.with_name(f".{folder.name}.previous")
-    with writing(folder):
-        _recover(folder, previous)
-        partial.mkdir(parents=True)
-    try:
-        yield partial
+    with _alone(folder):
         with writing(folder):
-            _replace(folder, partial, previous)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+        try:
+            yield partial
+            with writing(folder):
+                _sync(partial)
+                _replace(folder, partial, _previous(folder))
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        # What was kept of interrupted runs has served once one has come to its end.
+        for kept in _beside(folder, "kept-*"):
+            shutil.rmtree(kept, ignore_errors=True)
+
+
+def recover(folder: Path) -> None:
+    """Clear up after a run that was killed: its remains go, and a result it had set aside comes back.
+
+    Where another run is at work, or nothing may be written, all stays as it is.
+    """
+    if _previous(folder).exists() or any(_beside(folder, "partial-*")):
+        with contextlib.suppress(ExperimentError), _alone(folder):
+            pass
 
 
 @contextlib.contextmanager
@@ -37,11 +54,13 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        cause = (error.strerror or str(error)).lower()
+        # A folder to be made where there is a file: "file exists" would puzzle whoever means the folder.
+        cause = "not a directory" if isinstance(error, FileExistsError) else (error.strerror or str(error)).lower()
+        remedy = "free some space, or name" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "name"
         at = f" ({error.filename})" if error.filename and Path(error.filename) != folder else ""
         raise ExperimentError(
             f"cannot write the results to {folder}: {cause}{at}; "
-            "free it, or name another folder with --output FOLDER. Earlier results are as they were."
+            f"{remedy} another folder with --output FOLDER. Earlier results are as they were."
         ) from error
 
 
@@ -85,21 +104,70 @@ def keeping(folder: Path, fingerprint: str) -> Path:
     return folder.with_name(f".{folder.name}.kept-{fingerprint[:16]}")
 
 
-def forget(folder: Path) -> None:
-    """Remove what was kept of interrupted runs, once one has come to its end."""
-    for kept in folder.parent.glob(f".{folder.name}.kept-*"):
-        shutil.rmtree(kept, ignore_errors=True)
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold an output folder against other runs, and begin by clearing up after one that was killed."""
+    lock = folder.with_name(f".{folder.name}.lock")
+    with writing(folder):
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        file = _locked(lock, folder)
+    try:
+        with writing(folder):
+            _clear_up(folder)
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        file.close()
 
 
-def _recover(folder: Path, previous: Path) -> None:
-    """Clear up after a run that was killed: its remains go, and a result it had set aside comes back."""
+def _locked(lock: Path, folder: Path) -> TextIO:
+    """Lock a file. The system frees it with its process, however that ends: nothing has to be guessed of numbers of processes."""
+    while True:
+        file = lock.open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            with file:
+                raise ExperimentError(
+                    f"another run (process {file.read() or 'unknown'}) is writing to {folder}; wait until it ends, or name "
+                    "another folder with --output FOLDER"
+                ) from None
+        # The run that held it may have removed it in between; the name is then another file's, or none's.
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
+                return file
+        file.close()
+
+
+def _clear_up(folder: Path) -> None:
+    previous = _previous(folder)
     if previous.exists() and not folder.exists():
         previous.rename(folder)
     shutil.rmtree(previous, ignore_errors=True)
-    for remains in folder.parent.glob(f".{folder.name}.partial-*"):
-        process = int(remains.name.rpartition("-")[2])
-        if not _is_running(process):
+    for remains in _beside(folder, "partial-*"):
+        # A run's ends in the number of its process; another name is somebody's own.
+        if remains.name.removeprefix(f".{folder.name}.partial-").isdigit():
             shutil.rmtree(remains, ignore_errors=True)
+
+
+def _previous(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.previous")
+
+
+def _beside(folder: Path, pattern: str) -> list[Path]:
+    return list(folder.parent.glob(f".{glob.escape(folder.name)}.{pattern}"))
+
+
+def _sync(folder: Path) -> None:
+    """Have all files on the disk before their folder gets its name, or a loss of power could leave empty ones."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
 
 
 def _replace(folder: Path, complete: Path, previous: Path) -> None:
@@ -113,11 +181,3 @@ def _replace(folder: Path, complete: Path, previous: Path) -> None:
             previous.rename(folder)
         raise
     shutil.rmtree(previous, ignore_errors=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except OSError as error:
-        return not isinstance(error, ProcessLookupError)
-    return True

@@ -122,7 +122,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     programs, descents = _programs(settings), []
     with workspace.stage("descent", "programs", len(programs)) as advance_to:
         for done, program in enumerate(programs):
-            descents += _descend(task, program, settings, jax.random.fold_in(key, done))
+            own = jax.random.fold_in(key, done)
+            descents += workspace.once(
+                f"{done}", lambda program=program, own=own: _descend(task, program, settings, own)
+            )
             advance_to(done + 1)
     return Outcome(settings, descents, float(jnp.abs(slope).max()), task)
 

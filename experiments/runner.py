@@ -10,14 +10,13 @@ import shlex
 import subprocess
 import sys
 import time
-import warnings
 import zlib
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from experiments.config import Run, flatten, load_runs, part
-from experiments.output import building, forget, keeping, write_csv, write_text, write_toml, writing
+from experiments.output import building, keeping, recover, write_csv, write_text, write_toml, writing
 from experiments.parallel import num_cores
 from experiments.report import Report, overview, page
 from experiments.workspace import CompileClock, Workspace
@@ -51,12 +50,13 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 
 
 def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
+    recover(folder)
     settings = run.settings.model_dump(mode="json")
     fingerprint = _fingerprint([settings, run.question, run.expected])
     previous = _previous(folder)
     # A report that lacks its video is made again once there is an OpenGL to draw it with.
     is_unchanged = previous.get("fingerprint") == fingerprint
-    if is_unchanged and not force and not (previous["lacks_video"] and _can_draw()):
+    if is_unchanged and not force and not (previous.get("lacks_video") and _can_draw()):
         print(f"unchanged: {folder / 'report.html'} (same settings and code; --force runs it again)")
         return
     with building(folder) as partial:
@@ -76,15 +76,17 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
             "lacks_video": report.video is None and bool(report.video_caption),
             "seconds": {
                 **workspace.seconds,
-                "total": time.perf_counter() - started,
+                "total": time.perf_counter() - started + workspace.kept_seconds,
                 "of it compiling": compiling.seconds,
+                **({"of it before an interruption": workspace.kept_seconds} if workspace.kept_seconds else {}),
             },
             "fingerprint": fingerprint,
         }
         with writing(folder):
             _write(run, report, partial, facts)
-    forget(folder)
     print(f"{report.verdict}\n{folder / 'report.html'}")
+    if facts["lacks_video"]:
+        print(f"no video: {report.video_caption}", file=sys.stderr)
 
 
 def _can_draw() -> bool:
@@ -95,8 +97,7 @@ def _can_draw() -> bool:
 
 def _call(run: Run, workspace: Workspace) -> Report:
     """Run the experiment; what the library warns of, and what it finds unstable, goes into the report, not to the terminal."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with workspace.listening():
         # Late, once the precision is chosen: these import JAX and MuJoCo.
         from experiments.theme import save
 
@@ -108,9 +109,8 @@ def _call(run: Run, workspace: Workspace) -> Report:
         video, caption = pictures.video(outcome, workspace, wanted) if wanted else (None, "")
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
-    told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
     # A scene warns of some of it when it is loaded.
-    sentences = dict.fromkeys([*report.warnings, *told, *workspace.warnings])
+    sentences = dict.fromkeys([*report.warnings, *workspace.told, *workspace.warnings])
     return Report(**{**vars(report), "warnings": list(sentences)})
 
 
@@ -156,8 +156,9 @@ def _previous(folder: Path) -> dict[str, Any]:
     """What the folder's result was made with; nothing if there is none or it is damaged."""
     try:
         facts = json.loads((folder / "environment.json").read_text(encoding="utf-8"))
-        return facts if (folder / "report.html").is_file() else {}
-    except (OSError, ValueError):
+        has_report = (folder / "report.html").stat().st_size > 0
+        return facts if has_report and isinstance(facts, dict) else {}
+    except (OSError, ValueError, RecursionError):
         return {}
 
 

@@ -268,7 +268,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
         for number, name in enumerate(settings.cases):
             own = float(case(name).model.opt.timestep)
-            courses += [_course(name, h, settings) for h in sorted({own, *settings.timesteps}, reverse=True)]
+            for h in sorted({own, *settings.timesteps}, reverse=True):
+                courses.append(workspace.once(f"{name} {h}", lambda name=name, h=h: _course(name, h, settings)))
             advance_to(number + 1)
     return Outcome(courses)
 

@@ -1,8 +1,8 @@
 """What every kind of experiment can be told, and what its settings are made of; imports nothing heavy."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -12,6 +12,15 @@ class SettingsTable(BaseModel):
     """A table of settings that refuses unknown keys and wrong types."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True)
+
+    @field_validator("*")
+    @classmethod
+    def _fits(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse counts beyond the integers that index arrays; a seed has a bound of its own."""
+        for one in value if isinstance(value, tuple) else (value,):
+            if isinstance(one, int) and abs(one) >= 2**31 and info.field_name != "seed":
+                raise ValueError(f"must be below 2^31, got {one:.3g}")
+        return value
 
 
 class RunSettings(SettingsTable):

@@ -142,7 +142,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         tables = []
         for i, (stiffness, rollouts) in enumerate(cells):
             problem = _problem(settings, stiffness)
-            table = compare(
+            estimate = functools.partial(
+                compare,
                 named,
                 problem.objective(settings.stddev),
                 jnp.array([settings.point]),
@@ -152,7 +153,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 num_repeats=settings.num_repeats,
                 confidence=settings.confidence,
             )
-            tables.append(table)
+            tables.append(workspace.once(f"{done + i}", estimate))
             advance_to(done + len(tables))
         return _dataset(settings, cells, tables)
 

@@ -1,17 +1,26 @@
 """What a running experiment sees of its output folder, its clock and its terminal."""
 
 import contextlib
+import os
+import pickle
+import re
 import sys
 import threading
 import time
+import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
 
+from experiments.output import writing
+
 if TYPE_CHECKING:
     from mjxgrad.scene import Scene
+
+_Found = TypeVar("_Found")
 
 
 class Workspace:
@@ -21,12 +30,51 @@ class Workspace:
         self.folder = folder
         self._kept = folder / "kept" if kept is None else kept
         self.seconds: dict[str, float] = {}
+        self.kept_seconds = 0.0
         self.warnings: list[str] = []
+        self._caught: list[warnings.WarningMessage] = []
 
     def keep(self, name: str) -> Path:
         """Return where to write what outlives an interruption, and is there again when the same run is begun anew."""
         self._kept.mkdir(parents=True, exist_ok=True)
         return self._kept / name
+
+    def once(self, name: str, compute: Callable[[], _Found]) -> _Found:
+        """Compute a part of the work, or take it over from the same run, interrupted after this part.
+
+        Each part has a name of its own. What it warned of is told again, and its time counts.
+        """
+        safe = re.sub(r"[^\w.,=+-]", "_", name)
+        path = self.keep(f"{safe[:80]}-{zlib.crc32(name.encode()):08x}.part")
+        # Written whole, by this very source: its name has a hash of all that decides a result.
+        if path.is_file():
+            found, seconds, told = pickle.loads(path.read_bytes())
+            self.kept_seconds += seconds
+            self.warnings += told
+            return found
+        started, before = time.perf_counter(), len(self.told)
+        found = compute()
+        content = pickle.dumps((found, time.perf_counter() - started, self.told[before:]))
+        with writing(self.folder):
+            partial = path.with_suffix(".partial")
+            with partial.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        return found
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take what the library warns of for the report, instead of the terminal."""
+        with warnings.catch_warnings(record=True) as self._caught:
+            warnings.simplefilter("always")
+            yield
+
+    @property
+    def told(self) -> list[str]:
+        """What the library has warned of."""
+        return [str(w.message) for w in self._caught if issubclass(w.category, UserWarning)]
 
     def check(self, scene: "Scene", *, speed: float | None = None, name: str | None = None) -> None:
         """Note what the time step of a scene, whose bodies meet at a speed (m/s), does not follow, for the report."""

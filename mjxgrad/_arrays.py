@@ -1,5 +1,6 @@
 """What is known of arrays while a program is traced, and roots whose derivatives exist where the usual ones have none."""
 
+import operator
 from typing import Any
 
 import jax
@@ -30,6 +31,30 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
     """Return whether all numbers of an array, or of one of its columns, are known, and are this one."""
     found = known(values)
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
+
+
+def whole(name: str, value: Any, least: int | None = 1) -> int:
+    """Return a count, refusing what is no whole number, too small, or known to the running program alone."""
+    if isinstance(value, jax.core.Tracer):
+        raise ValueError(
+            f"{name} must be known before anything is compiled, got a traced value; make it static in jax.jit"
+        )
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
+    if least is not None and number < least:
+        raise ValueError(f"{name} must be at least {least}, got {number}")
+    return number
+
+
+def one_key(key: Any) -> None:
+    """Refuse what is not a single random key."""
+    dtype, shape = getattr(key, "dtype", None), jnp.shape(key)
+    is_new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not ((is_new and shape == ()) or (dtype == jnp.uint32 and shape == (2,))):
+        given = f"an array of shape {shape}" if shape else repr(key)
+        raise ValueError(f"key must be one of jax.random.key, got {given}; jax.vmap takes several")
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import known
+from mjxgrad._arrays import known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
@@ -119,6 +119,7 @@ def initial_state(
     Raises:
         ValueError: if a part does not have the shape that the scene gives it.
     """
+    _check_scene(scene)
     data, parts = scene.data, []
     for message in [] if qpos is None else _beyond_limits(scene.model, qpos):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -190,6 +191,9 @@ def rollout(
             horizon is missing or contradicted, or controls or noise hold numbers that are not finite (checked where
             values are known, that is outside `jax.jit`; inside, the rollout is flagged as diverged at that step).
     """
+    _check_scene(scene)
+    if not isinstance(state, State):
+        raise ValueError(f"state must be of mg.initial_state, or the end of a rollout, got {type(state).__name__}")
     check_gradient(gradient, onset, smoothing)
     for message in [] if smoothing is None else smoothing_warnings(smoothing, scene.model):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -293,6 +297,11 @@ def rollout(
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
+
+
+def _check_scene(scene: Any) -> None:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be of mg.load_scene, got {type(scene).__name__}")
 
 
 def _one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
@@ -418,7 +427,7 @@ def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
 def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
     lengths = {k: int(jnp.shape(v)[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
     if horizon is not None:
-        lengths["horizon"] = horizon
+        lengths["horizon"] = whole("horizon", horizon)
     if not lengths:
         raise ValueError("horizon must be given where neither controls nor noise give it, got None")
     if len(set(lengths.values())) > 1:

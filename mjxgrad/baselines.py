@@ -19,8 +19,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad.objective import ActionNoise, Objective
+from mjxgrad.objective.base import as_objective
 from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
-from mjxgrad.optimiser.step import as_objective, parameter_stddev
+from mjxgrad.optimiser.step import parameter_stddev
 
 __all__ = ["cross_entropy", "mppi", "predictive_sampling"]
 

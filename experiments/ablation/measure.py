@@ -1,5 +1,6 @@
 """From settings to numbers: a scene with everything, without one group, and without all that it does not need."""
 
+import functools
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -284,7 +285,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     try:
         with workspace.stage("variants", "scenes", len(settings.chosen)) as advance_to:
             for number, name in enumerate(settings.chosen):
-                scenes.append(_scene(name, settings, workspace))
+                scenes.append(workspace.once(name, functools.partial(_scene, name, settings, workspace)))
                 advance_to(number + 1)
     finally:
         jax.config.update("jax_enable_compilation_cache", had_cache)

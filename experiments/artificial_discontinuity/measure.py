@@ -182,7 +182,13 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     bodies = {name: shape(name) for name in (*sizes.shapes, *sizes.lattices)}
     shapes = list(bodies.values())
     with workspace.stage("held bodies", "bodies", len(shapes)) as advance_to:
-        found = in_threads(lambda body: [_static(settings, body, name) for name in sizes.paths], shapes, advance_to)
+        found = in_threads(
+            lambda at: workspace.once(
+                f"held {at}", lambda: [_static(settings, shapes[at], name) for name in sizes.paths]
+            ),
+            range(len(shapes)),
+            advance_to,
+        )
     statics = [one for each in found for one in each]
     box, cube = found[0], shapes[0]
     with workspace.stage("overlap volumes", "paths", len(sizes.paths)):
@@ -195,7 +201,11 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     for body in pushed:
         workspace.check(body.scene, name=body.label)
     with workspace.stage("pushes", "bodies", len(pushed)) as advance_to:
-        pushes = in_threads(lambda one: push_slopes(settings, one[1], places, one[0]), enumerate(pushed), advance_to)
+        pushes = in_threads(
+            lambda at: workspace.once(f"pushed {at}", lambda: push_slopes(settings, pushed[at], places, at)),
+            range(len(pushed)),
+            advance_to,
+        )
     return Outcome(
         settings=settings,
         statics=statics,
@@ -420,7 +430,9 @@ def matings(settings: Settings, workspace: Workspace) -> list[Mating]:
         workspace.check(scene, name=f"mating, {label}")
         jobs.append((label, scene, np.random.default_rng([settings.seed, 100 + i])))
     with workspace.stage("mating", "geometries", len(scenes)) as advance_to:
-        return in_threads(lambda job: _mate(settings, *job), jobs, advance_to)
+        return in_threads(
+            lambda job: workspace.once(f"mating {job[0]}", lambda: _mate(settings, *job)), jobs, advance_to
+        )
 
 
 def _peg_and_hole(label: str) -> mujoco.MjModel:

@@ -72,20 +72,29 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if task is not None:
         workspace.check(task.scene)
     with workspace.stage("gradients", "stiffnesses", len(stiffness)) as advance_to:
-        measured = bias_variance(
-            objective,
-            jnp.asarray(settings.angles)[:, None],
-            jax.random.key(settings.seed),
-            softness=knob,
-            num_samples=settings.num_samples,
-            num_reference=settings.reference_samples,
-            confidence=settings.confidence,
-            progress=lambda done, _: advance_to(done),
+        measured = workspace.once(
+            "gradients",
+            lambda: bias_variance(
+                objective,
+                jnp.asarray(settings.angles)[:, None],
+                jax.random.key(settings.seed),
+                softness=knob,
+                num_samples=settings.num_samples,
+                num_reference=settings.reference_samples,
+                confidence=settings.confidence,
+                progress=lambda done, _: advance_to(done),
+            ),
         )
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
+        name, remedy = "slope", "take smaller angles, less noise or a smaller slope"
+        if task is not None:
+            name, remedy = (
+                "stiffness",
+                "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)",
+            )
         raise ExperimentError(
-            f"stiffness {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
-            "derivatives, are finite; leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
+            f"{name} {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
+            f"derivatives, are finite; {remedy}"
         )
     table = _table(measured, stiffness, settings)
     for i in np.flatnonzero((table.finite_share < 1).any("angle")):

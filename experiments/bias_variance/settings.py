@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from experiments.settings import Finite, Positive, RunSettings, VideoSettings
 
@@ -21,7 +21,7 @@ class Settings(RunSettings):
 
     task: Literal["ball_wall", "ramp"]
     """What is differentiated."""
-    stddev: Positive
+    stddev: Annotated[float, Field(ge=1e-9, allow_inf_nan=False)]
     """Of the noise on the angle, in rad (on the ramp without a unit)."""
     angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=6)]
     """Where gradients are estimated, in rad."""
@@ -40,3 +40,11 @@ class Settings(RunSettings):
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
     video: ThrowsSettings | None = None
+
+    @field_validator("angles", "stiffness")
+    @classmethod
+    def _differ(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        # Twice the same would count as two in the tests over all of them.
+        if twice := {value for value in values if values.count(value) > 1}:
+            raise ValueError(f"must differ, got {min(twice):g} more than once")
+        return values

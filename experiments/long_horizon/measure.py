@@ -153,10 +153,11 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)
         workspace.check(one.scene)
-        found[name] = _measure(settings, one, np.random.default_rng([settings.seed, index]), workspace)
+        rng = np.random.default_rng([settings.seed, index])
+        found[name] = workspace.once(name, lambda one=one, rng=rng: _measure(settings, one, rng, workspace))
         if name == "double_pendulum":
             with workspace.stage("adaptive integration", "rollouts", 1):
-                reference = _adaptive(settings.sizes, one)
+                reference = workspace.once("adaptive", lambda one=one: _adaptive(settings.sizes, one))
     return Outcome(settings, found, reference)
 
 

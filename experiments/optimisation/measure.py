@@ -289,9 +289,12 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:
         for i, method in enumerate(settings.methods):
             # Other noise for every method: the tests of their differences take runs to be independent.
-            runs.append(_run(method, task, settings, jax.random.fold_in(run_key, i)))
+            run = functools.partial(_run, method, task, settings, jax.random.fold_in(run_key, i))
+            runs.append(workspace.once(f"{i}", run))
             advance_to(len(runs))
-    errors = _errors(task, settings, error_key, workspace) if settings.error_repeats > 1 else None
+    errors = None
+    if settings.error_repeats > 1:
+        errors = workspace.once("errors", lambda: _errors(task, settings, error_key, workspace))
     return Outcome(
         settings=settings,
         num_samples=task.num_samples,

@@ -131,14 +131,14 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         for model in settings.models:
             run = _tree(task, settings, model) if settings.method == "tree" else _trajectory(task, settings, model)
             for seed in range(num_seeds):
-                attempts.append(run(seed))
+                attempts.append(workspace.once(f"{model} {seed}", lambda run=run, seed=seed: run(seed)))
                 advance_to(len(attempts))
     found = Outcome(settings, attempts, None, np.zeros((1, 5)), 0.0)
     if settings.method == "tree" and settings.tree.polish_iterations:
         shortest = found.shortest(settings.models[0])
         if found.is_solved(shortest):
             with workspace.stage("polishing", "ways", 1) as advance_to:
-                polished = _polish(task, settings, shortest)
+                polished = workspace.once("polished", lambda: _polish(task, settings, shortest))
                 advance_to(1)
     best = polished or found.best
     with workspace.stage("rollout", "rollouts", 1):

@@ -317,8 +317,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             key, descent_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), number))
             one = problem(name, settings)
             workspace.check(one.task.scene)
-            cells += [_cell(one, i, k, settings) for i, k in enumerate(jax.random.split(key, len(one.points)))]
-            courses += _courses(one, descent_key, settings.num_seeds)
+            for i, k in enumerate(jax.random.split(key, len(one.points))):
+                cells.append(workspace.once(f"{name} {i}", functools.partial(_cell, one, i, k, settings)))
+            descend = functools.partial(_courses, one, descent_key, settings.num_seeds)
+            courses += workspace.once(f"{name}, descents", descend)
             advance_to(number + 1)
     return Outcome(settings, cells, courses)
 

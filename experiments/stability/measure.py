@@ -1,5 +1,6 @@
 """From settings to numbers: mjxgrad beside C MuJoCo on every point."""
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -195,7 +196,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to, processes() as pool:
         for scene in scenes:
             grid = points(scene, size.resolution, size.num_random, settings.seed)
-            cases.append(_Case(scene, grid, simulate(scene, grid, settings.num_steps, pool), settings))
+            in_c = functools.partial(simulate, scene, grid, settings.num_steps, pool)
+            cases.append(_Case(scene, grid, workspace.once(f"C {scene.name}", in_c), settings))
             advance_to(len(cases))
     found = [{C_MUJOCO: _of_c(case)} for case in cases]
     truths: list[np.ndarray] = []
@@ -249,7 +251,9 @@ def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_
         return _Runs(program.run(*arrays), event, truth)
 
     with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
-        return in_threads(run, cases, advance_to)
+        return in_threads(
+            lambda case: workspace.once(f"{precision} {case.scene.name}", lambda: run(case)), cases, advance_to
+        )
 
 
 def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: Workspace) -> list[_Runs]:

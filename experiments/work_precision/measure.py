@@ -80,7 +80,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("scenes", "programs", sum(len(found) + 1 for found in needed.values())) as advance_to:
         for name, one in cases.items():
             workspace.check(mg.load_scene(one.model), name=one.title)
-            courses.append(_course(name, one, needed[name], settings, lambda: advance_to(next(done))))
+            course = functools.partial(_course, name, one, needed[name], settings, lambda: advance_to(next(done)))
+            courses.append(workspace.once(name, course))
             advance_to(next(done))
     return Outcome(settings, tuple(courses))
 

@@ -40,7 +40,7 @@ _ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
 
 
 _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "stiffness": (lambda x: x > 0, "positive"),
+    "stiffness": (lambda x: (x > 0) & (x < np.inf), "positive and finite"),
     "damping_ratio": (lambda x: x >= 0, "at least 0"),
     "impedance": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
     "width": (lambda x: x > 0, "positive"),

@@ -1,10 +1,12 @@
-"""Contacts between geoms: MJX's pairs, slots and functions, but for three kinds of pair whose points MJX finds in another way.
+"""Contacts between geoms: MJX's pairs, slots and functions, but for four kinds of pair whose points MJX finds in another way.
 
 A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
 and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
 there is nothing to search, and a contact belongs to one diagonal for good.
 
 A ball on a box. MJX knows its distance only where they overlap; the nearest point of a box is known anywhere.
+
+A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder is known, too.
 
 A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and gives the other two the height that
 follows from the first. Standing upright there is no lowest point; it then picks a fixed one, and the heights of the other two
@@ -145,7 +147,7 @@ def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points
     along_nearest, along_second = (jnp.sum(jnp.abs(outward) * axis, axis=1)[:, None] for axis in (nearest, second))
     traded = outward + sign * (along_second - along_nearest) * (1.0 * nearest - 1.0 * second)
     is_opposite = jnp.any(nearest & second, axis=1)
-    pos, frame = _towards_box(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
+    pos, frame = _towards(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
     next_one = jnp.max(rest, axis=1)
     # Round an edge the normal turns as the ball does: nothing to share.
     return pos, frame, jnp.max(beyond, axis=1) - next_one + _ROUND_EDGES * jnp.where(next_one > 0, next_one, 0.0)
@@ -188,8 +190,30 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> _Fo
 def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
     distance, outward, *_ = _from_box(model, data, geoms)
-    pos, frame = _towards_box(model, data, geoms, distance, outward)
+    pos, frame = _towards(model, data, geoms, distance, outward)
     return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
+
+
+def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
+    """Return the point of the cylinder that is nearest to the ball's centre; from within, that of the nearer of side and end."""
+    sphere, cylinder = geoms.T
+    away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
+    centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
+    radius = safe_norm(centre[:, :2])
+    on_axis = (radius == 0)[:, None]
+    radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
+    # In the half-plane of axis and centre: across, along.
+    beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]
+    sign = jnp.stack([jnp.ones_like(radius), jnp.where(centre[:, 2] < 0, -1.0, 1.0)], axis=1)
+    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
+    length = safe_norm(gap)
+    is_inside = jnp.all(beyond <= 0, axis=1)
+    nearer = sign * (jnp.arange(2) == jnp.argmax(beyond, axis=1)[:, None])
+    outward = jnp.where(is_inside[:, None], nearer, gap / jnp.where(length > 0, length, 1.0)[:, None])
+    distance = jnp.where(is_inside, jnp.max(beyond, axis=1), length)
+    outward = jnp.concatenate([outward[:, :1] * radial, outward[:, 1:]], axis=1)
+    pos, frame = _towards(model, data, geoms, distance, outward)
+    return distance - pick(sphere, model.geom_size)[:, 0], pos, frame
 
 
 def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
@@ -207,12 +231,12 @@ def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, A
     return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward, beyond, sign
 
 
-def _towards_box(
+def _towards(
     model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
 ) -> tuple[_Points, _Frames]:
     """Return position and frame of contacts, half-way between both surfaces."""
-    sphere, box = geoms.T
-    normal = contract("pij,pj->pi", pick(box, data.geom_xmat), -outward)
+    sphere, other = geoms.T
+    normal = contract("pij,pj->pi", pick(other, data.geom_xmat), -outward)
     reach = 0.5 * (distance + pick(sphere, model.geom_size)[:, 0])
     return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
 
@@ -222,4 +246,9 @@ def _largest(x: _Points) -> Array:
     return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
 
 
-_FUNCTIONS = {(_PLANE, _BOX): _plane_box, (_PLANE, _CYLINDER): _plane_cylinder, (_SPHERE, _BOX): _sphere_box}
+_FUNCTIONS = {
+    (_PLANE, _BOX): _plane_box,
+    (_PLANE, _CYLINDER): _plane_cylinder,
+    (_SPHERE, _BOX): _sphere_box,
+    (_SPHERE, _CYLINDER): _sphere_cylinder,
+}

@@ -273,6 +273,8 @@ def parts_and_terms(
 
 def weigh(rule: Rule, parts: Parts, plan: Plan, *, by_coordinate: bool = False) -> Weights:
     """Apply a rule to all coordinates or to each, where it has derivatives to judge that say something."""
+    if isinstance(rule, type) or not callable(rule):
+        raise ValueError(f"rule must be one of mg.estimators.rules, such as rules.Consistent(), got {rule!r}")
     is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
 
     def one_block(evidence: Evidence) -> Weights:

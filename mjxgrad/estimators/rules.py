@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 from scipy import stats
 
+from mjxgrad._arrays import is_known
 from mjxgrad.estimators.estimate import Reason
 
 
@@ -78,6 +79,11 @@ class FixedAlpha(eqx.Module):
     """The same weight always, from 0 to 1."""
 
     alpha: ArrayLike
+
+    def __check_init__(self):
+        is_number = isinstance(self.alpha, int | float) or is_known(self.alpha)
+        if is_number and not np.all((np.asarray(self.alpha) >= 0) & (np.asarray(self.alpha) <= 1)):
+            raise ValueError(f"alpha must be from 0 to 1, got {self.alpha}")
 
     def __call__(self, evidence: Evidence) -> Weights:
         alpha = jnp.asarray(self.alpha, evidence.first_norm.dtype)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import one_key, whole
 from mjxgrad.estimators.moments import Summary
 from mjxgrad.objective import Differentiated, Objective
 from mjxgrad.objective.base import unchanged, value_and_gradient
@@ -59,12 +60,13 @@ class Plan:
     def __post_init__(self):
         pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
         smallest, pairs = (4, pairs) if self.rollouts_per_unit == 2 else (2, "")
+        whole("num_samples", self.num_samples, least=None)
         if self.num_samples < smallest:
             raise ValueError(f"num_samples must be at least {smallest}{pairs}, got {self.num_samples}")
         if self.num_samples % self.rollouts_per_unit:
             raise ValueError(f"num_samples must be even{pairs}, got {self.num_samples}")
-        if self.chunk_size is not None and self.chunk_size < self.rollouts_per_unit:
-            raise ValueError(f"chunk_size must be at least {self.rollouts_per_unit}, got {self.chunk_size}")
+        if self.chunk_size is not None:
+            whole("chunk_size", self.chunk_size, self.rollouts_per_unit)
 
     @property
     def rollouts_per_unit(self) -> int:
@@ -174,6 +176,7 @@ def sample(
     The noise of unit i comes from `fold_in(key, i)`, so it is the same in whatever chunk. The index `plan.num_units` is
     the rollout without noise, which rides in the batch so that the rollout is compiled only once.
     """
+    one_key(key)
     is_noise_free = (units == plan.num_units) & plan.with_zero_noise
 
     def noise_of(unit: Int[Array, ""], is_free: Bool[Array, ""]) -> tuple[list[PyTree], Bool[Array, ""]]:

@@ -273,8 +273,7 @@ class _ActionsTranspose:
 
 
 def _checked(outcome: Outcome) -> Outcome:
-    as_scalar(outcome.cost, "the task's cost")
-    return outcome
+    return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
 
 
 def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:

@@ -139,6 +139,8 @@ class Objective(eqx.Module):
             )
         if not jnp.issubdtype(jnp.result_type(params), jnp.floating):
             raise ValueError(f"params must be floating-point, got {jnp.result_type(params)}; write 1.0 in place of 1")
+        if not shape[0]:
+            raise ValueError("params must have at least one number, got none")
         if self.dim is None:
             return dataclasses.replace(self, dim=shape[0])
         if shape[0] != self.dim:
@@ -151,11 +153,23 @@ def unchanged(vector: Float[Array, " dim"]) -> Float[Array, " dim"]:
     return vector
 
 
-def as_scalar(value: Array, name: str) -> Float[Array, ""]:
-    """Give the cost, refusing anything that is not one number."""
+def as_objective(objective: Any) -> Objective:
+    """Return an objective as it is, refusing anything else."""
+    if not isinstance(objective, Objective):
+        raise ValueError(
+            f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
+            "or give optimise annealing= with a function from a scale to an objective"
+        )
+    return objective
+
+
+def as_scalar(value: Any, name: str) -> Float[Array, ""]:
+    """Give the cost as a floating-point number, which a count may be, too; refuse anything else."""
+    if not eqx.is_array_like(value):
+        raise ValueError(f"{name} must return one number, got {type(value).__name__}")
     if jnp.shape(value) != ():
         raise ValueError(f"{name} must return a scalar of shape (), got shape {jnp.shape(value)}")
-    return value
+    return jnp.asarray(value, jnp.result_type(value, float))
 
 
 def value_and_gradient(
@@ -165,16 +179,21 @@ def value_and_gradient(
 
     Forward mode for up to three dimensions, reverse mode beyond and for what has no forward mode (`jax.custom_vjp`).
     """
+
+    def scalar(at: Float[Array, " dim"]) -> Any:
+        found = function(at)
+        return (as_scalar(found[0], "function"), *found[1:]) if has_aux else as_scalar(found, "function")
+
     if point.size <= MOST_FORWARD_DIMENSIONS:
-        along = functools.partial(jax.jvp, function, (point,), has_aux=has_aux)
+        along = functools.partial(jax.jvp, scalar, (point,), has_aux=has_aux)
         out_axes = (None, 0, None) if has_aux else (None, 0)
         try:
             value, gradient, *besides = jax.vmap(along, out_axes=out_axes)((jnp.eye(point.size, dtype=point.dtype),))
-            return (as_scalar(value, "function"), *besides) if has_aux else as_scalar(value, "function"), gradient
+            return (value, *besides) if has_aux else value, gradient
         except TypeError:  # a rule of jax.custom_vjp has no forward mode; any other mistake comes again below
             pass
-    value, pull_back, *besides = jax.vjp(function, point, has_aux=has_aux)
-    (gradient,) = pull_back(jnp.ones_like(as_scalar(value, "function")))
+    value, pull_back, *besides = jax.vjp(scalar, point, has_aux=has_aux)
+    (gradient,) = pull_back(jnp.ones_like(value))
     return (value, *besides) if has_aux else value, gradient
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
+    as_objective,
     as_scalar,
     gaussian,
     positive,
@@ -127,7 +128,7 @@ def as_vector(
     array.
     """
     vector, restore = flattened(params)
-    objective = of_vector(objective, restore).sized_for(vector)
+    objective = of_vector(as_objective(objective), restore).sized_for(vector)
     if restore is None:
         return objective, vector, unchanged
     return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)

@@ -43,6 +43,8 @@ def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
         ValueError: if the file is damaged, or its fingerprint is another; the message says in what.
     """
     try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no archive of arrays")
         with np.load(path, allow_pickle=False) as archive:
             header = json.loads(archive["header"].tobytes())
             leaves = [archive[f"leaf{i}"] for i in range(len(archive.files) - 1)]

@@ -16,6 +16,7 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import whole
 from mjxgrad.estimators.estimate import Estimator, Reason
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.parameters import Restored
@@ -74,9 +75,8 @@ class RunOptions(eqx.Module):
 
     def __check_init__(self):
         for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every", "segment", "max_rollouts"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+            if (value := getattr(self, name)) is not None:
+                whole(name, value)
         # Rollouts are counted on the device in 32 bits, where a step beyond the budget must still fit in.
         if self.max_rollouts is not None and self.max_rollouts >= 2**30:
             raise ValueError(f"max_rollouts must be below 2**30, got {self.max_rollouts}; leave it out for no limit")
@@ -221,6 +221,11 @@ def optimise(
 
 def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], options: RunOptions) -> Optimisation:
     """Run a method, from one start or from many at once, one per leading entry of `key`, all in one program."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((method, params, key))):
+        raise ValueError(
+            "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles itself, and takes several "
+            "seeds by several keys"
+        )
     params, key = _matched(params, key)
     arrays, static = eqx.partition((method, options), eqx.is_array)
 

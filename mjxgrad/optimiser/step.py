@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, flattened, of_vector
+from mjxgrad.objective.base import as_objective
 from mjxgrad.optimiser.annealing import Annealing, as_annealing
 from mjxgrad.optimiser.result import Record
 
@@ -125,6 +126,13 @@ class GradientStep(Method):
             raise ValueError(
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
+            )
+        if not callable(estimator):
+            named = "functools.partial(mg.estimators.alpha_order, num_samples=64)"
+            raise ValueError(f"estimator must be a function such as {named}, got {estimator!r}")
+        if not isinstance(optimiser, optax.GradientTransformation):
+            raise ValueError(
+                f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {optimiser!r}"
             )
         if clip_norm is not None:
             if not clip_norm > 0:
@@ -281,16 +289,6 @@ def estimated_gradient(
 
 def _nothing(leaf: jax.ShapeDtypeStruct) -> Array:
     return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else 0, leaf.dtype)
-
-
-def as_objective(objective: Any) -> Objective:
-    """Return an objective as it is, refusing anything else."""
-    if not isinstance(objective, Objective):
-        raise ValueError(
-            f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
-            "or give annealing= with a function from a scale to an objective"
-        )
-    return objective
 
 
 def parameter_stddev(objective: Objective, dim: int) -> Float[Array, " dim"] | None:

@@ -13,11 +13,10 @@ import numpy as np
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
 from mjxgrad.contact.warnings import name_pairs
-from mjxgrad.scene.refusals import describe_pair, element_name, has_medium
+from mjxgrad.scene.refusals import element_name, has_medium, searched_pairs
 
 _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
-_GEOM = mujoco.mjtGeom
 _SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
 _IMPEDANCES = (
@@ -222,15 +221,13 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion(f"integrator at {name_pairs(names)}", *both, reason, exact=False)
 
 
-def _distance_fields(model: mujoco.MjModel) -> Iterator[Conversion]:
-    searched = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
-    smooth = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value, *searched}
-    kinds = ((pair, set(model.geom_type[[pair.geom1, pair.geom2]].tolist())) for pair in contact_pairs(model))
-    found = [describe_pair(model, pair) for pair, both in kinds if both & searched and both <= smooth]
-    if found:
-        what, used = f"contact of {name_pairs(found)}", "search on distance fields"
-        reason = "its normal may be off by 10 degrees; use capsules, spheres or boxes"
-        yield Conversion(what, "exact", used, reason, exact=False)
+def searched_contacts(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """Without the user's word they are refused before."""
+    if found := list(searched_pairs(model)):
+        reason = (
+            "its normal may be off by 10 degrees, its derivative by any factor, or NaN; use capsules, spheres or boxes"
+        )
+        yield Conversion(f"contact of {name_pairs(found)}", "exact", "search on distance fields", reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -270,5 +267,4 @@ AFTER_REFUSALS: _Rules = (
     _least_friction,
     _no_width,
     _implicitfast,
-    _distance_fields,
 )

@@ -16,8 +16,8 @@ import numpy as np
 from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors
-from mjxgrad.scene.omissions import LeaveOut, omit, switch_off
+from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors, searched_contacts
+from mjxgrad.scene.omissions import LeaveOut, omit, omit_pairs, switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneWarning, numbers_of
 
@@ -39,6 +39,7 @@ def load_scene(
     keep_everything: bool = False,
     timestep: float | None = None,
     max_contacts: int | None = None,
+    distance_fields: bool = False,
 ) -> Scene:
     """Load a scene, convert or refuse what MJX lacks and leave out what the scene does not need.
 
@@ -56,6 +57,9 @@ def load_scene(
         max_contacts: how many contacts of each friction dimension (`condim`) a state has room for: the nearest get it, and
             only they cost anything in the solve. None has room for all that could touch. Where all of them are taken, in
             some step, `Trajectory.crowded` says so.
+        distance_fields: take contacts of cylinders and ellipsoids with each other and capsules, and of ellipsoids with
+            spheres, on your own responsibility. MJX searches them on distance fields: the motion may be good, the gradient
+            is often not, or NaN.
 
     Returns:
         The scene. `print(scene.summary())` shows what it has.
@@ -74,7 +78,13 @@ def load_scene(
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     mj_model, name = _compile(source)
-    _refuse_many_pairs(mj_model, name)
+    try:
+        mj_model.names.decode()
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{name} must have names in UTF-8, got {mj_model.names[error.start :][:1]!r}; save it as UTF-8"
+        ) from None
+    _refuse_many_pairs(mj_model, name, leave_out or LeaveOut())
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
@@ -85,7 +95,7 @@ def load_scene(
     if mj_model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
-    conversions = _make_simulable(mj_model, name)
+    conversions = _make_simulable(mj_model, name, leave_out or LeaveOut(), distance_fields)
     stepped = copy.deepcopy(mj_model)
     conversions += list(drop_sensors(stepped))
     omitted, omissions = omit(stepped, leave_out) if leave_out is not None else ((), ())
@@ -117,6 +127,8 @@ def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) ->
         raise TypeError(f"source must be {accepted}, got {type(source).__name__}")
     if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
         return _parse(mujoco.MjModel.from_xml_string, source.strip("\ufeff \t\r\n"), "the MJCF")
+    if source == "":
+        raise FileNotFoundError(f"source must be {accepted}, got ''")
     path = Path(source)
     if path.is_dir():
         raise IsADirectoryError(f"source must be {accepted}, got the folder {str(path)!r}")
@@ -134,8 +146,8 @@ def _parse(read, argument: str | mujoco.MjSpec, name: str) -> tuple[mujoco.MjMod
         raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (error)
 
 
-def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
-    count = count_pairs(model)
+def _refuse_many_pairs(model: mujoco.MjModel, name: str, leave_out: LeaveOut) -> None:
+    count = count_pairs(model) - len(leave_out.pairs)
     if count > MOST_PAIRS:
         raise SceneError(
             f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
@@ -144,31 +156,53 @@ def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
 
 
 def count_pairs(model: mujoco.MjModel) -> int:
-    """Count pairs of geoms of different bodies whose contype and conaffinity match, without listing them."""
+    """Count the pairs of geoms that can touch, without listing them; a `<pair>` counts beside what its geoms' masks say."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return 0
-    keys = np.stack([model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]], axis=1)
+    masks, weld = np.stack([model.geom_contype, model.geom_conaffinity], axis=1), model.body_weldid
 
-    def matching(columns: np.ndarray) -> int:
-        kinds, counts = np.unique(columns, axis=0, return_counts=True)
-        first, second = kinds[:, :1], kinds[:, 1:2]
-        match = ((first & second.T) | (second & first.T)) != 0
-        return int(counts @ match @ counts)
+    def matching(first: np.ndarray, second: np.ndarray) -> int:
+        of_one, ones = np.unique(masks[first], axis=0, return_counts=True)
+        of_other, others = np.unique(masks[second], axis=0, return_counts=True)
+        match = ((of_one[:, :1] & of_other[:, 1]) | (of_one[:, 1:] & of_other[:, 0])) != 0
+        return int(ones @ match @ others)
 
-    own = sum(matching(keys[keys[:, 2] == body, :2]) for body in np.unique(keys[:, 2]))
-    return (matching(keys[:, :2]) - own) // 2
+    every, body = np.full(model.ngeom, True), model.geom_bodyid
+    count = matching(every, every)
+    for fixed in np.unique(weld[body]):
+        own = weld[body] == fixed
+        count -= matching(own, own)
+    # Both orders were counted. What MuJoCo filters besides is a body and the one it is jointed to, unless that is the world, ...
+    count //= 2
+    jointed = {(int(weld[model.body_parentid[fixed]]), int(fixed)) for fixed in np.unique(weld[1:]) if fixed}
+    jointed = {pair for pair in jointed if pair[0]}
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        jointed = set()
+    count -= sum(matching(weld[body] == one, weld[body] == other) for one, other in jointed)
+    # ... and excluded bodies.
+    for signature in np.unique(model.exclude_signature):
+        one, other = divmod(int(signature), 1 << 16)
+        welds = (int(weld[one]), int(weld[other]))
+        if welds[0] != welds[1] and not {welds, welds[::-1]} & jointed:
+            count -= matching(body == one, body == other)
+    return count + model.npair
 
 
-def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:
-    """Convert in place what can be converted; refuse the rest."""
+def _make_simulable(
+    mj_model: mujoco.MjModel, name: str, leave_out: LeaveOut, distance_fields: bool
+) -> list[Conversion]:
+    """Convert in place what can be converted; refuse the rest, but for pairs that are left out."""
     conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
-    refused = refusal_messages(mj_model)
+    lean = copy.deepcopy(mj_model)
+    if leave_out.pairs:
+        omit_pairs(lean, leave_out)
+    refused = refusal_messages(lean, distance_fields=distance_fields)
     if len(refused) == 1:
         raise SceneError(f"{name} cannot be simulated: {refused[0]}")
     if refused:
         listed = "\n".join(f"  - {message}" for message in refused)
         raise SceneError(f"{name} cannot be simulated for {len(refused)} reasons:\n{listed}")
-    return conversions + [c for rule in AFTER_REFUSALS for c in rule(mj_model)]
+    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model)), *searched_contacts(lean)]
 
 
 def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
@@ -193,8 +227,14 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
         model.geom_conaffinity[:] = 0
     try:
         # Of several processes each has its own; MJX would take the first of all.
-        mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
+        with np.errstate(over="raise"):
+            mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         return mjx_model, _make_data(model, mjx_model, max_contacts)
+    except FloatingPointError:
+        largest = f"{np.finfo(np.float32).max:.1g}"
+        raise SceneError(
+            f"{name} must hold numbers up to {largest} in single precision, got a larger one; set jax_enable_x64 for those"
+        ) from None
     except NotImplementedError as error:
         raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
 

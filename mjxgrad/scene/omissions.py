@@ -145,16 +145,9 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
             pairs to leave out.
     """
     rows = len(make_efc_type(model))
-    everything = contact_pairs(model)
-    omitted = named_pairs(everything, wanted.pairs, "leave_out.pairs")
-    for pair in omitted:
-        if pair.explicit >= 0:
-            raise ValueError(
-                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
-            )
+    everything, omitted = omit_pairs(model, wanted)
     omissions = []
     if omitted:
-        keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
         more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
         listed = ", ".join(str(pair) for pair in omitted[:4]) + more
         omissions.append(Omission(f"contact of {len(omitted)} of {len(everything)} pairs", f"as asked: {listed}"))
@@ -164,6 +157,20 @@ def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ..
     if omissions:
         omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
     return omitted, tuple(omissions)
+
+
+def omit_pairs(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ...], tuple[ContactPair, ...]]:
+    """Leave out pairs of a model, in place; return all that it had and those left out. Raises ValueError as `omit` does."""
+    everything = contact_pairs(model)
+    omitted = named_pairs(everything, wanted.pairs, "leave_out.pairs")
+    for pair in omitted:
+        if pair.explicit >= 0:
+            raise ValueError(
+                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
+            )
+    if omitted:
+        keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
+    return everything, omitted
 
 
 def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:

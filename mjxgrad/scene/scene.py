@@ -142,6 +142,13 @@ class Scene(eqx.Module):
             raise ValueError("to_mujoco needs known values, got a traced scene")
         return with_numbers(self.mj_model, numbers)
 
+    def __repr__(self) -> str:
+        # All arrays of it would fill pages of messages.
+        return f"Scene({self.name!r}, nq={self.mj_model.nq}, nu={self.mj_model.nu}, pairs={len(self.pairs)})"
+
+    def __hash__(self) -> int:
+        raise TypeError("a Scene is a pytree of arrays: make it an ordinary argument of jax.jit, not a static one")
+
     def summary(self) -> str:
         """Describe the scene in text for a terminal 120 characters wide: sizes, options, contacts, conversions, omissions.
 

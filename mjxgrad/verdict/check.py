@@ -250,7 +250,9 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
     room = 2 * needed + _SPARE_CONTACTS
     if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
         return scene, None
-    return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room
+    return dataclasses.replace(
+        scene, data=load_scene(scene.to_mujoco(), max_contacts=room, distance_fields=True).data
+    ), room
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:

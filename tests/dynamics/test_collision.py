@@ -82,6 +82,55 @@ def test_the_contacts_of_a_box_have_the_derivative_of_its_corners():
     np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-9)
 
 
+CAN = """
+<mujoco><worldbody><body><freejoint/><geom size=".07" margin="5"/></body>
+<body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>
+"""
+
+
+def _can():
+    mj_model = mujoco.MjModel.from_xml_string(CAN)
+    model = mjx.put_model(mj_model)
+    return mj_model, mjx.make_data(mj_model), _finder(model)
+
+
+def test_a_ball_on_a_cylinder_touches_where_it_does_in_c():
+    """On the side, an end and the edge between, from outside and from within."""
+    mj_model, start, find = _can()
+    mj_data, places = mujoco.MjData(mj_model), set()
+    for seed in range(60):
+        mj_data.qpos[:] = _poses(seed)
+        mujoco.mj_forward(mj_model, mj_data)
+        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
+        ours = np.concatenate([contact.dist, contact.pos[0], contact.frame[0, 0]])
+        theirs = np.concatenate([mj_data.contact.dist, mj_data.contact.pos[0], mj_data.contact.frame[0, :3]])
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
+        centre = mj_data.geom_xmat[1].reshape(3, 3).T @ (mj_data.geom_xpos[0] - mj_data.geom_xpos[1])
+        places.add((np.hypot(*centre[:2]) > 0.1, abs(centre[2]) > 0.15))
+    assert len(places) == 4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_contact_of_a_ball_on_a_cylinder_has_the_derivative_of_its_point(seed):
+    _, start, find = _can()
+
+    def outcome(qpos):
+        contact = find(start.replace(qpos=qpos))
+        return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame[0, 0]])
+
+    qpos = jnp.asarray(_poses(seed))
+    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-7)
+
+
+def test_on_its_axis_a_ball_on_a_cylinder_has_a_derivative():
+    """Upright, centres one above the other: the distance is the height less what is between, whichever way it moves."""
+    _, start, find = _can()
+    upright = jnp.array([0, 0, 0.21, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0], float)
+    slope = jax.jacrev(lambda qpos: find(start.replace(qpos=qpos)).dist[0])(upright)
+    np.testing.assert_allclose(slope[:3], [0, 0, 1], atol=1e-14)
+    assert np.isfinite(slope).all()
+
+
 @pytest.mark.parametrize(
     "limits", [{}, {"max_geom_pairs": 2}, {"max_contact_points": 2}, {"max_geom_pairs": 2, "max_contact_points": 1}]
 )

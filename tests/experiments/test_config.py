@@ -159,3 +159,47 @@ def test_broken_toml_is_told_with_its_line(write):
 
 def test_a_file_without_a_comment_has_no_question():
     assert read_header("seed = 1\n") == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (b"\xcd # Is it so?", "not UTF-8, at byte 0; save it as UTF-8"),
+        (f"seed = {'9' * 5000}".encode(), "not TOML: a number is too long"),
+        (b"experiment = ['bias_variance']", 'experiment: there is no experiment ["bias_variance"]; did you mean'),
+        (b"[experiment]", "experiment: there is no experiment {}; choose one of ablation"),
+        (b"", "experiment: required, and missing; choose one of ablation"),
+        (b"deep = " + b"[" * 3000 + b"]" * 3000, "arrays or tables are nested too deeply"),
+        (b"[" + b".".join([b"a"] * 3000) + b"]", "arrays or tables are nested too deeply"),
+        (VALID.encode() + b'"" = 1', '"": unknown key'),
+        (VALID.encode() + b"[sweep]\nseed = [" + b"0," * 200 + b"]\nstddev = [" + b"1," * 200 + b"]", "10000 runs, got 40000"),
+        (VALID.replace("10\n", "100000000000\n").encode(), "num_samples: must be below 2^31, got 1e+11"),
+        (VALID.replace("so?", "so?" * 5000).encode(), "must have at most 5000 characters"),
+        (VALID.replace("0.1", "1e-320").encode(), "stddev: must be greater than or equal to 0.000000001"),
+        (VALID.replace("[0.05]", "[0.05, 0.2, 0.05]").encode(), "angles: must differ, got 0.05 more than once"),
+        (VALID.replace("1e2", "1.0").encode(), "stiffness: must differ, got 1 more than once"),
+    ],
+)  # fmt: skip
+def test_what_no_hand_should_write_is_a_sentence(tmp_path, text, sentence):
+    (tmp_path / "trial.toml").write_bytes(text)
+    with pytest.raises(ConfigurationError) as caught:
+        load_runs(str(tmp_path / "trial.toml"), [])
+    assert sentence in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+def test_a_mark_at_the_beginning_of_a_file_is_overlooked(tmp_path):
+    (tmp_path / "trial.toml").write_text(VALID, encoding="utf-8-sig")
+    assert load_runs(str(tmp_path / "trial.toml"), [])[0].question == "Is it so?"
+
+
+def test_of_many_mistakes_the_first_are_shown(write):
+    with pytest.raises(ConfigurationError) as caught:
+        load_runs(write(VALID + "".join(f"key_{i} = 1\n" for i in range(500))), [])
+    assert str(caught.value).endswith("\n  and 480 more")
+
+
+@pytest.mark.parametrize("name", ["...toml", "a\nb.toml"])
+def test_a_name_that_is_none_for_a_folder_is_refused(tmp_path, name):
+    (tmp_path / name).write_text(VALID)
+    assert mistakes(str(tmp_path / name))[0].startswith("its name must be one for a folder")

@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from experiments.config import ExperimentError
-from experiments.output import building, write_csv, write_text, write_toml
+from experiments.output import building, recover, write_csv, write_text, write_toml
 
 
 def listing(folder):
@@ -53,12 +53,26 @@ def test_what_a_killed_run_left_behind_is_cleared_and_its_former_result_comes_ba
     assert listing(tmp_path / "run") == ["old"]
 
 
-def test_the_remains_of_a_run_that_still_goes_on_are_left_to_it(tmp_path):
-    other = tmp_path / f".run.partial-{os.getppid()}"
-    other.mkdir()
-    with building(tmp_path / "run"):
-        pass
-    assert other.is_dir()
+def test_a_second_run_into_a_folder_is_refused_by_the_number_of_the_first_and_leaves_it_alone(tmp_path):
+    """Where the first ends so does its hold, and what bears no process's number is nobody's remains."""
+    (tmp_path / ".run.partial-old").mkdir()
+    with building(tmp_path / "run") as folder:
+        (folder / "first").write_text("first")
+        refused = pytest.raises(
+            ExperimentError, match=rf"another run \(process {os.getpid()}\) is writing to .*run; wait"
+        )
+        with refused, building(tmp_path / "run"):
+            pass
+        recover(tmp_path / "run")
+        assert folder.is_dir()
+    assert listing(tmp_path / "run") == ["first"]
+    assert listing(tmp_path) == [".run.partial-old", "run"]
+
+
+def test_remains_are_cleared_without_a_run_too(tmp_path):
+    (tmp_path / ".run.partial-123").mkdir()
+    recover(tmp_path / "run")
+    assert listing(tmp_path) == []
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

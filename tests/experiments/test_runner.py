@@ -4,8 +4,12 @@ import csv
 import json
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import tomllib
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -219,7 +223,10 @@ def test_rollouts_that_are_all_nan_are_a_sentence_that_names_the_stiffness(copie
     """A slope of 1e200 times an angle that overflows: the cost is finite nowhere that counts."""
     (copied / "nan.toml").write_text(SETTINGS.replace("angles = [0.05, 0.12]", "angles = [1e160, 2e160]"))
     assert run(copied / "nan.toml", copied / "runs") == 2
-    assert "gives no estimate" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "gives no estimate" in err
+    assert "smaller angles" in err
+    assert "time step" not in err, "a ramp has none"
     assert not (copied / "runs" / "nan").exists()
 
 
@@ -257,8 +264,6 @@ def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monk
 @pytest.mark.slow
 def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(tmp_path):
     import os
-    import subprocess
-    import sys
 
     small = ["num_samples=8", "reference_samples=100", "stiffness=[1e2,1e4]", "angles=[0.65]"]
     command = [sys.executable, "-m", "experiments", "run", "ball_wall", *small, "--output", str(tmp_path)]
@@ -269,6 +274,111 @@ def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(
     text = (tmp_path / "ball_wall" / "report.html").read_text()
     assert "<b>No video.</b>" in text
     assert "libosmesa6" in text
+
+
+@pytest.mark.parametrize("damage", ["[]", "3", "null", "{", '{"fingerprint": 1}'])
+def test_a_damaged_record_of_a_run_is_none(copied, monkeypatch, damage):
+    (copied / "runs" / "steep" / "environment.json").write_text(damage)
+    monkeypatch.setattr(measure, "measure", _reached)
+    assert run(copied / "steep.toml", copied / "runs") == 2
+
+
+def test_an_empty_report_is_none_and_an_unchanged_run_clears_what_a_killed_one_left(copied, monkeypatch):
+    monkeypatch.setattr(measure, "measure", _reached)
+    remains = copied / "runs" / ".steep.partial-99999999"
+    remains.mkdir()
+    assert run(copied / "steep.toml", copied / "runs") == 0
+    assert not remains.exists()
+    (copied / "runs" / "steep" / "report.html").write_text("")
+    assert run(copied / "steep.toml", copied / "runs") == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."),
+            "take fewer samples (RES",
+        ),
+        (np._core._exceptions._ArrayMemoryError((10**13,), np.dtype(float)), "Unable to allocate"),
+    ],
+)
+def test_too_little_memory_is_a_sentence(copied, monkeypatch, capsys, error, sentence):
+    def exhaust(*_):
+        raise error
+
+    monkeypatch.setattr(measure, "measure", exhaust)
+    assert run(copied / "steep.toml", copied / "runs", "--force") == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_another_error_of_the_runtime_is_a_mistake_in_the_program(copied, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("a mistake")
+
+    monkeypatch.setattr(measure, "measure", fail)
+    with pytest.raises(RuntimeError, match="a mistake"):
+        run(copied / "steep.toml", copied / "runs", "--force")
+
+
+def test_an_output_without_a_name_is_refused(finished, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", str(finished / "steep.toml"), "--output", ""])
+    assert "must name a folder" in capsys.readouterr().err
+
+
+def _reached(*_):
+    raise ValueError("reached")
+
+
+# A kind of two parts that kills itself in the second one, once.
+IN_PARTS = """
+import os
+import signal
+import warnings
+from pathlib import Path
+
+LOG = Path(__file__).with_name("log")
+
+
+def part(number):
+    with LOG.open("a") as file:
+        file.write(f"{number} ")
+    warnings.warn(f"part {number}")
+    if LOG.read_text() == "0 1 ":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number + jnp.asarray(settings_number)
+
+
+def measure(settings, workspace):
+    global settings_number
+    settings_number = settings.number
+    found = [workspace.once(f"part/{number}", lambda number=number: part(number)) for number in range(2)]
+    return Outcome(float(sum(found)))
+"""
+
+
+def test_after_a_kill_a_run_goes_on_from_its_last_finished_part(tmp_path, monkeypatch, capsys):
+    """0.1 + 1.1 by a process that is killed in the second part, and one that follows."""
+    head, _, tail = ONE_FILE.partition("def measure(")
+    (tmp_path / "in_parts.py").write_text(head + IN_PARTS + tail[tail.index("\n\n\n") :])
+    (tmp_path / "trial.toml").write_text('# How much?\nexperiment = "in_parts"\nnumber = 0.1\n')
+    begin = (
+        "import sys, pathlib, experiments, experiments.__main__ as command; from experiments import config; "
+        "config.FOLDER = pathlib.Path(sys.argv[1]); experiments.__path__.append(sys.argv[1]); command.main(sys.argv[2:])"
+    )
+    arguments = ["run", str(tmp_path / "trial.toml"), "--output", str(tmp_path / "runs")]
+    killed = subprocess.run([sys.executable, "-c", begin, str(tmp_path), *arguments], cwd=runner.ROOT, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert not (tmp_path / "runs" / "trial").exists()
+    monkeypatch.setattr(config, "FOLDER", tmp_path)
+    monkeypatch.setattr(experiments, "__path__", [*experiments.__path__, str(tmp_path)])
+    assert main(arguments) == 0
+    assert (tmp_path / "log").read_text() == "0 1 1 ", "the first part was not done again"
+    assert capsys.readouterr().out.startswith("Twice the number is 1.2")
+    text = (tmp_path / "runs" / "trial" / "report.html").read_text()
+    assert "part 0" in text, "what it warned of is told again"
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["trial"]
 
 
 def test_a_kind_may_be_one_file_that_imports_jax(tmp_path, monkeypatch, capsys):

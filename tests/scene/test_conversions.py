@@ -181,12 +181,12 @@ def test_the_search_on_distance_fields_is_warned_about_because_its_normal_is_off
     <mujoco>
       <worldbody>
         <geom name="can" type="cylinder" size="0.2 0.1"/>
-        <body pos="0.15 0.02 0.19"><freejoint/><geom name="ball" size="0.1"/></body>
+        <body pos="0.15 0.02 0.19"><freejoint/><geom name="ball" type="ellipsoid" size="0.1 0.1 0.1"/></body>
       </worldbody>
     </mujoco>
     """
-    with pytest.warns(SceneWarning, match=r"'ball' \(sphere\) with 'can' \(cylinder\).*distance"):
-        scene = load_scene(source)
+    with pytest.warns(SceneWarning, match=r"'ball' \(ellipsoid\) with 'can' \(cylinder\).*distance"):
+        scene = load_scene(source, distance_fields=True)
     data = jax.jit(lambda m, d: mjx.collision(m, mjx.kinematics(m, d)))(scene.model, scene.data)
     # The ball lies on the flat top, so the true normal is vertical.
     normal = np.abs(np.array(data._impl.contact.frame[0, 0, 2]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.scene import SceneError, load_scene
+from mjxgrad.scene import LeaveOut, SceneError, SceneWarning, load_scene
 
 PENDULUM = """
 <mujoco>
@@ -116,7 +116,8 @@ REFUSED = {
         _fill(PENDULUM, rest=FIXED_TENDON.format("range='-.1 .1' limited='true' margin='.2'")),
         "tendon 't'", "half"),
     "cylinder with box": (
-        _fill(BALL, body="<body pos='0 0 1'><freejoint/><geom name='can' type='cylinder' "
+        _fill(BALL, geom="contype='0' conaffinity='0'",
+              body="<body pos='0 0 1'><freejoint/><geom name='can' type='cylinder' "
               "size='.1 .1'/></body><geom name='wall' type='box' size='.1 .1 .1'/>"),
         "'can' (cylinder) with 'wall' (box)", "<exclude>"),
     "mesh with margin": (
@@ -138,6 +139,46 @@ def test_refusal_names_the_culprit_and_the_remedy(feature):
     message = str(error.value)
     assert culprit in message
     assert remedy in message
+
+
+# Two geoms on bodies of their own, and what MJX names them by.
+PAIR = """<mujoco><worldbody><body name="p"><freejoint/><geom name="one" {one}/></body>
+<body name="q" pos=".3 0 0"><freejoint/><geom name="other" {other}/></body></worldbody>{contact}</mujoco>"""
+_SIZES = {"sphere": ".1", "capsule": ".1 .1", "ellipsoid": ".1 .2 .3", "cylinder": ".1 .1", "plane": "1 1 1"}
+SEARCHED = ["cylinder capsule", "cylinder cylinder", "cylinder ellipsoid", "ellipsoid ellipsoid",
+            "ellipsoid sphere", "ellipsoid capsule"]  # fmt: skip
+
+
+def _pair(kinds, contact="", mask=""):
+    one, other = (f'type="{kind}" size="{_SIZES[kind]}" {mask}' for kind in kinds.split())
+    return PAIR.format(one=one, other=other, contact=contact)
+
+
+@pytest.mark.parametrize("kinds", SEARCHED)
+def test_contact_by_a_search_on_distance_fields_is_refused_unless_asked_for(kinds):
+    with pytest.raises(
+        SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*leave_out.*distance_fields=True"
+    ):
+        load_scene(_pair(kinds))
+    with pytest.warns(SceneWarning, match="search on distance fields instead of exact.*derivative"):
+        assert len(load_scene(_pair(kinds), distance_fields=True).pairs) == 1
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}, {"leave_out": True}],
+)
+@pytest.mark.filterwarnings("error")
+def test_of_what_cannot_touch_no_search_is_refused(how):
+    leave_out = LeaveOut((("one", "other"),)) if how.pop("leave_out", False) else None
+    assert load_scene(_pair("cylinder ellipsoid", **how), leave_out=leave_out).pairs == ()
+
+
+def test_a_cylinder_and_the_one_it_hangs_from_are_no_obstacle():
+    """MuJoCo lets bodies that a joint connects pass through each other."""
+    child = '<body><joint/><geom type="cylinder" size=".1 .1"/></body>'
+    body = f'<body><freejoint/><geom type="ellipsoid" size=".1 .2 .3"/>{child}</body>'
+    assert load_scene(f"<mujoco><worldbody>{body}</worldbody></mujoco>").pairs == ()
 
 
 def test_an_excluded_pair_is_no_obstacle():

@@ -140,3 +140,24 @@ def test_what_is_no_number_is_named():
         load_scene(
             "<mujoco><worldbody><body><freejoint/><geom size='.1' friction='nan 0 0'/></body></worldbody></mujoco>"
         )
+
+
+def test_names_in_another_encoding_are_refused(tmp_path):
+    path = tmp_path / "latin.xml"
+    path.write_bytes(b"<mujoco><worldbody><body name='b\xe9'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    with pytest.raises(SceneError, match=r"latin.xml must have names in UTF-8, got b'.xe9'; save"):
+        load_scene(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_beyond_single_precision_are_refused_there():
+    heavy = "<mujoco><worldbody><body><freejoint/><geom size='.1' mass='1e300'/></body></worldbody></mujoco>"
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(
+            SceneError, match=r"numbers up to 3e\+38 in single precision, got a larger one; set jax_enable_x64"
+        ):
+            load_scene(heavy)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert load_scene(heavy).mj_model.body_mass[1] == 1e300

@@ -1,0 +1,101 @@
+"""What is called wrongly is answered in a sentence, and not in the words of Python or JAX.
+
+In a process without the checks of types that the other tests run under, for they would answer first.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SETUP = """
+import functools, json, sys, tempfile
+import equinox as eqx, jax, jax.numpy as jnp, numpy as np, optax
+import mjxgrad as mg
+from mjxgrad import estimators
+
+key, params = jax.random.key(0), jnp.array([1.0, 2.0])
+noisy = mg.parameter_noise(lambda x: x @ x, 0.1)
+scene = mg.load_scene("<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody>"
+                      "<actuator><motor joint='joint'/></actuator></mujoco>".replace("<joint ", "<joint name='joint' "))
+state = mg.initial_state(scene)
+archive = tempfile.mkdtemp() + "/run.npy"
+np.save(archive, np.zeros(3))
+
+
+def first(cost=None, count=8, at=params, key=key, objective=None):
+    objective = objective or (noisy if cost is None else mg.parameter_noise(cost, 0.1))
+    return estimators.first_order(objective, at, key, num_samples=count)
+
+
+def optimise(**how):
+    given = {"estimator": functools.partial(estimators.first_order, num_samples=4), "optimiser": optax.sgd(0.1), "num_steps": 2}
+    return mg.optimise(noisy, how.pop("at", params), how.pop("key", key), **given | how)
+
+
+def answer(call):
+    try:
+        eval(call)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return "no error"
+
+
+print(json.dumps({call: answer(call) for call in json.loads(sys.argv[1])}))
+"""
+FOUND = {
+    "first(objective=lambda x: x @ x)": "objective must be an Objective, got function; wrap a function by mg.parameter_noise",
+    "first(cost=lambda x: {'cost': x @ x})": "function must return one number, got dict",
+    "first(cost=lambda x: None)": "function must return one number, got NoneType",
+    "first(cost=lambda x: x)": "function must return a scalar of shape (), got shape (2,)",
+    "first(count='8')": "num_samples must be a whole number, got '8'",
+    "first(count=None)": "num_samples must be a whole number, got None",
+    "first(count=2.5)": "num_samples must be a whole number, got 2.5",
+    "first(count=8.0)": "num_samples must be a whole number, got 8.0",
+    "jax.jit(lambda n: first(count=n))(8)": "num_samples must be known before anything is compiled, got a traced value",
+    "first(at=jnp.zeros(0))": "params must have at least one number, got none",
+    "first(key=0)": "key must be one of jax.random.key, got 0",
+    "first(key=jax.random.split(key, 3))": "key must be one of jax.random.key, got an array of shape (3,)",
+    "estimators.alpha_order(noisy, params, key, num_samples=8, rule='consistent')": "rule must be one of mg.estimators.rules",
+    "estimators.rules.FixedAlpha(3.0)": "alpha must be from 0 to 1, got 3.0",
+    "optimise(estimator='first_order')": "estimator must be a function such as functools.partial(",
+    "optimise(optimiser='adam')": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got 'adam'",
+    "optimise(optimiser=optax.adam)": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got <function",
+    "optimise(num_steps=2.5)": "num_steps must be a whole number, got 2.5",
+    "optimise(at=jnp.zeros(0))": "params must have at least one number, got none",
+    "jax.jit(lambda x: optimise(at=x))(params)": "optimise must be called outside of jax.jit and jax.vmap",
+    "optimise(checkpoint=archive)": "checkpoint must be a file that a run has saved, got ",
+    "mg.rollout(scene, scene.data, horizon=2)": "state must be of mg.initial_state, or the end of a rollout, got Data",
+    "mg.rollout(scene.model, state, horizon=2)": "scene must be of mg.load_scene, got Model",
+    "mg.initial_state(scene.model)": "scene must be of mg.load_scene, got Model",
+    "mg.rollout(scene, state, horizon=2.5)": "horizon must be a whole number, got 2.5",
+    "jax.jit(lambda n: mg.rollout(scene, state, horizon=n))(2)": "horizon must be known before anything is compiled",
+    "mg.rollout(scene, state, lambda p, s: None, horizon=2)": "the policy must return one control per actuator, shape (1,)",
+    "mg.Softness(stiffness=jnp.inf)": "stiffness must be positive and finite, got inf",
+    "jax.jit(lambda s: 1, static_argnums=0)(scene)": "make it an ordinary argument of jax.jit",
+    "mg.load_scene('')": "got ''",
+    # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
+    "first(cost=lambda x: 3)": "no error",
+    "first(cost=lambda x: jnp.sum(x > 0))": "no error",
+    "first(count=np.int64(8), key=jax.random.PRNGKey(0))": "no error",
+    "jax.vmap(lambda k: first(key=k))(jax.random.split(key, 3))": "no error",
+    "jax.jit(lambda a: jax.vmap(estimators.rules.FixedAlpha)(a))(jnp.zeros(2))": "no error",
+    "optimise(key=jax.random.split(key, 2))": "no error",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def answers():
+    command = [sys.executable, "-c", SETUP, json.dumps(list(FOUND))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert not done.returncode, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("call", FOUND)
+def test_a_wrong_call_is_answered_in_a_sentence(answers, call):
+    assert FOUND[call] in answers[call]
+    assert len(answers[call]) < 600
