@@ -45,7 +45,7 @@ def page(
     """Write the page as HTML that needs nothing beside it."""
     sentences = "".join(f"<li{' class=fault' if one.is_fault else ''}>{_text(one.text)}</li>" for one in findings)
     body = (
-        f"{'' if measured is None else _figure(measured, outcomes)}<ul>{sentences}</ul>"
+        f"{_figure(measured, outcomes) if measured is not None and measured.lines else ''}<ul>{sentences}</ul>"
         f"<h2>To paste</h2><pre>{_text(code)}</pre>"
     )
     return document(f"mjxgrad check {name}", headline, body, details)
