@@ -98,6 +98,7 @@ class Verdict:
     def _details(self) -> dict[str, str]:
         """Return what is there to look up: what was measured, the scene, its time step."""
         spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
+        of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
         rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
         noises = [
             f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
@@ -106,7 +107,7 @@ class Verdict:
             for row in rows
         ]
         return {
-            "What was measured": "\n".join([f"Outcomes: {'; '.join(self.outcomes)}.", *noises, f"Time: {spent}."]),
+            "What was measured": "\n".join([*of_what, *noises, f"Time: {spent}."]),
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
