@@ -195,7 +195,7 @@ def check(
         programs.wait()
         spent["compiling"] = time.perf_counter() - compiling
         measuring = time.perf_counter()
-        if {"onset", "discrete"} <= set(programs.kinds):
+        if "onset" in programs.kinds:
             times = {"seconds": _MOVED * budget, "deadline": loaded + budget}
             measured = measure(scene, motions, programs, rng, from_start=cost is not None, **times, log=say)
             found += measured_findings(measured)

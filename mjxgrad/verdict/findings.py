@@ -152,22 +152,21 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
 def left_out_findings(kinds: Sequence[str], measured: Measured | None, budget: int | float) -> Iterator[Finding]:
     """Yield what there was no time for, from the kinds of derivative that were compiled in time."""
     if measured is None:
-        late = [words for kind, words in _WORDS.items() if kind != "event" and kind not in kinds]
-        text = f"Not measured: within a budget of {budget:g} s {' and '.join(late)} did not compile."
-        yield Finding("not_measured", f"{text} What follows is of motions alone; a larger budget measures the rest.")
+        text = f"Not measured: {_WORDS['onset']} did not compile within a budget of {budget:g} s."
+        yield Finding("not_measured", f"{text} What is said is of motions alone; a larger budget measures the rest.")
         return
-    missing = [_WORDS["event"]] * ("event" not in kinds) + list(measured.left_out)
+    missing = [words for kind, words in _WORDS.items() if kind not in kinds] + list(measured.left_out)
     if missing:
         text = f"Left out for a budget of {budget:g} s: {'; '.join(missing)}. A larger one measures it, too."
         yield Finding("left_out", text)
 
 
 def _slope_finding(found: Sequence[Slope]) -> Finding:
-    if not found[0].num_readings:
+    if not found[-1].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     read = [one for one in found if one.num_readings]
     parts = [f"{_WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
-    lead = f"How far the mean derivative is from the slope, typical of {found[0].num_readings} readings."
+    lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}")
 
 
@@ -194,7 +193,7 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
         off, errors = [], []
         for line in measured.lines:
             comparison = line.smooth if kind == "onset" else line.plain
-            if kind not in comparison.gradients:
+            if comparison is None or kind not in comparison.gradients:
                 continue
             at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
             is_clear = (size > 0) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))

@@ -49,7 +49,7 @@ class Line:
     Attributes:
         pose: where it starts, in words.
         varied: what is changed along it, in words.
-        plain: MuJoCo's motion: its slope, and its derivatives by kind.
+        plain: MuJoCo's motion: its slope, and its derivatives by kind; None where there was no time for them.
         smooth: the motion with an onset, likewise.
         jumps: of the motion with an onset, over its spread; the parameter is the place on the line.
         changed: pairs that touch on one side of the largest jump alone.
@@ -60,7 +60,7 @@ class Line:
 
     pose: str
     varied: str
-    plain: SlopeComparison
+    plain: SlopeComparison | None
     smooth: SlopeComparison
     jumps: Jumps
     changed: tuple[str, ...]
@@ -238,9 +238,9 @@ class _Probe:
 
         places = phases((-1.0, 1.0), self.programs.size)
         kinds = [kind for kind in ("discrete", "event") if kind in self.programs.kinds]
-        onset, discrete, *others = (along(kind, places) for kind in ("onset", *kinds))
-        derivatives = [one.derivatives for one in (discrete, *others)]
-        plain = compare_to_slope(places, discrete.outcomes, derivatives, kinds)
+        onset, *others = (along(kind, places) for kind in ("onset", *kinds))
+        derivatives = [one.derivatives for one in others]
+        plain = compare_to_slope(places, others[0].outcomes, derivatives, kinds) if kinds else None
         continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
         centre, spreads = np.nanmean(onset.outcomes[:, -1], axis=0), np.nanstd(onset.outcomes, axis=0)
         # What has come to rest by then varies by rounding alone.
@@ -261,7 +261,7 @@ class _Probe:
             jumps=jumps,
             changed=self._changed(state, controls, direction, jumps),
             growth=np.median(onset.growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
-            num_diverged=discrete.num_diverged + onset.num_diverged,
+            num_diverged=sum(one.num_diverged for one in (onset, *others[:1])),
             num_crowded=onset.num_crowded,
         )
 

@@ -19,6 +19,7 @@ from mjxgrad.scene.load import count_pairs
 from mjxgrad.verdict.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.verdict.measure import Line, Measured, _estimates, measure
 from mjxgrad.verdict.motions import random_motions
+from mjxgrad.verdict.page import page
 from mjxgrad.verdict.programs import Moved, Programs, change_of_poses
 
 BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></default><worldbody>
@@ -143,10 +144,10 @@ def test_what_a_budget_leaves_no_time_for_is_named():
 
 
 class OutOfTime(Programs):
-    """Programs without the event gradient that take no time for the first two questions, and for ever for the others."""
+    """Programs that take no time for the first two questions, and for ever for the others."""
 
-    def __init__(self):
-        self.size, self.kinds = 32, ("onset", "discrete")
+    def __init__(self, *kinds):
+        self.size, self.kinds = 32, kinds
         self._seconds = itertools.chain([1.0, 0.0, 0.0], itertools.repeat(np.inf))
 
     @property
@@ -160,19 +161,26 @@ class OutOfTime(Programs):
         return Moved(outcomes, derivatives, np.ones(outcomes.shape[:2]), 0, 0)
 
 
-def test_questions_that_there_is_no_time_for_are_left_out_by_name():
+@pytest.mark.parametrize("kinds", [("onset", "discrete"), ("onset",)])
+def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
     scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions, programs = random_motions(scene, rng), OutOfTime()
+    motions, programs = random_motions(scene, rng), OutOfTime(*kinds)
     deadline = time.perf_counter() + 1000
     measured = measure(
         scene, motions, programs, rng, from_start=False, seconds=1, deadline=deadline, log=lambda _: None
     )  # fmt: skip
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
-    (told,) = left_out_findings(programs.kinds, measured, 60)
+    (told,) = left_out_findings(kinds, measured, 60)
     for words in ("budget of 60 s", 'gradient="event"', "a line along the controls", "noise of 0.3", "contacts at"):
         assert words in told.text
-    assert not any("event" in finding.text for finding in measured_findings(measured))
-    assert recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None).gradient == "discrete"
+    assert ("MuJoCo's step" in told.text) == ("discrete" not in kinds)
+    (slope,) = [finding.text for finding in measured_findings(measured) if finding.kind == "slope"]
+    assert "event" not in slope
+    assert ("MuJoCo's step" in slope) == ("discrete" in kinds)
+    advice = recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None)
+    assert (advice.gradient, advice.onset) == ("discrete", "discrete" not in kinds)
+    drawn = page("scene", "headline", (), "", {}, measured, ("speed",))
+    assert drawn.count('class="plain"') == (65 if "discrete" in kinds else 0)  # 2 panels of 32 dots, and a legend
 
 
 def test_hit_or_miss_is_named_with_its_pair(wall):
