@@ -164,7 +164,7 @@ def identify(
             (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
         held_out: share that is only judged by: every so many recordings or windows, or the end of a single one.
         window: cut recordings into windows of so many seconds, each from its measured state.
-        free_start: find where each motion begins, too.
+        free_start: find where each motion begins, too; without it the noise of the first state goes into the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """

@@ -172,3 +172,11 @@ def test_what_a_parameter_may_not_change_is_named():
     parameters.add(sysid.Parameter("switch", 0.1, 0.0, 1.0, modifier=disable))
     with pytest.raises(ValueError, match="parameters must change numbers alone, got one that changes geom_condim"):
         identification.identify_sequences(parameters, [sequence])
+
+
+def test_a_signal_without_a_name_is_refused_with_the_remedy():
+    sequence = _recorded(noise=0.0)
+    mapping = sequence.sensordata[0].signal_mapping
+    mapping[None] = mapping.pop("speed")
+    with pytest.raises(ValueError, match="name the sensors in the MJCF"):
+        identification.identify_sequences(_parameters(sequence.spec), [sequence])
