@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
-        _say(f"{error}; mjxgrad --help lists the commands")
+        _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
     # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
@@ -257,10 +257,17 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
 
         states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
     else:
-        with np.load(_existing(str(qpos))) as found:
+        try:
+            found = np.load(_existing(str(qpos)))
+        except (ValueError, EOFError) as error:
+            raise CommandError(f"{qpos} must be an NPZ or NPY file with positions, one state in each row") from error
+        if not isinstance(found, np.ndarray):
             if "qpos" not in found:
                 raise CommandError(f"{qpos} must hold an array named qpos, got {', '.join(found) or 'none'}")
-            states = found["qpos"]
+            found = found["qpos"]
+        states = found
+        if states.ndim != 2 or states.shape[1] != loaded.model.nq:
+            raise CommandError(f"qpos must have {loaded.model.nq} numbers for each state, got shape {states.shape}")
     mg.render.write_video(output, mg.render.frames(loaded, states, speed=speed))
     print(output)
 
