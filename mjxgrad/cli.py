@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +79,12 @@ def main(arguments: list[str] | None = None) -> int:
     # Whatever asks to stop is answered as Ctrl-C is.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        return app(arguments, exit_on_error=False, print_error=False) or 0
+        status = app(arguments, exit_on_error=False, print_error=False) or 0
+        if arguments is None and threading.active_count() > 1:
+            # A compilation that `check` gave up cannot be stopped otherwise, and leaving would wait for it.
+            sys.stdout.flush()
+            os._exit(status)
+        return status
     except KeyboardInterrupt:
         _say("interrupted")
         return 130
@@ -86,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
-        _say(f"{error}; mjxgrad --help lists the commands")
+        _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
     # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
@@ -105,7 +111,7 @@ def check(
     as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
-    seconds: float = 30.0,
+    budget: float = 120.0,
     seed: int = 0,
 ) -> int:
     """Say whether and how a scene can be differentiated; the exit status is 1 where there are faults.
@@ -116,7 +122,7 @@ def check(
         as_json: write JSON.
         html: write a page to this file.
         quick: only what takes seconds: contact, time step, what has no effect.
-        seconds: to spend on measuring once all is compiled.
+        budget: how long it may take in s, once the scene is loaded; what does not fit is left out by name.
         seed: of what is random.
     """
     mg, started = _library(), time.monotonic()
@@ -125,7 +131,7 @@ def check(
         _say(f"{time.monotonic() - started:4.0f} s  {text}")
 
     function = None if cost is None else _function(cost)
-    verdict = mg.check(_existing(scene), function, derivatives=not quick, seconds=seconds, seed=seed, log=log)
+    verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     if html is not None:
         html.write_text(verdict.as_html(), encoding="utf-8")
         log(f"wrote {html}")
@@ -158,7 +164,7 @@ def identify(
             (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
         held_out: share that is only judged by: every so many recordings or windows, or the end of a single one.
         window: cut recordings into windows of so many seconds, each from its measured state.
-        free_start: find where each motion begins, too.
+        free_start: find where each motion begins, too; without it the noise of the first state goes into the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """
@@ -251,10 +257,17 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
 
         states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
     else:
-        with np.load(_existing(str(qpos))) as found:
+        try:
+            found = np.load(_existing(str(qpos)))
+        except (ValueError, EOFError) as error:
+            raise CommandError(f"{qpos} must be an NPZ or NPY file with positions, one state in each row") from error
+        if not isinstance(found, np.ndarray):
             if "qpos" not in found:
                 raise CommandError(f"{qpos} must hold an array named qpos, got {', '.join(found) or 'none'}")
-            states = found["qpos"]
+            found = found["qpos"]
+        states = found
+        if states.ndim != 2 or states.shape[1] != loaded.model.nq:
+            raise CommandError(f"qpos must have {loaded.model.nq} numbers for each state, got shape {states.shape}")
     mg.render.write_video(output, mg.render.frames(loaded, states, speed=speed))
     print(output)
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mjxgrad as mg
@@ -54,6 +55,32 @@ def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said)
         SCENE.format(gear=1).replace("<worldbody>", '<option integrator="implicit"/><worldbody>')
     )
     assert cli.main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+@pytest.mark.parametrize("name", ["motion.npy", "motion.npz"])
+def test_positions_are_filmed_from_either_kind_of_file(scene, capsys, monkeypatch, name):
+    seen = []
+    monkeypatch.setattr(mg.render, "frames", lambda _, states, **__: seen.append(states))
+    monkeypatch.setattr(mg.render, "write_video", lambda *_: None)
+    states = np.linspace(0, 1, 5)[:, None]
+    np.save(name, states) if name.endswith("npy") else np.savez(name, qpos=states)
+    assert cli.main(["render", scene, name]) == 0
+    np.testing.assert_array_equal(seen[0], states)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (lambda path: path.write_text("time,z\n0,1\n"), "must be an NPZ or NPY file"),
+        (lambda path: np.savez(path, q=np.zeros((2, 1))), "array named qpos, got q"),
+        (lambda path: np.savez(path, qpos=np.zeros((2, 3))), "1 numbers for each state, got shape (2, 3)"),
+    ],
+)
+def test_positions_that_cannot_be_filmed_are_refused_in_one_line(scene, capsys, content, said):
+    content(Path("motion.npz"))
+    assert cli.main(["render", scene, "motion.npz"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
 

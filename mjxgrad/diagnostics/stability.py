@@ -188,7 +188,7 @@ class StabilityReport:
     def summary(self) -> str:
         """Describe it for a human, in some 120 columns: a line for all springs alike, then the warnings."""
         speeds = "".join(
-            f", at {value:g} {unit}"
+            f", at {format_number(value)} {unit}"
             for value, unit in ((self.speed, "m/s"), (self.joint_speed, "rad/s at limits"))
             if value is not None
         )
@@ -239,12 +239,19 @@ class StabilityReport:
             return None
         return self.speed if spring.kind == "contact" else self.joint_speed
 
+    @staticmethod
+    def _written(spring: Spring, speed: float) -> tuple[str, str]:
+        """Write a speed, and the depth from which on a bounce goes through: of a joint limit the unit is the joint's."""
+        is_length = spring.kind == "contact"
+        return format_number(speed) + " m/s" * is_length, f"{spring.size:.3g}" + " m" * is_length
+
     def _passed(self, spring: Spring) -> str | None:
         speed = self._speed_of(spring)
         if speed is None or speed * self.timestep < spring.size:
             return None
+        at, size = self._written(spring, speed)
         return (
-            f"at {speed:g} the bodies move {speed * self.timestep:.3g} in one step, more than the {spring.size:.3g} within "
+            f"at {at} the bodies move {speed * self.timestep:.3g} in one step, more than the {size} within "
             f"which they are found, and can pass through; use a time step below {spring.size / speed:.2g} s"
         )
 
@@ -254,8 +261,9 @@ class StabilityReport:
             return None
         # At the same damping ratio the depth goes as one over the root of the stiffness.
         needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
+        at, size = self._written(spring, speed)
         return (
-            f"at {speed:g} a bounce goes {spring.depth(speed):.3g} deep, more than the {spring.size:.3g} from which bodies "
+            f"at {at} a bounce goes {spring.depth(speed):.3g} deep, more than the {size} from which bodies "
             f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
         )
 
@@ -277,10 +285,12 @@ class StabilityReport:
             reasons.append(f"rises within {steps:.2g} time steps")
         if not reasons:
             return None
+        at, _ = self._written(spring, speed)
+        unit = " m" if spring.kind == "contact" else ""
         return (
-            f"at {speed:g} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
+            f"at {at} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
             "onset=mg.Onset(), as tasks do by default, or an impedance from 0 over a width of at least "
-            f"{STEPS_NEEDED * speed * self.timestep:.2g}"
+            f"{STEPS_NEEDED * speed * self.timestep:.2g}{unit}"
         )
 
 

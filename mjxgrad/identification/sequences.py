@@ -243,6 +243,8 @@ def _columns(scene: Scene, model: mujoco.MjModel, measured: Any, rows: np.ndarra
     """Return values and sizes of each signal, states as columns of the whole, and whether it is a sensor."""
     if measured.signal_mapping is None:
         raise ValueError("sensordata must say what its columns are, got no mapping: make it by TimeSeries.from_names")
+    if None in measured.signal_mapping:  # as it calls what has no name, and keeps one of several
+        raise ValueError("sensordata must have named signals, got one without: name the sensors in the MJCF")
     found: dict[str, _Column] = {}
     for name, (kind, place) in measured.signal_mapping.items():
         value = measured.data[rows][:, place]

@@ -27,6 +27,7 @@ from mjxgrad.verdict.findings import (
     Finding,
     Recommendation,
     headline,
+    left_out_findings,
     measured_findings,
     recommend,
     slopes,
@@ -36,7 +37,7 @@ from mjxgrad.verdict.findings import (
 from mjxgrad.verdict.measure import Measured, measure
 from mjxgrad.verdict.motions import Motions, half_range, random_motions
 from mjxgrad.verdict.page import page
-from mjxgrad.verdict.programs import KINDS, Outcomes, Programs
+from mjxgrad.verdict.programs import Outcomes, Programs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -45,6 +46,7 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
+_COMPILED, _MOVED = 0.7, 0.25  # shares of the budget: when to give up compiling, and how long to follow motions at most
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Verdict:
     Attributes:
         name: of the scene.
         headline: the answer, in at most 15 words.
-        findings: faults first.
+        findings: faults first, then what there was no time for.
         recommendation: what to ask for.
         code: the same, to be pasted.
         outcomes: what was looked at, in words.
@@ -96,6 +98,7 @@ class Verdict:
     def _details(self) -> dict[str, str]:
         """Return what is there to look up: what was measured, the scene, its time step."""
         spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
+        of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
         rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
         noises = [
             f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
@@ -104,7 +107,7 @@ class Verdict:
             for row in rows
         ]
         return {
-            "What was measured": "\n".join([f"Outcomes: {'; '.join(self.outcomes)}.", *noises, f"Time: {spent}."]),
+            "What was measured": "\n".join([*of_what, *noises, f"Time: {spent}."]),
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
@@ -139,7 +142,7 @@ def check(
     cost: Cost | None = None,
     *,
     derivatives: bool = True,
-    seconds: int | float = 30.0,
+    budget: int | float = 120.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Verdict:
@@ -154,7 +157,9 @@ def check(
         cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
             their start. None looks at random mixes of where bodies end up, and how fast.
         derivatives: measure them; False is a matter of seconds.
-        seconds: to spend on motions after compilation, about. Slow scenes are followed for fewer steps.
+        budget: how long it may take in s, compilation included, once the scene is loaded. Slow scenes are followed for fewer
+            steps; what does not fit is left out, and the verdict says what. A compilation that is given up goes on behind it
+            until it ends.
         seed: of all that is random.
         log: called with what is being done.
 
@@ -162,21 +167,22 @@ def check(
         The verdict; `print` it.
 
     Raises:
-        ValueError: if `seconds` is not positive, or the cost does not return a number or numbers to be added up.
+        ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
         SceneError: if MuJoCo cannot read the source, MJX cannot simulate it, or so many geoms can touch that loading would take
             minutes; and what else `load_scene` raises.
     """
-    if not seconds > 0:
-        raise ValueError(f"seconds must be positive, got {seconds}; derivatives=False measures nothing")
+    if not budget > 0:
+        raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     say = log or (lambda _: None)
     rng, started = np.random.default_rng(seed), time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, path = _load(source, say)
+        spent = {"loading": time.perf_counter() - started}
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
         stability = check_stability(scene, speed=touch_speed(motions))
-    spent = {"loading and motions": time.perf_counter() - started}
+    spent["motions"] = time.perf_counter() - started - spent["loading"]
     found = [*static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
@@ -184,20 +190,22 @@ def check(
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("compiling three kinds of derivative")
-        started = time.perf_counter()
-        size = _BATCHES[scene.model.nv > _SMALL]
-        programs = Programs(scene, size, outcomes, KINDS)
+        compiling, loaded = time.perf_counter(), started + spent["loading"]
+        programs = Programs(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, loaded + _COMPILED * budget)
         programs.wait()
-        spent["compiling"] = time.perf_counter() - started
-        started = time.perf_counter()
-        measured = measure(scene, motions, programs, rng, from_start=cost is not None, seconds=seconds, log=say)
-        spent["measuring"] = time.perf_counter() - started
-        found += measured_findings(measured)
+        spent["compiling"] = time.perf_counter() - compiling
+        measuring = time.perf_counter()
+        if "onset" in programs.kinds:
+            times = {"seconds": _MOVED * budget, "deadline": loaded + budget}
+            measured = measure(scene, motions, programs, rng, from_start=cost is not None, **times, log=say)
+            found += measured_findings(measured)
+            spent["measuring"] = time.perf_counter() - measuring
+        found += left_out_findings(programs.kinds, measured, budget)
     advice = recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
         name=scene.name,
         headline=headline(found, advice, motions),
-        findings=tuple(sorted(found, key=lambda one: not one.is_fault)),
+        findings=tuple(sorted(found, key=lambda one: (not one.is_fault, one.kind not in ("not_measured", "left_out")))),
         recommendation=advice,
         code=_code(scene, advice, path),
         outcomes=names,

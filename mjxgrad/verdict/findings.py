@@ -15,13 +15,16 @@ from mjxgrad.verdict.measure import STDDEVS, Measured
 from mjxgrad.verdict.motions import Motions
 
 Kind = Literal[
-    "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs", "slope", "order", "note"
-]
+    "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
+    "not_measured", "left_out", "slope", "order", "note",
+]  # fmt: skip
 MANY_PAIRS = 1000
 """Pairs of geoms from which on they are counted aloud."""
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
+
+_WORDS = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
 
 
 @dataclass(frozen=True)
@@ -146,12 +149,24 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     yield from _order_findings(measured)
 
 
+def left_out_findings(kinds: Sequence[str], measured: Measured | None, budget: int | float) -> Iterator[Finding]:
+    """Yield what there was no time for, from the kinds of derivative that were compiled in time."""
+    if measured is None:
+        text = f"Not measured: {_WORDS['onset']} did not compile within a budget of {budget:g} s."
+        yield Finding("not_measured", f"{text} What is said is of motions alone; a larger budget measures the rest.")
+        return
+    missing = [words for kind, words in _WORDS.items() if kind not in kinds] + list(measured.left_out)
+    if missing:
+        text = f"Left out for a budget of {budget:g} s: {'; '.join(missing)}. A larger one measures it, too."
+        yield Finding("left_out", text)
+
+
 def _slope_finding(found: Sequence[Slope]) -> Finding:
-    if not found[0].num_readings:
+    if not found[-1].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
-    words = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
-    parts = [f"{words[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in found]
-    lead = f"How far the mean derivative is from the slope, typical of {found[0].num_readings} readings."
+    read = [one for one in found if one.num_readings]
+    parts = [f"{_WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
+    lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}")
 
 
@@ -178,6 +193,8 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
         off, errors = [], []
         for line in measured.lines:
             comparison = line.smooth if kind == "onset" else line.plain
+            if comparison is None or kind not in comparison.gradients:
+                continue
             at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
             is_clear = (size > 0) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
             is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
@@ -200,11 +217,13 @@ def recommend(
     if measured is None:
         horizon = max(40, round(0.2 / motions.timestep))
         return Recommendation(touches, "discrete", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
-    found = slopes(measured)
-    discrete, event, onset = found
-    needs_none = not touches or (discrete.num_off == 0 and not discrete.error > _CLOSE)
+    discrete, event, onset = slopes(measured)
+    is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
+    needs_none = not touches or is_exact
     # Where contacts chatter an event gradient has no bound, so it must be better beyond chance, of two counts.
-    is_event_better = onset.num_off - event.num_off > 2 * math.sqrt(onset.num_off + event.num_off)
+    is_event_better = event.num_readings > 0 and onset.num_off - event.num_off > 2 * math.sqrt(
+        onset.num_off + event.num_off
+    )
     best = discrete if needs_none else event if is_event_better else onset
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
@@ -219,11 +238,12 @@ def recommend(
     ]
     limit = min(limits, default=math.inf)
     is_limited = limit < measured.times[-1]
+    is_unknown = not measured.lines or not own
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
         onset=best.kind == "onset",
         gradient="event" if best.kind == "event" else "discrete",
-        estimator="alpha_order" if has_jumps or is_limited else "first_order",
+        estimator="alpha_order" if has_jumps or is_limited or is_unknown else "first_order",
         stddev=stddev,
         horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
         timestep=timestep,
@@ -265,17 +285,18 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
     """Answer in at most 15 words."""
     asked = "onset=mg.Onset()" if advice.onset else f'gradient="{advice.gradient}"'
     answer = f"{asked} and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
-    faults = [finding.kind for finding in findings if finding.is_fault]
+    minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
     words = {
-        "time_step": "the time step is too long for a contact",
+        "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
         "no_contact": "nothing touches",
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
         "explodes": "the derivative explodes",
         "many_pairs": "too many pairs can touch",
+        "not_measured": "derivatives were not measured",
     }
-    found = next((words[kind] for kind in words if kind in faults), None)
+    found = next((words[kind] for kind in words if kind in minded), None)
     return f"Differentiate it with {answer}." if found is None else f"Mind that {found}. Then {answer}."
 
 

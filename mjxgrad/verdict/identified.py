@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 
 from mjxgrad import render
@@ -20,7 +21,7 @@ from mjxgrad.identification.recording import stack
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.page import document
 
-_WIDTH, _HEIGHT, _LEFT, _TOP = 360.0, 130.0, 50.0, 18.0
+_WIDTH, _HEIGHT, _LEFT, _TOP = 360.0, 130.0, 66.0, 18.0
 _MOST_SIGNALS, _MOST_DOTS = 8, 300
 _FRAME = (240, 320)
 
@@ -140,6 +141,7 @@ class Identified:
         motions = [*self.recordings[:1], *([self._shown] if self._shown is not self.recordings[0] else [])]
         signals = []
         for name in self._shown.measured:
+            titles = _titles(self.scene, name, before[name].shape[1])
             for i in range(before[name].shape[1]):
                 times = np.concatenate([np.asarray(one.times) for one in motions])
                 values = np.concatenate([one.measured[name][:, i] for one in motions])
@@ -147,8 +149,9 @@ class Identified:
                 if known.any():
                     spread = max(float(np.ptp(values[known])), 1e-12)
                     change = float(np.abs(after[name][:, i] - before[name][:, i]).max()) / spread
-                    title = f"{name}[{i}]" if before[name].shape[1] > 1 else name
-                    signals.append((change, title, times[known], values[known], before[name][:, i], after[name][:, i]))
+                    signals.append(
+                        (change, titles[i], times[known], values[known], before[name][:, i], after[name][:, i])
+                    )
         signals.sort(key=lambda one: -one[0])
         split = float(motions[0].times[-1]) if len(motions) > 1 else None
         shown = [_panel(timestep, split, *one[1:]) for one in signals[:_MOST_SIGNALS]]
@@ -187,6 +190,27 @@ class Identified:
         source = f"data:video/mp4;base64,{data}"
         video = f'<video controls loop muted autoplay playsinline src="{source}"></video>'
         return f"<figure>{video}<figcaption>{words}</figcaption></figure>"
+
+
+def _titles(scene: Scene, name: str, width: int) -> list[str]:
+    """Name the numbers of a signal: positions and velocities by their joints, with units; others by their place."""
+    if name not in ("qpos", "qvel"):
+        return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+    model, found = scene.mj_model, []
+    for joint in range(model.njnt):
+        label = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+        # A free joint often has no name, but its body has one.
+        label = label or mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.jnt_bodyid[joint]) or f"joint {joint}"
+        kind, rate = mujoco.mjtJoint(model.jnt_type[joint]), "/s" * (name == "qvel")
+        turns = [f"rotation {axis}, rad/s" for axis in "xyz"] if rate else [f"quaternion {part}" for part in "wxyz"]
+        parts = {
+            mujoco.mjtJoint.mjJNT_FREE: [*(f"{axis}, m{rate}" for axis in "xyz"), *turns],
+            mujoco.mjtJoint.mjJNT_BALL: turns,
+            mujoco.mjtJoint.mjJNT_SLIDE: [f"m{rate}"],
+            mujoco.mjtJoint.mjJNT_HINGE: [f"rad{rate}"],
+        }[kind]
+        found += [f"{label}, {part}" if len(parts) == 1 else f"{label} {part}" for part in parts]
+    return found
 
 
 def _panel(

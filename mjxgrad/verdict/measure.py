@@ -1,5 +1,6 @@
 """What is measured of a scene's derivatives: along lines, and under noise, by the diagnostics that there are for each."""
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._rollout import State
 from mjxgrad.contact import Softness
+from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
@@ -34,6 +36,7 @@ _NUM_LINES, _NUM_TIMES = 3, 4
 _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS = 4 * CHUNK, 30 * CHUNK
 _NUM_BATCHES = 24.0  # that are moved in all, about
+_LINE_BATCHES, _NOISE_BATCHES = 6, 1
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
 _AT_REST = 1e-3  # of the largest variation at any time
 _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
@@ -46,7 +49,7 @@ class Line:
     Attributes:
         pose: where it starts, in words.
         varied: what is changed along it, in words.
-        plain: MuJoCo's motion: its slope, and its derivatives by kind.
+        plain: MuJoCo's motion: its slope, and its derivatives by kind; None where there was no time for them.
         smooth: the motion with an onset, likewise.
         jumps: of the motion with an onset, over its spread; the parameter is the place on the line.
         changed: pairs that touch on one side of the largest jump alone.
@@ -57,7 +60,7 @@ class Line:
 
     pose: str
     varied: str
-    plain: SlopeComparison
+    plain: SlopeComparison | None
     smooth: SlopeComparison
     jumps: Jumps
     changed: tuple[str, ...]
@@ -98,12 +101,13 @@ class Noise:
 
 @dataclass(frozen=True)
 class Measured:
-    """All that was measured; times are those of outcomes after the start of a line, in s."""
+    """All that was measured, and what was not for want of time; times are those of outcomes after the start, in s."""
 
     times: Float[np.ndarray, " times"]
     num_steps: int
     lines: tuple[Line, ...]
     noises: tuple[Noise, ...]
+    left_out: tuple[str, ...] = ()
 
 
 def measure(
@@ -114,9 +118,10 @@ def measure(
     *,
     from_start: bool,
     seconds: int | float,
+    deadline: float,
     log: Callable[[str], None],
 ) -> Measured:
-    """Measure along lines and under noise, in about so many seconds after compilation."""
+    """Measure along lines and under noise, in about so many seconds, and leave out what would not end by the deadline."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
@@ -131,14 +136,38 @@ def measure(
     directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
     softness = _softer(scene)
     settings = [(stddev, soft) for soft in ([None] if softness is None else [None, softness]) for stddev in STDDEVS]
+    lines = [
+        (f"a line along {one[0]}", _LINE_BATCHES, functools.partial(probe.line, *at, *one))
+        for at, one in zip(chosen, directions, strict=True)
+    ]
+    noises = [
+        (
+            f"noise of {stddev:g}"
+            + ("" if stiffness is None else f" with contacts at {format_number(stiffness)} 1/s²"),
+            _NOISE_BATCHES,
+            functools.partial(
+                probe.noise, *chosen[0], stddev, stiffness, np.random.default_rng(int(rng.integers(2**31)))
+            ),
+        )
+        for stddev, stiffness in settings
+    ]
+
+    def in_time(_: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
+        # Going by what the steps before it took, beside each other.
+        seconds = num_batches * num_steps / CHUNK * programs.chunk_seconds
+        return task() if time.perf_counter() + seconds < deadline else None
+
+    # By worth, for the last ones are left out where time is short.
+    asked = [lines[0], noises[0], *lines[1:], *noises[1:]]
     with ThreadPoolExecutor(2) as pool:
-        noise_keys = [np.random.default_rng(int(rng.integers(2**31))) for _ in settings]
-        noises = [
-            pool.submit(probe.noise, *chosen[0], *one, own) for one, own in zip(settings, noise_keys, strict=True)
-        ]
-        lines = [pool.submit(probe.line, *at, *one) for at, one in zip(chosen, directions, strict=False)]
-        measured = tuple(one.result() for one in lines), tuple(one.result() for one in noises)
-    return Measured(np.array(lengths) * motions.timestep, num_steps, *measured)
+        found = list(pool.map(lambda one: in_time(*one), asked))
+    return Measured(
+        np.array(lengths) * motions.timestep,
+        num_steps,
+        tuple(one for one in found if isinstance(one, Line)),
+        tuple(one for one in found if isinstance(one, Noise)),
+        tuple(words for (words, *_), one in zip(asked, found, strict=True) if one is None),
+    )
 
 
 def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
@@ -149,9 +178,7 @@ def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: i
     states = _repeated(motions.state(0, 0), programs.size)
     controls = np.repeat(motions.controls[:1, :CHUNK], programs.size, axis=0)
     programs.move("onset", states, controls, direction, [CHUNK])
-    started = time.perf_counter()
-    programs.move("onset", states, controls, direction, [CHUNK])
-    affordable = CHUNK * int(seconds / (_NUM_BATCHES * (time.perf_counter() - started)))
+    affordable = CHUNK * seconds / (_NUM_BATCHES * programs.chunk_seconds)
     num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
     num_chunks = num_steps // CHUNK
     return sorted({CHUNK * max(1, round(num_chunks * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
@@ -210,8 +237,10 @@ class _Probe:
             return self.programs.move(kind, states, varied, direction, self.lengths)
 
         places = phases((-1.0, 1.0), self.programs.size)
-        discrete, event, onset = (along(kind, places) for kind in ("discrete", "event", "onset"))
-        plain = compare_to_slope(places, discrete.outcomes, [discrete.derivatives, event.derivatives])
+        kinds = [kind for kind in ("discrete", "event") if kind in self.programs.kinds]
+        onset, *others = (along(kind, places) for kind in ("onset", *kinds))
+        derivatives = [one.derivatives for one in others]
+        plain = compare_to_slope(places, others[0].outcomes, derivatives, kinds) if kinds else None
         continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
         centre, spreads = np.nanmean(onset.outcomes[:, -1], axis=0), np.nanstd(onset.outcomes, axis=0)
         # What has come to rest by then varies by rounding alone.
@@ -232,7 +261,7 @@ class _Probe:
             jumps=jumps,
             changed=self._changed(state, controls, direction, jumps),
             growth=np.median(onset.growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
-            num_diverged=discrete.num_diverged + onset.num_diverged,
+            num_diverged=sum(one.num_diverged for one in (onset, *others[:1])),
             num_crowded=onset.num_crowded,
         )
 

@@ -45,7 +45,7 @@ def page(
     """Write the page as HTML that needs nothing beside it."""
     sentences = "".join(f"<li{' class=fault' if one.is_fault else ''}>{_text(one.text)}</li>" for one in findings)
     body = (
-        f"{'' if measured is None else _figure(measured, outcomes)}<ul>{sentences}</ul>"
+        f"{_figure(measured, outcomes) if measured is not None and measured.lines else ''}<ul>{sentences}</ul>"
         f"<h2>To paste</h2><pre>{_text(code)}</pre>"
     )
     return document(f"mjxgrad check {name}", headline, body, details)
@@ -87,40 +87,40 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
         line = max(jumping, key=lambda one: float(one.jumps.sizes.max()))
         sizes = np.abs(line.jumps.after - line.jumps.before)[line.jumps.largest]
         return line, len(measured.times) - 1, int(sizes.argmax())
-    errors = [np.where(line.plain.is_resolved(), line.plain.relative_error[0], 0) for line in measured.lines]
+    compared = [line.plain or line.smooth for line in measured.lines]
+    errors = [np.where(one.is_resolved(), one.relative_error[0], 0) for one in compared]
     number, time, outcome = np.unravel_index(int(np.argmax(errors)), np.shape(errors))
     return measured.lines[int(number)], int(time), int(outcome)
 
 
 def _drawing(line: Line, time: int, outcome: int) -> str:
     """Draw the outcome along the line, and below it its derivatives on the slope that they should have."""
-    x = line.plain.parameters
-    pairs = [
-        (one.outcomes[:, time, outcome], one.derivatives[0, :, time, outcome]) for one in (line.plain, line.smooth)
-    ]
-    (plain, plain_slopes), (smooth, smooth_slopes) = pairs
-    slope = np.gradient(smooth, x)
+    shown = {style: one for style, one in (("plain", line.plain), ("smooth", line.smooth)) if one is not None}
+    x, values = line.smooth.parameters, [one.outcomes[:, time, outcome] for one in shown.values()]
+    derivatives = [one.derivatives[0, :, time, outcome] for one in shown.values()]
+    slope = np.gradient(values[-1], x)
     across = lambda at: _LEFT + (at - x[0]) / (x[-1] - x[0]) * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
     marks = []
-    panels = (("outcome", smooth, plain, smooth), ("derivative", slope, plain_slopes, smooth_slopes))
-    for number, (label, curve, *dots) in enumerate(panels):
+    panels = (("outcome", values[-1], values), ("derivative", slope, derivatives))
+    for number, (label, curve, dots) in enumerate(panels):
         top = _TOP + number * (_PANEL + _GAP)
-        low, high = _range(curve if number else np.concatenate([plain, smooth]))
+        low, high = _range(curve if number else np.concatenate(dots))
         up = lambda y, top=top, low=low, high=high: top + _PANEL * (1 - (np.clip(y, low, high) - low) / (high - low))  # noqa: E731
         marks.append(f'<path class="axis" fill="none" d="M{_LEFT} {top}v{_PANEL}H{_WIDTH - _RIGHT}"/>')
         marks += [f'<path class="jump" d="M{across(at):.1f} {top}v{_PANEL}"/>' for at in line.jumps.places]
         marks.append(f'<path class="slope" d="{_path(across(x), up(curve))}"/>')
-        for style, values in zip(("plain", "smooth"), dots, strict=True):
+        for style, heights in zip(shown, dots, strict=True):
             marks += [
                 f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="1.9"/>'
-                for a, b in zip(across(x), up(values), strict=True)
+                for a, b in zip(across(x), up(heights), strict=True)
                 if np.isfinite(b)
             ]
         digits = max(2, int(np.ceil(np.log10(max(abs(low), abs(high), 1e-12) / (high - low)))) + 2)
         for value in (low, high):
             marks.append(f'<text x="{_LEFT - 6}" y="{up(value) + 4:.1f}" text-anchor="end">{value:.{digits}g}</text>')
         marks.append(f'<text x="{_WIDTH - _RIGHT}" y="{top - 6}" text-anchor="end">{label}</text>')
-    marks.append(f'<text class="plain" x="{_LEFT}" y="14">MuJoCo\'s step</text>')
+    if line.plain is not None:
+        marks.append(f'<text class="plain" x="{_LEFT}" y="14">MuJoCo\'s step</text>')
     marks.append(f'<text class="smooth" x="{_LEFT + 92}" y="14">with an onset</text>')
     marks.append(f'<text x="{_LEFT}" y="{_HEIGHT - 6}">place on the line, −1 to 1</text>')
     return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'

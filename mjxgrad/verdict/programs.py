@@ -6,9 +6,11 @@ shorter ones within it. Contact parameters are arguments, so that a sweep over s
 one direction compiles in half the time of reverse mode, and gives the change of every outcome at every time.
 """
 
+import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,12 +27,13 @@ from mjxgrad.task import finite_cost
 
 CHUNK = 10
 """Steps of one call."""
-KINDS = ("discrete", "event", "onset")
-"""What may be asked of a step: MuJoCo's motion with two derivatives, and contacts that begin within the step."""
+KINDS = ("onset", "discrete", "event")
+"""What may be asked of a step: contacts that begin within it, and MuJoCo's motion with two derivatives; the dearest first."""
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's code of the first level: half the time to compile (hopper, jax 0.10.2: 12 s in place of 24) and as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _WORKERS = 2
+_EVENT = 1.5  # times as long as the kind compiled before it takes the event gradient, at most
 _TINY = 1e-5  # m, rad: of a central difference through the exponential map of orientations, exact to its square
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
@@ -77,28 +80,52 @@ class Programs:
         scene: that is stepped.
         size: motions in a batch.
         outcomes: of a trajectory.
-        kinds: names of `KINDS`.
+        deadline: by `time.perf_counter`. What is not compiled by then is given up; a compilation that has begun cannot be
+            stopped, and goes on until it ends.
+        kinds: that are compiled, once `wait` has returned.
     """
 
     scene: Scene
     size: int
     outcomes: Outcomes
-    kinds: Sequence[str]
-    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(_WORKERS))
+    deadline: float
+    kinds: tuple[str, ...] = ()
 
     def __post_init__(self):
         self.contact = contact_of(self.scene.model)
         self._compiled: dict[str, Future] = {}
         self._judges: dict[tuple[int, ...], Callable] = {}
-        for kind in self.kinds:
+        self._num_calls, self._seconds, self._compile_seconds = 0, 0.0, 0.0
+        pool, longest = ThreadPoolExecutor(_WORKERS), 0.0
+        for kind in KINDS:
+            started = time.perf_counter()
+            # The first trace says how long another one takes, at most.
+            if started + longest > self.deadline:
+                break
             # Traced here, for a thread does not see what a `with` has set, such as the precision; compiled beside it.
             lowered = jax.jit(jax.vmap(self._advance(kind), in_axes=(None, 0, 0, 0, 0))).lower(*self._shapes())
-            self._compiled[kind] = self.pool.submit(lowered.compile, compiler_options=_options())
+            longest = max(longest, time.perf_counter() - started)
+            self._compiled[kind] = pool.submit(self._compile, kind, lowered)
+        pool.shutdown(wait=False)
+
+    def _compile(self, kind: str, lowered: Any) -> Callable | None:
+        """Compile a kind; the event gradient only where it will be ready in time, going by the one that was before it."""
+        started = time.perf_counter()
+        if kind == "event" and started + _EVENT * self._compile_seconds > self.deadline:
+            return None
+        program = lowered.compile(compiler_options=_options())
+        self._compile_seconds = time.perf_counter() - started
+        return program
 
     def wait(self) -> None:
-        """Wait until all of them are compiled."""
-        for future in self._compiled.values():
-            future.result()
+        """Wait until all of them are compiled, or the deadline."""
+        wait(self._compiled.values(), timeout=max(0.0, self.deadline - time.perf_counter()))
+        self.kinds = tuple(kind for kind, one in self._compiled.items() if one.done() and one.result() is not None)
+
+    @property
+    def chunk_seconds(self) -> float:
+        """How long `CHUNK` steps of a batch took so far, in the mean."""
+        return self._seconds / max(self._num_calls, 1)
 
     def _advance(self, kind: str) -> Callable:
         asked: dict = {"onset": Onset()} if kind == "onset" else {"gradient": kind}
@@ -142,13 +169,14 @@ class Programs:
         pieces, bad, crowded, start = [], np.zeros(self.size, bool), np.zeros(self.size, bool), states
         start_change = change
         for begin in range(0, lengths[-1], CHUNK):
-            here = slice(begin, begin + CHUNK)
+            here, called = slice(begin, begin + CHUNK), time.perf_counter()
             (states, kept), (change, kept_change), (diverged, is_crowded) = program(
                 contact, states, change, controls[:, here], control_change[:, here]
             )
             pieces.append(jax.tree.map(np.asarray, (kept, kept_change)))
             bad |= np.asarray(diverged)
             crowded |= np.asarray(is_crowded)
+            self._num_calls, self._seconds = self._num_calls + 1, self._seconds + time.perf_counter() - called
         path, path_change = (
             [np.concatenate([first[:, None], *parts], axis=1) for first, *parts in zip(own, *rest, strict=True)]
             for own, rest in (

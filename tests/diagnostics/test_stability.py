@@ -143,7 +143,7 @@ def test_passing_through_is_said_of_a_post_and_not_of_a_plane():
 
 def test_without_a_speed_nothing_is_said_about_onsets():
     assert _report().warnings == ()
-    assert any("begins with a jump" in text for text in _report(speed=1.0).warnings)
+    assert any("at 1 m/s its force begins with a jump" in text for text in _report(speed=1.0).warnings)
 
 
 def test_the_summary_names_the_scene_its_springs_and_its_warnings():

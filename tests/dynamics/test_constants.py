@@ -99,3 +99,77 @@ def test_a_changed_mass_presses_as_a_recompiled_model_does():
         body_invweight0=light.model.body_invweight0,  # given: it stays
     )
     assert np.abs(mg.rollout(stale, mg.initial_state(stale), horizon=3).qvel - expected).max() > 1e-3
+
+
+# What the compiler reads, by the field that it becomes.
+_WRITTEN = {"body_mass": "mass", "body_inertia": "inertia", "geom_size": "size", "geom_friction": "friction"}
+
+
+def _explicit(name):
+    """Return a scene in whose file every mass, inertia, size and friction is a number that nothing else follows from."""
+    spec = mujoco.MjSpec.from_file(str(ASSETS / f"{name}.xml"))
+    model = spec.compile()
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER  # a quarter of RK4's program
+    spec.option.tolerance, spec.option.ls_tolerance, spec.option.iterations = 1e-15, 1e-12, 200
+    for i, body in enumerate(spec.bodies[1:], 1):
+        body.explicitinertial, body.mass, body.inertia = True, model.body_mass[i], model.body_inertia[i]
+        body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
+    for i, geom in enumerate(spec.geoms):
+        geom.fromto[:] = np.nan
+        geom.size, geom.pos, geom.quat = model.geom_size[i], model.geom_pos[i], model.geom_quat[i]
+    return spec
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_a_motion_s_derivatives_by_every_mass_inertia_size_and_friction_are_those_of_recompiled_models(name):
+    """Three steps with feet that slide on the floor, against central differences of C MuJoCo, recompiled for each number."""
+    spec, random, height = _explicit(name), np.random.default_rng(0), 1 if name == "hopper" else 2
+    model = spec.compile()
+    data, qpos = mujoco.MjData(model), model.qpos0.copy()
+    # Joints away from their limits, whose forces would lift what is to touch.
+    limited = model.jnt_limited.astype(bool)
+    low, high = model.jnt_range[limited].T
+    qpos[model.jnt_qposadr[limited]] = random.uniform(0.6 * low + 0.4 * high, 0.4 * low + 0.6 * high)
+    qvel = 0.5 * random.normal(size=model.nv)
+    # Lowered until it is pressed into the floor by 4 mm.
+    data.qpos[:] = qpos
+    while min(data.contact.dist, default=1.0) > -0.004:
+        data.qpos[height] -= 1e-4
+        mujoco.mj_fwdPosition(model, data)
+    qpos[height] = data.qpos[height]
+
+    def in_c():
+        recompiled = spec.compile()
+        moved = mujoco.MjData(recompiled)
+        moved.qpos[:], moved.qvel[:] = qpos, qvel
+        mujoco.mj_step(recompiled, moved, 3)
+        return np.concatenate([moved.qpos, moved.qvel])
+
+    scene = mg.load_scene(model)
+
+    def ours(fields):
+        changed = scene.with_model(**fields)
+        start = mg.initial_state(changed, qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+        end = mg.rollout(changed, start, horizon=3).final
+        return jnp.concatenate([end.qpos, end.qvel])
+
+    values = {field: np.array(getattr(model, field)) for field in _WRITTEN}
+    found = jax.jit(jax.jacfwd(ours))({field: jnp.asarray(value) for field, value in values.items()})
+    felt = set()
+    for field, value in values.items():
+        elements = spec.bodies if field.startswith("body") else spec.geoms
+        for place in map(tuple, np.argwhere(value > 0)):
+            changed, ends, step = value[place[0]].copy(), [], 1e-5 * value[place]
+            for side in (1, -1):
+                moved = np.array(changed)
+                moved[place[1:]] += side * step
+                setattr(elements[place[0]], _WRITTEN[field], moved if place[1:] else float(moved))
+                ends.append(in_c())
+            setattr(elements[place[0]], _WRITTEN[field], changed if place[1:] else float(changed))
+            expected = (ends[0] - ends[1]) / (2 * step)
+            felt |= {field} if np.abs(expected).max() > 1e-3 else set()
+            scale = max(1.0, np.abs(expected).max())
+            np.testing.assert_allclose(found[field][:, *place], expected, atol=1e-5 * scale, err_msg=f"{field} {place}")
+    assert felt == set(_WRITTEN)

@@ -12,6 +12,7 @@ import mjxgrad as mg
 from mjxgrad import cli
 from mjxgrad.identification import files
 from mjxgrad.identification.parameters import write_all
+from mjxgrad.verdict.identified import _titles
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
   <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>
@@ -146,3 +147,18 @@ def test_the_command_finds_a_mass_and_writes_what_it_found(tmp_path, monkeypatch
     assert set(found["inseparable"][0]) == {"mass:cart", "gear:motor"}
     assert found["headline"].startswith("0 of 2 numbers found")
     assert cli.main(["identify", "cart.xml", "motion.csv", "--parameter", "weight"]) == 2
+
+
+def test_figures_name_positions_and_velocities_by_their_joints():
+    """In the order of MuJoCo's qpos and qvel."""
+    scene = mg.load_scene("""<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body>
+      <body><joint name="slide" type="slide"/><geom size=".1"/><body><joint type="ball"/><geom size=".1"/>
+      <body><joint name="turn"/><geom size=".1"/></body></body></body></worldbody></mujoco>""")
+    positions, speeds = (_titles(scene, name, 0) for name in ("qpos", "qvel"))
+    assert (len(positions), len(speeds)) == (scene.model.nq, scene.model.nv)
+    assert [positions[i] for i in (2, 3, 7, 8, 12)] == [
+        "ball z, m", "ball quaternion w", "slide, m", "joint 2 quaternion w", "turn, rad",
+    ]  # fmt: skip
+    assert [speeds[i] for i in (0, 5, 6, 10)] == ["ball x, m/s", "ball rotation z, rad/s", "slide, m/s", "turn, rad/s"]
+    assert _titles(scene, "touch", 1) == ["touch"]
+    assert _titles(scene, "place", 2) == ["place[0]", "place[1]"]

@@ -83,6 +83,48 @@ def test_the_answer_and_its_intervals_are_those_of_mujoco_sysid(tmp_path):
     np.testing.assert_array_equal(loaded["length"].max_value, [0.4])
 
 
+@pytest.mark.slow
+def test_armatures_of_an_arm_of_five_joints_are_found_to_the_intervals_of_mujoco_sysid():
+    """As in its tutorial: all begin at 0.01, sensors are noisy, and torques drive the joints."""
+    links = "".join(
+        f"<body name='{i}' pos='{0.2 * (i > 0)} 0 0'><joint name='{i}' axis='{i % 2} {1 - i % 2} 0' damping='1'"
+        f" armature='{0.5 - 0.1 * i}'/><geom type='capsule' fromto='0 0 0 .2 0 0' size='.03' mass='.8'/>"
+        for i in range(5)
+    )
+    motors, sensors = (
+        "".join(f"<{kind} name='{kind}{i}' joint='{i}'/>" for i in range(5)) for kind in ("motor", "jointpos")
+    )
+    spec = mujoco.MjSpec.from_string(
+        f"<mujoco><option timestep='.004'><flag contact='disable'/></option><worldbody>{links}{'</body>' * 5}</worldbody>"
+        f"<actuator>{motors}</actuator><sensor>{sensors}</sensor></mujoco>"
+    )
+    model, rng = spec.compile(), np.random.default_rng(0)
+    times = model.opt.timestep * np.arange(250)
+    controls = (5 - np.arange(5)) * np.sin(times[:, None] * rng.uniform(3, 8, 5) + np.arange(5))
+    start = sysid.create_initial_state(model, np.zeros(5), np.zeros(5))
+    states, recorded = mujoco.rollout.rollout(model, mujoco.MjData(model), start, controls[:-1])
+    noisy = recorded[0] + 0.05 * rng.normal(size=recorded[0].shape)
+    measured = sysid.TimeSeries.from_names(states[0, :, 0], noisy, model)
+    sequence = sysid.ModelSequences("arm", spec, "swing", start, sysid.TimeSeries(times, controls), measured, True)
+    parameters = sysid.ParameterDict()
+    for i in range(5):
+
+        def set_armature(spec, parameter, joint=str(i)):
+            spec.joint(joint).armature = parameter.value[0]
+
+        parameters.add(sysid.Parameter(f"armature{i}", 0.5 - 0.1 * i, 0.01, 0.8, modifier=set_armature))
+        parameters[f"armature{i}"].value[:] = 0.01
+    found, result = identification.identify_sequences(parameters, [sequence], onset=None)
+    residual = sysid.build_residual_fn(models_sequences=[sequence])
+    expected, theirs = sysid.optimize(parameters, residual, verbose=False)
+    left, _, _ = residual(theirs.x, expected, return_pred_all=True)
+    _, half_width = sysid.calculate_intervals(left, theirs.jac)
+    np.testing.assert_allclose(found.as_vector(), expected.as_vector(), atol=0.01 * half_width.min())
+    np.testing.assert_allclose(np.concatenate(list(result.half_width.values())), half_width, rtol=1e-3)
+    # Twice the 95 % interval: one of 10 000 is beyond it by chance.
+    assert (np.abs(found.as_vector() - 0.5 + 0.1 * np.arange(5)) < 2 * half_width).all()
+
+
 def test_the_derivative_through_the_compiler_is_that_of_recompiled_models():
     """What follows from ten numbers of a body whose axes the compiler reorders, against C MuJoCo, recompiled."""
 
@@ -130,3 +172,11 @@ def test_what_a_parameter_may_not_change_is_named():
     parameters.add(sysid.Parameter("switch", 0.1, 0.0, 1.0, modifier=disable))
     with pytest.raises(ValueError, match="parameters must change numbers alone, got one that changes geom_condim"):
         identification.identify_sequences(parameters, [sequence])
+
+
+def test_a_signal_without_a_name_is_refused_with_the_remedy():
+    sequence = _recorded(noise=0.0)
+    mapping = sequence.sensordata[0].signal_mapping
+    mapping[None] = mapping.pop("speed")
+    with pytest.raises(ValueError, match="name the sensors in the MJCF"):
+        identification.identify_sequences(_parameters(sequence.spec), [sequence])

@@ -1,5 +1,6 @@
 """Planted faults are named, and what is measured is what closed forms say."""
 
+import itertools
 import json
 import time
 from pathlib import Path
@@ -15,9 +16,11 @@ from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
 from mjxgrad.scene.load import count_pairs
-from mjxgrad.verdict.findings import measured_findings, slopes
-from mjxgrad.verdict.measure import Line, Measured, _estimates
-from mjxgrad.verdict.programs import change_of_poses
+from mjxgrad.verdict.findings import left_out_findings, measured_findings, recommend, slopes
+from mjxgrad.verdict.measure import Line, Measured, _estimates, measure
+from mjxgrad.verdict.motions import random_motions
+from mjxgrad.verdict.page import page
+from mjxgrad.verdict.programs import Moved, Programs, change_of_poses
 
 BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></default><worldbody>
   <geom name="floor" type="plane" size="5 5 .1"/>
@@ -50,12 +53,12 @@ def fault(verdict, kind):
 
 @pytest.fixture(scope="module")
 def wall():
-    return mg.check(WALL, seconds=10)
+    return mg.check(WALL, budget=1000)
 
 
 @pytest.fixture(scope="module")
 def bounce():
-    return mg.check(ball(), seconds=10)
+    return mg.check(ball(), budget=1000)
 
 
 def test_a_sound_scene_has_no_fault():
@@ -123,6 +126,61 @@ def test_all_sources_give_the_same_verdict():
     spec, model = mujoco.MjSpec.from_string(text), mujoco.MjModel.from_xml_string(text)
     sources = (text, spec, model, mg.load_scene(text))
     assert len({quick(source).headline for source in sources}) == 1
+
+
+def test_what_a_budget_leaves_no_time_for_is_named():
+    """In a thousandth of a second nothing compiles."""
+    started = time.monotonic()
+    verdict = mg.check(ball(), budget=1e-3)
+    assert time.monotonic() - started < 10
+    assert verdict.measured is None
+    assert "derivatives were not measured" in verdict.headline
+    assert verdict.recommendation.estimator == "alpha_order"  # is never wrong
+    (told,) = [one.text for one in verdict.findings if one.kind == "not_measured"]
+    assert "0.001 s" in told
+    assert "onset=mg.Onset()" in told
+    assert not kinds(verdict)
+    assert len(verdict.headline.split()) <= 15
+
+
+class OutOfTime(Programs):
+    """Programs that take no time for the first two questions, and for ever for the others."""
+
+    def __init__(self, *kinds):
+        self.size, self.kinds = 32, kinds
+        self._seconds = itertools.chain([1.0, 0.0, 0.0], itertools.repeat(np.inf))
+
+    @property
+    def chunk_seconds(self):
+        return next(self._seconds)
+
+    def move(self, kind, states, controls, direction, lengths, contact=None):
+        """Return the velocity at the start as the outcome of all times."""
+        outcomes = np.repeat(states.qvel[:, None, :1], len(lengths), axis=1)
+        derivatives = np.full_like(outcomes, direction.velocities[0])
+        return Moved(outcomes, derivatives, np.ones(outcomes.shape[:2]), 0, 0)
+
+
+@pytest.mark.parametrize("kinds", [("onset", "discrete"), ("onset",)])
+def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
+    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
+    motions, programs = random_motions(scene, rng), OutOfTime(*kinds)
+    deadline = time.perf_counter() + 1000
+    measured = measure(
+        scene, motions, programs, rng, from_start=False, seconds=1, deadline=deadline, log=lambda _: None
+    )  # fmt: skip
+    assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
+    (told,) = left_out_findings(kinds, measured, 60)
+    for words in ("budget of 60 s", 'gradient="event"', "a line along the controls", "noise of 0.3", "contacts at"):
+        assert words in told.text
+    assert ("MuJoCo's step" in told.text) == ("discrete" not in kinds)
+    (slope,) = [finding.text for finding in measured_findings(measured) if finding.kind == "slope"]
+    assert "event" not in slope
+    assert ("MuJoCo's step" in slope) == ("discrete" in kinds)
+    advice = recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None)
+    assert (advice.gradient, advice.onset) == ("discrete", "discrete" not in kinds)
+    drawn = page("scene", "headline", (), "", {}, measured, ("speed",))
+    assert drawn.count('class="plain"') == (65 if "discrete" in kinds else 0)  # 2 panels of 32 dots, and a legend
 
 
 def test_hit_or_miss_is_named_with_its_pair(wall):
