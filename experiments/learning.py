@@ -172,20 +172,11 @@ def _course(
 ) -> Course:
     key = jax.random.key(settings.seed)
     stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
-    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
-    changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
-    how = (learning.apg if settings.algorithm == "apg" else learning.Settings)(
-        num_environments=settings.sizes.num_environments,
-        window=settings.window,
-        critic_rate=settings.critic_rate,
-        rule=rules.get(method, FixedAlpha(1.0)),
-        **changes,
-    )
     learned = learning.learn(
         _stepped(stiffer, method),
         jax.random.split(key, settings.sizes.num_seeds),
         num_updates=settings.sizes.num_updates,
-        settings=how,
+        settings=_how(settings, method),
         log=lambda done, _: advance_to(done),
         log_every=_every(settings),
         checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
@@ -204,6 +195,18 @@ def _course(
         returns=found.returns,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
+    )
+
+
+def _how(settings: Settings, method: Method) -> learning.Settings:
+    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
+    changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
+    return (learning.apg if settings.algorithm == "apg" else learning.Settings)(
+        num_environments=settings.sizes.num_environments,
+        window=settings.window,
+        critic_rate=settings.critic_rate,
+        rule=rules.get(method, FixedAlpha(1.0)),
+        **changes,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from mjxgrad import learning
 from mjxgrad._rollout import initial_state
 from mjxgrad.envs.trot import trot
 
@@ -150,6 +151,16 @@ def test_the_policy_sees_turning_down_posture_targets_and_the_last_reference(env
 def test_it_is_over_below_25_cm_and_beyond_a_quarter_turn(env, height, tilt, is_over):
     qpos = env.stance.at[2].set(height).at[3:7].set(jnp.array([np.cos(tilt / 2), np.sin(tilt / 2), 0, 0]))
     assert bool(env.is_over(initial_state(env.scene, qpos))) == is_over
+
+
+def test_whoever_stands_still_is_charged_what_the_notebook_charges(env):
+    """-47.806 is the return of the notebook's own code (brax 0.14.2, MJX 3.17, one solver iteration) on this robot, actions zero.
+
+    Its feet are those of one time step before: a difference of 0.01.
+    """
+    found = learning.evaluate(env, lambda obs: jnp.zeros(12), jax.random.key(0), num_episodes=1)
+    assert_allclose(found.returns[0], -47.806, atol=0.02)
+    assert found.lengths[0] == 240
 
 
 def test_derivatives_along_three_actions_are_those_of_differences(env, key):
