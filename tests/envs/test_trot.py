@@ -109,9 +109,8 @@ def state_of(env, seed):
     """A state in which all numbers differ."""
     rng = np.random.default_rng(seed)
     quaternion = np.array([1, 0.2, -0.1, 0.3]) + 0.1 * rng.standard_normal(4)
-    qpos = np.concatenate(
-        [[0.1, -0.2, 0.5], quaternion / np.linalg.norm(quaternion), STANCE + 0.1 * rng.standard_normal(12)]
-    )
+    place = np.array([0.1, -0.2, 0.5]) + 0.1 * rng.standard_normal(3)
+    qpos = np.concatenate([place, quaternion / np.linalg.norm(quaternion), STANCE + 0.1 * rng.standard_normal(12)])
     return initial_state(env.scene, jnp.array(qpos), jnp.array(rng.standard_normal(18)))
 
 
