@@ -36,6 +36,7 @@ class Settings:
         critic_batches: parts of such a pass.
         target_rate: share by which the target value function follows the value function.
         largest_norm: to which gradients are clipped.
+        largest_entry: to which each of their numbers is clipped instead, unless None.
         has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
         is_episodic: whether every window begins anew.
     """
@@ -56,6 +57,7 @@ class Settings:
     critic_batches: int = 4
     target_rate: float = 0.8
     largest_norm: float = 1.0
+    largest_entry: float | None = None
     has_critic: bool = True
     is_episodic: bool = False
 
@@ -78,8 +80,7 @@ class Settings:
 def apg(**changes: Any) -> Settings:
     """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
 
-    Windows follow one another. There, noise begins as here but its size is learned, and each number of a gradient is clipped
-    to 1, not its norm.
+    Windows follow one another. There, noise begins as here but its size is learned.
 
     Args:
         changes: settings that are to be others.
@@ -96,6 +97,7 @@ def apg(**changes: Any) -> Settings:
         "actor_scale": 0.01,
         "actor_rate": 1e-4,
         "actor_decay": 0.997,
+        "largest_entry": 1.0,
         "has_critic": False,
     }
     return Settings(**(settings | changes))
@@ -190,9 +192,12 @@ def optimisers(
     settings: Settings, num_updates: int
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Return those of policy and value function."""
+    clip = optax.clip_by_global_norm(settings.largest_norm)
+    if settings.largest_entry is not None:
+        clip = optax.clip(settings.largest_entry)
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
-        return optax.chain(optax.clip_by_global_norm(settings.largest_norm), optax.adam(schedule, b1=0.7, b2=0.95))
+        return optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95))
 
     per_update = settings.critic_iterations * settings.critic_batches
     actor_rate = optax.linear_schedule(settings.actor_rate, 0.0, num_updates)

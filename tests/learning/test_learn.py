@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import optax
 import pytest
 from numpy.testing import assert_allclose
 
@@ -165,6 +166,15 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     # Windows follow one another, and nothing is fitted.
     assert run.learner.environments.num_steps.max() > 3
     assert all(not x.any() for x in jax.tree.leaves(run.learner.critic.layers[-1]))
+
+
+@pytest.mark.parametrize(("entry", "clipped"), [(None, [0.6, 0.8]), (0.5, [0.5, 0.5])])
+def test_gradients_are_clipped_by_norm_or_number_by_number(entry, clipped):
+    """3 and 4 have norm 5, clipped to 1. Adam's first moment is 0.3 of what it is given."""
+    settings = learning.Settings(largest_entry=entry)
+    optimiser, _ = learning.learner.optimisers(settings, 5)
+    _, moments = optimiser.update(jnp.array([3.0, 4.0]), optimiser.init(jnp.zeros(2)))
+    assert_allclose(optax.tree.get(moments, "mu"), 0.3 * np.array(clipped), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("decay", "rates"), [(None, [0.5, 0.4, 0.3]), (0.9, [0.5, 0.45, 0.405])])
