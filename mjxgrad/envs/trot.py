@@ -7,8 +7,8 @@ What is seen, done, paid and over is the notebook's, as it runs. Three things th
   It is zero and is left out here, as is the return to the reference where that comparison finds a large error.
 - Feet and base are those of one time step (2 ms) before the action's end. Here they are those of its end.
 
-Its simulator solves contact by one iteration, which is not enough: under the notebook's noise a robot that stands returns -58 there,
-and -50 where the same code solves until it converges, as here. So compare what was learned, not from where.
+Its simulator solves contact by one iteration, which is not enough: under the notebook's noise a robot that stands returns -58,
+and -50 where the same code solves until it converges, as here.
 
 References:
     MuJoCo, `mjx/training_apg.ipynb`, study 1 (Google DeepMind, 2024).
