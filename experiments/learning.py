@@ -36,12 +36,13 @@ NAMES = {
     "ppo": "PPO",
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
-Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped"]
+Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
     "quadruped": envs.quadruped,
-    **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name != "quadruped"},
+    "trot": envs.trot,
+    **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name not in ("quadruped", "trot")},
 }
-_OWN_STEPS = ("cartpole", "quadruped")  # whose time steps are their own
+_OWN_STEPS = ("cartpole", "quadruped", "trot")  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
 
 
@@ -62,17 +63,19 @@ class Settings(RunSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
     environment: Name
-    """What is learned: DiffRL's tasks, or a quadruped that follows commands."""
+    """What is learned: DiffRL's tasks, a quadruped that follows commands, or the trot of MuJoCo's notebook."""
+    algorithm: Literal["shac", "apg"] = "shac"
+    """SHAC, or analytic policy gradients as in brax: no value function, other networks and rates."""
     methods: Annotated[tuple[Method, ...], Field(min_length=1)]
     """Which gradients learn; PPO is brax's."""
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
     """By which contact is stiffer than in the scene."""
     num_substeps: Annotated[int, Field(ge=1)] | None = None
-    """Time steps per action of 1/60 s; stiffer contact needs more. The cart-pole and the quadruped have their own."""
+    """Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, quadruped and trot have their own."""
     window: Annotated[int, Field(ge=1)] = 32
     """Steps of each environment per update."""
-    actor_rate: Positive = 2e-3
-    """Learning rate of the policy."""
+    actor_rate: Positive | None = None
+    """Learning rate of the policy; if left out, the algorithm's."""
     critic_rate: Positive = 2e-3
     """Learning rate of the value function."""
     size: Literal["quick", "default", "full"] = "default"
@@ -178,19 +181,11 @@ def _course(
     stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
     if method == "ppo":
         return _judged_course(settings, stiffer, method, stiffness, *_by_ppo(settings, stiffer, advance_to))
-    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
-    how = learning.Settings(
-        num_environments=settings.sizes.num_environments,
-        window=settings.window,
-        actor_rate=settings.actor_rate,
-        critic_rate=settings.critic_rate,
-        rule=rules.get(method, FixedAlpha(1.0)),
-    )
     learned = learning.learn(
         _stepped(stiffer, method),
         jax.random.split(key, settings.sizes.num_seeds),
         num_updates=settings.sizes.num_updates,
-        settings=how,
+        settings=_how(settings, method),
         log=lambda done, _: advance_to(done),
         log_every=_every(settings),
         checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
@@ -254,6 +249,18 @@ def _judged_course(
         terms=found.terms,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
+    )
+
+
+def _how(settings: Settings, method: Method) -> learning.Settings:
+    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
+    changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
+    return (learning.apg if settings.algorithm == "apg" else learning.Settings)(
+        num_environments=settings.sizes.num_environments,
+        window=settings.window,
+        critic_rate=settings.critic_rate,
+        rule=rules.get(method, FixedAlpha(1.0)),
+        **changes,
     )
 
 

@@ -2,7 +2,7 @@
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
 from mjxgrad.learning.learn import Learned, learn
-from mjxgrad.learning.learner import Learner, Policy, Settings
+from mjxgrad.learning.learner import Learner, Policy, Settings, apg
 from mjxgrad.learning.logs import Log, to_all, to_csv, to_tensorboard, to_tracker
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "Log",
     "Policy",
     "Settings",
+    "apg",
     "evaluate",
     "learn",
     "to_all",

@@ -11,7 +11,7 @@ difference between methods:
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
 | `rules.Consistent(failure_probability=1e-3)` | the same with an eye for bias: α-order, the default |
 
-With `is_episodic=True` every window begins anew and there is no value function: analytic policy gradients (APG).
+With the settings `apg()` there is no value function: analytic policy gradients (APG).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.

@@ -1,6 +1,7 @@
 """What learns and how: settings, a policy, and all that an update needs to know."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.estimators.rules import Consistent, Rule
+from mjxgrad.estimators.rules import Consistent, FixedAlpha, Rule
 from mjxgrad.learning.networks import Network, Normaliser, make_actor, make_critic
 
 
@@ -26,16 +27,20 @@ class Settings:
             them: one that sees bias by chance in a twentieth brings in much noise, so the default is surer.
         stddev: of the noise on actions before their squashing, in the first and in the last update.
         actor_layers: hidden sizes of the policy.
+        actor_scale: what the first gains of its hidden layers are multiplied with.
         critic_layers: hidden sizes of the value function.
         actor_rate: learning rate, which decreases linearly to zero.
+        actor_decay: what the rate is multiplied with at every update instead, unless None.
         critic_rate: of the value function, likewise.
         critic_iterations: passes over a window's states per update.
         critic_batches: parts of such a pass.
         target_rate: share by which the target value function follows the value function.
         largest_norm: to which gradients are clipped.
+        largest_entry: to which each of their numbers is clipped instead, unless None.
         largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
             zeroth-order one over environments, see `window.Gradients.shortened`. Infinity shortens none.
-        is_episodic: whether every window begins anew and there is no value function.
+        has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
+        is_episodic: whether every window begins anew.
     """
 
     num_environments: int = 64
@@ -45,14 +50,18 @@ class Settings:
     rule: Rule = dataclasses.field(default_factory=lambda: Consistent(failure_probability=1e-3))
     stddev: tuple[float, float] = (0.4, 0.1)
     actor_layers: tuple[int, ...] = (128, 64, 32)
+    actor_scale: float = 1.0
     critic_layers: tuple[int, ...] = (64, 64)
     actor_rate: float = 2e-3
+    actor_decay: float | None = None
     critic_rate: float = 2e-3
     critic_iterations: int = 16
     critic_batches: int = 4
     target_rate: float = 0.8
     largest_norm: float = 1.0
+    largest_entry: float | None = None
     largest_sample: float = 1.0
+    has_critic: bool = True
     is_episodic: bool = False
 
     def __post_init__(self):
@@ -71,6 +80,33 @@ class Settings:
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
                 f"got {self.critic_batches}"
             )
+
+
+def apg(**changes: Any) -> Settings:
+    """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
+
+    Windows follow one another. There, noise begins as here but its size is learned.
+
+    Args:
+        changes: settings that are to be others.
+
+    References:
+        Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
+        (`brax/training/agents/apg`).
+    """
+    settings = {
+        "discount": 1.0,
+        "rule": FixedAlpha(1.0),
+        "stddev": (0.07, 0.07),
+        "actor_layers": (256, 128),
+        "actor_scale": 0.01,
+        "actor_rate": 1e-4,
+        "actor_decay": 0.997,
+        "largest_entry": 1.0,
+        "largest_sample": float("inf"),
+        "has_critic": False,
+    }
+    return Settings(**(settings | changes))
 
 
 class Policy(eqx.Module):
@@ -128,9 +164,11 @@ def begin(environment: Environment, key: PRNGKeyArray, *, settings: Settings, nu
         spread = jax.random.randint(spread_key, (count,), 0, environment.episode_length)
         environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
     num_observations = environments.obs.shape[-1]
-    actor = make_actor(num_observations, environment.num_actions, settings.actor_layers, actor_key)
+    actor = make_actor(
+        num_observations, environment.num_actions, settings.actor_layers, actor_key, settings.actor_scale
+    )
     # Without a value function it is one that is zero and stays so.
-    scale = 0.0 if settings.is_episodic else 1.0
+    scale = 1.0 if settings.has_critic else 0.0
     critic = make_critic(num_observations, settings.critic_layers, critic_key, final_scale=scale)
     actor_optimiser, critic_optimiser = optimisers(settings, num_updates)
     return Learner(
@@ -159,11 +197,17 @@ def starts(environment: Environment, model_keys: Key[Array, " environments"], ke
 def optimisers(
     settings: Settings, num_updates: int
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Return those of policy and value function, whose rates decrease linearly to zero."""
+    """Return those of policy and value function."""
+    clip = optax.clip_by_global_norm(settings.largest_norm)
+    if settings.largest_entry is not None:
+        clip = optax.clip(settings.largest_entry)
 
-    def optimiser(rate: float, steps: int) -> optax.GradientTransformation:
-        schedule = optax.linear_schedule(rate, 0.0, steps)
-        return optax.chain(optax.clip_by_global_norm(settings.largest_norm), optax.adam(schedule, b1=0.7, b2=0.95))
+    def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
+        return optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95))
 
     per_update = settings.critic_iterations * settings.critic_batches
-    return optimiser(settings.actor_rate, num_updates), optimiser(settings.critic_rate, num_updates * per_update)
+    actor_rate = optax.linear_schedule(settings.actor_rate, 0.0, num_updates)
+    if settings.actor_decay is not None:
+        actor_rate = optax.exponential_decay(settings.actor_rate, 1, settings.actor_decay)
+    critic_rate = optax.linear_schedule(settings.critic_rate, 0.0, num_updates * per_update)
+    return optimiser(actor_rate), optimiser(critic_rate)

@@ -21,17 +21,22 @@ class Network(eqx.Module):
     norms: tuple[eqx.nn.LayerNorm, ...]
 
     @classmethod
-    def make(cls, sizes: Sequence[int], key: PRNGKeyArray, *, final_scale: float = 1.0) -> "Network":
+    def make(
+        cls, sizes: Sequence[int], key: PRNGKeyArray, *, hidden_scale: float = 1.0, final_scale: float = 1.0
+    ) -> "Network":
         """Draw one.
 
         Args:
             sizes: numbers of inputs, of each hidden layer, of outputs.
             key: consumed here.
+            hidden_scale: what gains and offsets of the hidden layers are multiplied with. Normalisation makes up for it; what
+                differs is how far a step of the optimiser goes.
             final_scale: what the gains of the last layer are multiplied with.
         """
         keys = jax.random.split(key, len(sizes) - 1)
         layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]
-        last = layers[-1]
+        *hidden, last = layers
+        layers[:-1] = jax.tree.map(lambda x: hidden_scale * x, hidden)
         layers[-1] = eqx.tree_at(lambda x: (x.weight, x.bias), last, (final_scale * last.weight, jnp.zeros(sizes[-1])))
         return cls(tuple(layers), tuple(eqx.nn.LayerNorm(size) for size in sizes[1:-1]))
 
@@ -77,9 +82,13 @@ class Normaliser(eqx.Module):
         return Normaliser(count, self.mean + share * shift, self.squares + squares + shift**2 * self.count * share)
 
 
-def make_actor(num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray) -> Network:
+def make_actor(
+    num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray, hidden_scale: float = 1.0
+) -> Network:
     """Draw a network for actions before their squashing, which begin near zero."""
-    return Network.make([num_observations, *hidden, num_actions], key, final_scale=FINAL_SCALE)
+    return Network.make(
+        [num_observations, *hidden, num_actions], key, hidden_scale=hidden_scale, final_scale=FINAL_SCALE
+    )
 
 
 def make_critic(

@@ -34,7 +34,7 @@ def update(
     window, environments, gradients = _windows(environment, learner, environments, noise_key, stddev, settings)
     policy, actor_moments, found = _improve(learner, window, gradients, settings, num_updates)
     critic, target, critic_moments, critic_loss = learner.critic, learner.target, learner.critic_moments, jnp.zeros(())
-    if not settings.is_episodic:
+    if settings.has_critic:
         critic, critic_moments, critic_loss = _fit_critic(learner, window, critic_key, settings, num_updates)
         target = jax.tree.map(lambda old, new: old + settings.target_rate * (new - old), learner.target, critic)
     so_far = jnp.zeros_like(learner.episode_return) if settings.is_episodic else learner.episode_return

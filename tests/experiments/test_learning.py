@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from experiments import learning
 from experiments.__main__ import main
+from experiments.config import load_runs
 from experiments.learning import Course, Outcome, Settings, Sizes, findings, verdict
 
 QUICK = Settings(
@@ -52,6 +53,17 @@ def test_curves_are_means_of_the_last_ten():
     assert_allclose(smooth[0], values[0])
     assert_allclose(smooth[4], values[:5].mean(axis=0))
     assert_allclose(smooth[11], values[2:].mean(axis=0))
+
+
+def test_the_trot_is_learned_as_published():
+    """MuJoCo's notebook: 499 updates of 64 windows of 32; brax's rate, its decay, and no discount."""
+    (published,) = load_runs("learn_trot", ['size="full"'])
+    assert published.settings.sizes.num_updates == 499
+    how = learning._how(published.settings, "onset")
+    assert (how.num_environments, how.window, how.actor_layers) == (64, 32, (256, 128))
+    assert (how.actor_rate, how.actor_decay, how.discount, how.has_critic) == (1e-4, 0.997, 1.0, False)
+    (faster,) = load_runs("learn_trot", ["actor_rate=1e-3"])
+    assert learning._how(faster.settings, "onset").actor_rate == 1e-3
 
 
 COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["onset"]', "precision=float64"]

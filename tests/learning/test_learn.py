@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import optax
 import pytest
 from numpy.testing import assert_allclose
 
@@ -141,6 +142,51 @@ def test_an_evaluation_ends_with_the_episode(cartpole, key):
     angles = np.asarray(found.qpos[0, :, 1])
     assert angles[length - 1] <= 2.0 < angles[length]
     assert_allclose(angles[length:], angles[length])
+
+
+def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
+    """The gradient of one update against that of a plain sum over all windows; with hardly any noise, from the same starts."""
+    settings = learning.apg(num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9))
+    run = learning.learn(cartpole, key, num_updates=1, settings=settings)
+    before = learning.learner.begin(cartpole, key, settings=settings, num_updates=1)
+
+    def loss(actor):
+        def advance(state, _):
+            stepped, state = cartpole.step_on(state, jnp.tanh(actor(before.policy.normaliser(state.obs))))
+            return state, stepped.reward
+
+        def one(state):
+            return jax.lax.scan(advance, state, length=3)[1].sum()
+
+        return -jax.vmap(one)(before.environments).sum() / (4 * 3)
+
+    gradient = jax.jit(jax.grad(loss))(before.policy.actor)
+    norm = np.sqrt(sum((np.asarray(x) ** 2).sum() for x in jax.tree.leaves(gradient)))
+    assert_allclose(run.history["gradient_norm"][0], norm, rtol=1e-6)
+    # Windows follow one another, and nothing is fitted.
+    assert run.learner.environments.num_steps.max() > 3
+    assert all(not x.any() for x in jax.tree.leaves(run.learner.critic.layers[-1]))
+
+
+@pytest.mark.parametrize(("entry", "clipped"), [(None, [0.6, 0.8]), (0.5, [0.5, 0.5])])
+def test_gradients_are_clipped_by_norm_or_number_by_number(entry, clipped):
+    """3 and 4 have norm 5, clipped to 1. Adam's first moment is 0.3 of what it is given."""
+    settings = learning.Settings(largest_entry=entry)
+    optimiser, _ = learning.learner.optimisers(settings, 5)
+    _, moments = optimiser.update(jnp.array([3.0, 4.0]), optimiser.init(jnp.zeros(2)))
+    assert_allclose(optax.tree.get(moments, "mu"), 0.3 * np.array(clipped), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("decay", "rates"), [(None, [0.5, 0.4, 0.3]), (0.9, [0.5, 0.45, 0.405])])
+def test_the_rate_falls_to_zero_or_by_a_share(decay, rates):
+    """Adam's steps along a gradient that stays the same are the rates; of five updates, three."""
+    settings = learning.Settings(actor_rate=0.5, actor_decay=decay)
+    optimiser, _ = learning.learner.optimisers(settings, 5)
+    gradient = jnp.ones(1)
+    moments = optimiser.init(gradient)
+    for rate in rates:
+        change, moments = optimiser.update(gradient, moments)
+        assert_allclose(change, [-rate], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -48,3 +48,11 @@ def test_a_network_is_its_formula(key):
 
 def test_a_new_actor_hardly_moves(key):
     assert np.abs(make_actor(4, 2, (8, 8), key)(jnp.ones(4))).max() < 0.05
+
+
+def test_only_hidden_layers_are_scaled(key):
+    plain, scaled = (make_actor(4, 2, (8, 8), key, scale) for scale in (1.0, 0.01))
+    for layer, other in zip(plain.layers[:-1], scaled.layers[:-1], strict=True):
+        assert_allclose(other.weight, 0.01 * layer.weight)
+        assert_allclose(other.bias, 0.01 * layer.bias)
+    assert_allclose(scaled.layers[-1].weight, plain.layers[-1].weight)
