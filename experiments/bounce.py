@@ -212,8 +212,11 @@ _ORDER = (CONTINUOUS, EVENT, DISCRETE)
 def answer(outcome: Outcome) -> str:
     """Say how often the derivative is the slope, without and with the event."""
     fine = outcome.grid.isel(timestep=outcome.grid.timestep.values <= _FINE)
+    judged = int(fine.judged.sum())
+    if not judged:
+        return "At no contact is the slope known well enough: take more phases."
     shares = [f"{int(fine.holds.sel(arm=arm).sum())} ({arm})" for arm in _ORDER]
-    return f"Right at {joined(shares)} of {int(fine.judged.sum())} contacts and time steps."
+    return f"Right at {joined(shares)} of {judged} settings."
 
 
 def verdict(outcome: Outcome) -> str:

@@ -20,7 +20,7 @@ from experiments.config import ExperimentError, suggest
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
-from experiments.words import joined, quantity
+from experiments.words import capitalised, joined, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
 from mjxgrad.diagnostics import Comparison, EmpiricalBias, Rollouts, compare, empirical_bias, first_order_samples
@@ -51,7 +51,7 @@ class EstimatorSettings(SettingsTable):
             parts.append(self.baseline.replace("_", " ") if self.baseline != "none" else "no baseline")
         parts += ["pairs"] if self.antithetic else []
         parts += [self.rule.replace("_", " ")] if self.rule else []
-        return self.name.replace("_", " ") + (f" ({', '.join(parts)})" if parts else "")
+        return self.name.replace("_", " ").replace("alpha ", "α-") + (f" ({', '.join(parts)})" if parts else "")
 
 
 class Settings(RunSettings):
@@ -229,6 +229,31 @@ def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:
         told = empirical_bias(samples, reference=truth, confidence=settings.confidence)
         found.append((float(problem.slope_probability(point, stddev)), told))
     return found
+
+
+def answer(outcome: Outcome) -> str:
+    """Say which estimators see a jump; what a stiffness, what a ripple does to both orders."""
+    if outcome.by_stiffness is None:
+        labels, is_blind = outcome.is_biased.estimator.values, outcome.is_biased[-1].values
+        seeing, blind = list(labels[~is_blind]), list(labels[is_blind])
+        if not blind:
+            return "All of them see it."
+        if len(blind) <= len(seeing):
+            return f"All but {named(blind, len(labels), words=10)} see it."
+        return capitalised(f"{named(seeing, len(labels), words=10)} {'sees' if len(seeing) == 1 else 'see'} it.")
+    if not {"first order", "zeroth order"} <= set(outcome.by_stiffness.estimator.values):
+        return _closest(outcome)
+    errors = outcome.by_stiffness.rmse
+    first, zeroth = (
+        f"{float(e[-1] / e[0]):.2g}" for e in (errors.sel(estimator=f"{n} order") for n in ("first", "zeroth"))
+    )
+    if outcome.settings.problem == "quadratic_sine":
+        return f"It multiplies first order's error by {first}, zeroth order's by {zeroth}."
+    unseen = [
+        x for x, (_, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True) if not found.num_outlying
+    ]
+    missed = f"all samples miss from 1/ν = {power(unseen[0])}" if unseen else "samples never all miss"
+    return f"First order's error grows {first}×, zeroth order's {zeroth}×; {missed}."
 
 
 def verdict(outcome: Outcome) -> str:

@@ -152,7 +152,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     found, reference = {}, None
     for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)
-        workspace.check(one.scene)
+        workspace.check(one.scene, name=one.title)
         found[name] = _measure(settings, one, np.random.default_rng([settings.seed, index]), workspace)
         if name == "double_pendulum":
             with workspace.stage("adaptive integration", "rollouts", 1):

@@ -10,7 +10,7 @@ from scipy.stats import mannwhitneyu
 from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
-from experiments.words import quantity
+from experiments.words import capitalised, quantity
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
@@ -19,7 +19,7 @@ _AGREEMENT = 3.0
 def answer(outcome: Outcome) -> str:
     """Name the method that ends lowest, and whether the seeds can tell it from the next."""
     best = outcome.best
-    lowest = f"The lowest end is that of {best.method.label}."
+    lowest = f"{capitalised(best.method.label)} ends lowest, at {quantity(best.mean, best.spread)}."
     others = [run for run in outcome.runs if run is not best and run.kept.size]
     if not others or not best.kept.size:
         return lowest
@@ -116,7 +116,7 @@ def headline(outcome: Outcome) -> dict[str, str]:
         for run in outcome.runs
     }
     for difference in outcome.verdicts:
-        kind = "worse" if difference.is_above else "better" if difference.is_below else "no difference"
+        kind = "worse" if difference.is_above else "better" if difference.is_below else "cannot be told"
         cells["α-order against the better"] = f"{kind}: {_signed(difference)}"
     return cells
 
@@ -125,13 +125,16 @@ def _comparison(difference: Difference) -> str:
     ours, other = difference.ours, difference.other
     if not (ours.kept.size and other.kept.size):
         return f"{ours.is_lost.sum()} runs of α-order and {other.is_lost.sum()} of {other.method.label} were lost."
-    kind = "ends worse" if difference.is_above else "ends better" if difference.is_below else "is not worse"
-    noise = "" if difference.is_above or difference.is_below else ", beyond seed noise"
+    numbers = f"{_signed(difference)}, rank test p = {difference.p_value:.2g}"
+    against = f"{other.method.label}, the better of first and zeroth order"
     lost = f", with {ours.is_lost.sum()} runs lost" if ours.is_lost.any() else ""
-    return (
-        f"α-order {kind} than {other.method.label}, the better of first and zeroth order{noise}{lost} "
-        f"({_signed(difference)}, rank test p = {difference.p_value:.2g})."
-    )
+    if difference.is_above:
+        # What speaks against it counts by the means alone, too.
+        means = "" if difference.is_ranked or lost else " by the means alone"
+        return f"α-order ends worse than {against}{means}{lost} ({numbers})."
+    if difference.is_below:
+        return f"α-order ends better than {against}{lost} ({numbers})."
+    return f"{ours.kept.size} seeds cannot tell α-order from {against}{lost} ({numbers})."
 
 
 def _signed(difference: Difference) -> str:

@@ -18,6 +18,7 @@ from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.measure import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import AXES, RADIUS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
+from experiments.words import percent
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.warnings import largest_stable_step, steepest
 
@@ -30,27 +31,39 @@ _LINES = {"derivative": "by the start", "derivative_by_parameters": "by paramete
 
 
 def answer(outcome: Outcome) -> str:
-    """Say whether every failure is flagged."""
-    found = outcome.found
+    """Say at which share of the points step and gradient hold, and whether every failure is flagged."""
+    found, precision = outcome.found, outcome.settings.precisions[0]
+    ours, theirs = (_held(found.motion.sel(simulator=name)) for name in (precision, C_MUJOCO))
+    right, judged = _right(found.derivative.sel(simulator=precision), found.motion.sel(simulator=precision))
+    gradient = f", gradients at {percent(right / judged)}" if judged else ""
     unflagged = int((found.silent | found.missed).sum())
-    return "Every failure is flagged." if not unflagged else f"{unflagged} failures carry no flag."
+    flags = f"{unflagged} failures carry no flag" if unflagged else "every failure is flagged"
+    return f"Motion holds at {ours} (C MuJoCo: {theirs}){gradient}; {flags}."
+
+
+def _held(motion) -> str:
+    return percent(float((motion < Motion.GAINS_ENERGY).mean()))
 
 
 def verdict(outcome: Outcome) -> str:
     """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
     found, precisions = outcome.found, outcome.settings.precisions
+    silent, missed = int(found.silent.sum()), int(found.missed.sum())
     sentences = [
-        f"Over {found.sizes['point']} points, {' and '.join(precisions)}, {_count(found.silent)} left a rollout with a number "
-        f"that is not finite and no flag, and `soundness` missed {_count(found.missed)} of the gradients that are not finite "
-        "or explode."
+        f"{silent} rollouts have a number that is not finite, and no flag."
+        if silent
+        else "Every rollout with a number that is not finite is flagged.",
+        f"`soundness` misses {missed} gradients that explode or are not finite."
+        if missed
+        else "`soundness` tells every gradient that explodes or is not finite.",
     ]
     for name in precisions:
         signs = against_c(found, name)
         why = [reason for one in outcome.scenes for reason in reasons(one, name).values()]
         unexplained = f" ({why.count(UNEXPLAINED) or 'none'} without a reason found)" if why else ""
         sentences.append(
-            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(signs > 0)} of the points{unexplained}, "
-            f"and of a better one at {_count(signs < 0)}."
+            f"In {name} {int((signs == 0).sum())} of {signs.size} motions are as good as C MuJoCo's, "
+            f"{_count(signs > 0)} worse{unexplained} and {_count(signs < 0)} better."
         )
     return " ".join(sentences)
 
@@ -66,7 +79,10 @@ def summary(outcome: Outcome) -> Table:
                 name,
                 _count(found.motion == Motion.UNSOLVED),
                 _count(found.untold),
-                *(_right(found[key], found.motion) for key in ("derivative", "derivative_by_parameters")),
+                *(
+                    "{} of {}".format(*_right(found[key], found.motion))
+                    for key in ("derivative", "derivative_by_parameters")
+                ),
                 _count(unflagged),
                 _count(unflagged & (found.derivative == Derivative.NON_FINITE)),
             ]
@@ -91,15 +107,10 @@ def findings(outcome: Outcome) -> list[str]:
     ratio = np.concatenate([load(one.scene, one.points) for one in singles])
     fails = np.concatenate([one.found.motion.sel(simulator="float64") for one in singles]) >= Motion.GAINS_ENERGY
     below = ratio < 1
-    exceptions = fails & below
-    sentence = (
-        f"Of {below.sum()} single bounces within the explicit limit {_count(exceptions)} "
-        f"{'gains' if exceptions.sum() == 1 else 'gain'} energy"
-    )
-    if exceptions.any():
+    sentence = f"Within the explicit limit {_count(fails & below)} of {below.sum()} single bounces gain energy"
+    if (fails & below).any():
         sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
-    spared = (~fails & ~below).sum()
-    return [f"{sentence}; of {(~below).sum()} beyond it " + (f"all but {spared} do." if spared else "all do.")]
+    return [f"{sentence}; beyond it {(fails & ~below).sum()} of {(~below).sum()} do."]
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -188,11 +199,11 @@ def _count(where) -> str:
     return str(int(where.sum()) or "none")
 
 
-def _right(kinds, motion) -> str:
-    """Give how many derivatives are right of those that can be judged, where the motion is fine."""
+def _right(kinds, motion) -> tuple[int, int]:
+    """Count the right derivatives, and those that can be judged, where the motion is fine."""
     judged = np.isin(kinds, (Derivative.RIGHT, Derivative.WRONG, Derivative.EXPLODES, Derivative.NON_FINITE))
     is_fine = (motion < Motion.GAINS_ENERGY).values
-    return f"{int(((kinds.values == Derivative.RIGHT) & is_fine).sum())} of {int((judged & is_fine).sum())}"
+    return int(((kinds.values == Derivative.RIGHT) & is_fine).sum()), int((judged & is_fine).sum())
 
 
 def _cells(values, kinds: type[Motion] | type[Derivative]) -> list[str]:

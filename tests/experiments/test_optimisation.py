@@ -126,7 +126,7 @@ def test_a_sweep_whose_runs_have_other_methods_leaves_cells_empty(tmp_path):
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder, cells in zip(folders, ({"first": "1", "second": "2"}, {"first": "3"}), strict=True):
         folder.mkdir()
-        (folder / "summary.json").write_text(json.dumps({"verdict": "yes", "headline": cells}))
+        (folder / "summary.json").write_text(json.dumps({"answer": "yes", "headline": cells}))
     page = overview(runs, folders)
     assert "<tr><td>a</td><td>1</td><td>2</td></tr><tr><td>b</td><td>3</td><td></td></tr>" in page
 
@@ -159,6 +159,19 @@ def test_a_method_is_worse_by_its_ranks_where_one_wild_seed_hides_it_from_the_me
     assert found.is_above
 
 
+def test_three_seeds_are_too_few_to_call_a_method_better():
+    """However far apart, two times three ranks fall so by chance in 2 of 20 orders: two-sided p is 0.1."""
+    few = [made_up("alpha_order", [1.0, 1.1, 0.9]), made_up("first_order", [500.0, 510.0, 490.0])]
+    found = outcome(*few).verdicts[0]
+    assert found.high < 0
+    assert found.p_value == pytest.approx(0.1)
+    assert not found.is_below
+    assert "3 seeds cannot tell α-order from first order" in verdict(outcome(*few))
+    assert "by the means alone" in verdict(outcome(made_up("alpha_order", [900.0, 901.0, 902.0]), few[1]))
+    many = [made_up("alpha_order", [1.0, 1.1, 0.9, 1.2]), made_up("first_order", [500.0, 510.0, 490.0, 480.0])]
+    assert "ends better than first order" in verdict(outcome(*many))
+
+
 def test_runs_that_differ_by_rounding_tie():
     costs = np.array([100.0, 200.0, 300.0, 400.0])
     shifted = made_up("alpha_order", np.full(4, 100.0) * (1 + 1e-12))
@@ -179,8 +192,7 @@ def test_alpha_order_is_compared_with_the_better_of_first_and_zeroth_order():
     alpha = made_up("alpha_order", [100.0, 101.0, 99.0])
     first, zeroth = made_up("first_order", [500.0, 510.0, 490.0]), made_up("zeroth_order", [100.5, 101.0, 99.5])
     found = outcome(first, zeroth, alpha)
-    assert "not worse than zeroth order, the better of first and zeroth order" in verdict(found)
-    assert "better than first order" in verdict(outcome(first, alpha))
+    assert "3 seeds cannot tell α-order from zeroth order, the better of first and zeroth order" in verdict(found)
 
 
 def test_the_rules_of_the_literature_are_not_taken_for_the_default():
