@@ -373,9 +373,8 @@ def _unseen(outcome: Outcome) -> str:
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    found: dict[str, Any] = {"problem": problem, "samples": samples}
-    found |= {} if outcome.by_stiffness is None else {"stiffness": stiffness}
-    return found | ({"missing": missing} if outcome.hits else {})
+    found: dict[str, Any] = {} if outcome.by_stiffness is None else {"stiffness": stiffness}
+    return found | {"samples": samples, "problem": problem} | ({"missing": missing} if outcome.hits else {})
 
 
 def stiffness_name(outcome: Outcome) -> str:
@@ -407,7 +406,7 @@ def problem(outcome: Outcome):
     shown = "" if settings.shown_stiffness is None else f" at stiffness {settings.shown_stiffness:g}"
     caption = (
         f"Left, the cost{shown}; right, the gradient that is to be estimated, and what first order converges to. Where the "
-        "two part, first order is biased. The dotted line marks the point of the estimates below."
+        "two part, first order is biased. The dotted line marks the point of the estimates."
     )
     return figure, "The cost and its gradient", caption
 

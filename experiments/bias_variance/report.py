@@ -211,7 +211,7 @@ def landscape(outcome: Outcome):
     figure.legend(handles, labels, loc="outside right upper", title=_titled(words.knob, words.per))
     caption = (
         f"Left, the cost by {words.place}: {words.shown}. Right, what noise makes of it, and what both estimates are to "
-        "differentiate. Dotted lines mark the places examined below."
+        "differentiate. Dotted lines mark the places where gradients are estimated."
     )
     return figure, f"The cost against the {words.place}", caption
 

@@ -45,7 +45,7 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say what diverged, and how far the pendulum's steps are its motion."""
     found = [
-        f"{capitalised(one.title)}: derivatives of {1 - one.finite:.1%} of the rollouts are not finite."
+        f"{capitalised(one.title)}: derivatives of {percent(1 - one.finite)} of the rollouts are not finite."
         for one in outcome.found.values()
         if one.finite < 1
     ]

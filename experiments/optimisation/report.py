@@ -10,7 +10,7 @@ from scipy.stats import mannwhitneyu
 from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
-from experiments.words import capitalised, quantity
+from experiments.words import capitalised, percent, quantity
 
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
@@ -61,7 +61,7 @@ def warnings(outcome: Outcome) -> list[str]:
         if run.num_skipped.any():
             parts.append(f"{run.num_skipped.sum()} steps were not taken, because the estimate was not finite")
         if run.finite_share < 1:
-            parts.append(f"{1 - run.finite_share:.2%} of the rollouts were not finite and were left out")
+            parts.append(f"{percent(1 - run.finite_share)} of the rollouts were not finite and were left out")
         if parts:
             sentences.append(f"{run.method.label}: {'; '.join(parts)}.")
     return sentences
@@ -322,8 +322,8 @@ def alpha(outcome: Outcome):
     right.grid(visible=False, axis="y")
     right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
     caption = (
-        "Left, the weight of the first-order part, the mean over seeds and over a fiftieth of the steps; where there are "
-        "several blocks, over these, too. Right, how often each reason settled it."
+        "Left, the weight of the first-order part: the mean over seeds and blocks of parameters, smoothed over a fiftieth of the "
+        "steps. Right, how often each reason settled it."
     )
     return figure, "The weight of the first-order part", caption
 

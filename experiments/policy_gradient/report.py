@@ -64,7 +64,7 @@ def findings(outcome: Outcome) -> list[str]:
         return []
     cell = max(gentle, key=_change)
     return [
-        f"Where contact sets in gently it changes the first-order mean by at most {_change(cell):.1%} of the "
+        f"Where contact sets in gently it changes the first-order mean by at most {percent(_change(cell))} of the "
         f"gradient ({cell.label})."
     ]
 
