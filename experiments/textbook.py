@@ -20,7 +20,7 @@ from experiments.config import ExperimentError, suggest
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
-from experiments.words import capitalised, joined, named, quantity
+from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
 from mjxgrad.diagnostics import Comparison, EmpiricalBias, Rollouts, compare, empirical_bias, first_order_samples
@@ -310,14 +310,15 @@ def _closest(outcome: Outcome) -> str:
     where = "" if shown is None else f" at {stiffness_name(outcome)} = {shown:g}"
     if few == many:
         return f"From {low} to {high} rollouts{where} the smallest error is that of {few}."
-    return f"With {low} rollouts{where} the smallest error is that of {few}, with {high} that of {many}."
+    return f"With {low} rollouts{where} the smallest error is that of {few}; with {high} that of {many}."
 
 
 def _best(table: xr.Dataset) -> str:
-    """Name the estimator of least error, with all whose intervals overlap its own."""
+    """Name the estimator of least error, and count those whose intervals overlap its own."""
     table = table.sortby("rmse")
     ties = table.estimator.values[table.rmse_low.values <= table.rmse_high.values[0]]
-    return joined(ties, "or") + (" (a tie)" if len(ties) > 1 else "")
+    others = "one other" if len(ties) == 2 else f"{len(ties) - 1} others"
+    return f"{ties[0]}, in a tie with {others}" if len(ties) > 1 else str(ties[0])
 
 
 def _bias(outcome: Outcome) -> str:

@@ -280,8 +280,8 @@ def curves(outcome: Outcome):
         axis.yaxis.set_minor_formatter(NullFormatter())
     settings = outcome.settings
     caption = (
-        f"Lines are medians over {settings.seeds} seeds, bands reach from the lowest to the highest. The axis is the cost "
-        "above the lowest that any run has met, so a line that ends low on the logarithmic scale is as good as the best; "
+        f"Lines are medians over {settings.seeds} seeds; bands, of α-order and of what ends lowest, reach from the lowest seed "
+        "to the highest. The axis is the cost above the lowest that any run has met, so a line that ends low on the logarithmic scale is as good as the best; "
         "below, what one would otherwise use, with α-order for comparison. Both columns are of the same runs; the seconds "
         "include the measurement of the noise-free cost, which is no rollout of the method."
     )
@@ -341,7 +341,9 @@ def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
     cost = np.maximum(np.where(np.isfinite(run.cost), run.cost, np.nan) - _lowest(outcome), _floor(outcome))
     seen = np.isfinite(cost).any(axis=0)
     x, cost = x[seen], cost[:, seen]
-    axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.13, lw=0)
+    # Bands of all methods would hide each other, and the lines with them.
+    if run is outcome.best or run.method.is_default_alpha:
+        axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.16, lw=0)
     # Ours is a broad line beneath the others, so that those it agrees with are seen on it.
     width, order = (3.4, 2.5) if run.method.is_default_alpha else (1.4, 3.0)
     axis.plot(x, np.nanmedian(cost, axis=0), color=colour, lw=width, label=run.method.label, zorder=order)

@@ -29,7 +29,15 @@ def test_a_number_has_the_digits_that_its_error_allows(value, error, text):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(250.0, "250"), (1000.0, "10³"), (2500.0, "2500"), (3e5, "3×10⁵"), (1e-3, "10⁻³"), (3.2e-4, "3.2×10⁻⁴")],
+    [
+        (250.0, "250"),
+        (1000.0, "10³"),
+        (2500.0, "2500"),
+        (3000.0, "3×10³"),
+        (3e5, "3×10⁵"),
+        (1e-3, "10⁻³"),
+        (3.2e-4, "3.2×10⁻⁴"),
+    ],
 )
 def test_a_power_of_ten_is_written_as_one(value, text):
     assert power(value) == text
