@@ -282,8 +282,9 @@ def curves(outcome: Outcome):
     caption = (
         f"Lines are medians over {settings.seeds} seeds; bands, of α-order and of what ends lowest, reach from the lowest seed "
         "to the highest. The axis is the cost above the lowest that any run has met, so a line that ends low on the "
-        "logarithmic scale is as good as the best; below, what one would otherwise use, with α-order for comparison. Both columns are of the same runs; the seconds "
-        "include the measurement of the noise-free cost, which is no rollout of the method."
+        "logarithmic scale is as good as the best; below, what one would otherwise use, with α-order for comparison. Both "
+        "columns are of the same runs; the seconds include the measurement of the noise-free cost, which is no rollout of the "
+        "method."
     )
     return figure, "Cost against rollouts and against time", caption
 

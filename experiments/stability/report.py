@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
@@ -230,7 +230,7 @@ _EXPLICIT = (
 
 # In the order of the items.
 _MOTIONS = ("#c9e3f4", "#9ccbe8", "#56b4e9", "#0072b2", "#f0c36d", "#cc79a7", "#d55e00", "#22262e")
-_DERIVATIVES = ("#56b4e9", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
+_DERIVATIVES = ("#66c2a5", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
 _NAMES = {
     "timestep": "time step, s",
     "time_constant": "time constant, s",
@@ -262,7 +262,10 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
         for j, (name, what) in enumerate(columns):
             axis = axes[i, j]
             values = one.points.plane(i, one.found[what].sel(simulator=name).values)
-            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES)
+            # What the eye is to find is where a column is another than the one that it stands beside.
+            model = C_MUJOCO if what == "motion" else precisions[0]
+            same = values == one.points.plane(i, one.found[what].sel(simulator=model).values) if name != model else None
+            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES, same)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
             if i == 0:
@@ -273,17 +276,19 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     _legend(figure, one)
     caption = (
         f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all "
-        f"that is not on an axis is MuJoCo's default. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within "
+        f"that is not on an axis is MuJoCo's default. Pale: motion as in C MuJoCo, a gradient as in "
+        f"{precisions[0]}. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within "
         f"{BOUNCE:g} of its restitution; energy is gained beyond {GAIN:.0%}. Gradients are judged by central differences in "
         "float64; where the motion diverges there is none."
     )
     return figure, one.scene.name.capitalize(), caption
 
 
-def _image(axis: Axes, values: np.ndarray, colours: Sequence[str]) -> None:
-    palette = ListedColormap(list(colours))
-    norm = BoundaryNorm(np.arange(len(colours) + 1) - 0.5, len(colours))
-    axis.imshow(values, cmap=palette, norm=norm, origin="lower", aspect="auto", interpolation="nearest")
+def _image(axis: Axes, values: np.ndarray, colours: Sequence[str], pale: np.ndarray | None) -> None:
+    squares = to_rgba_array(colours)[np.maximum(values, 0)]
+    if pale is not None:
+        squares[pale, 3] = 0.25
+    axis.imshow(squares, origin="lower", aspect="auto", interpolation="nearest")
     axis.grid(visible=False)
 
 
