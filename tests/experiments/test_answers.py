@@ -208,8 +208,11 @@ def pushed(*points):
 
 
 def teeth(smaller):
-    found = xr.Dataset({"smaller": ("time", [smaller]), "has_impact": ("time", [True])})
-    return SimpleNamespace(courses=[found])
+    """Two readings with an impact before them; at the first the mean derivative is the slope."""
+    found = xr.Dataset(
+        {"smaller": ("time", [smaller] * 2), "has_impact": ("time", [True] * 2)}, {"arm": ["continuous onset"]}
+    )
+    return SimpleNamespace(courses=[found.assign(within=(("arm", "time"), [[True, False]]))])
 
 
 SEES = {"first order": True, "zeroth order": False, "α-order": False}
@@ -344,7 +347,7 @@ CASES = [
         "It cuts the points with a biased gradient from 1 to 0 of 1.",
     ),
     ("policy_gradient", pushed((False, 0.0, 0.0)), "First order is right with and without it, at all 1 points."),
-    ("sawtooth", teeth(23.0), "When contacts begin within the step, the sawtooth is 23 times smaller."),
+    ("sawtooth", teeth(23.0), "With an onset the sawtooth is 23 times smaller, its mean derivative right at 50%."),
 ]
 
 
