@@ -79,7 +79,7 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
     return _document(f"{name}: {question}", "\n".join(part for part in body if part))
 
 
-def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
+def overview(runs: Sequence[Run], folders: Sequence[Path], answer: str) -> str:
     """Write the page over a sweep: each combination, its main numbers, its answer and the way to its report."""
     name, keys = runs[0].name, list(runs[0].varied)
     summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
@@ -94,7 +94,7 @@ def overview(runs: Sequence[Run], folders: Sequence[Path]) -> str:
     return _document(
         f"{name}, {len(runs)} runs",
         f'<header><p class="kicker">{_text(name)}, swept over {_text(", ".join(keys))}</p>'
-        f"<h1>{_text(runs[0].question)}</h1></header>"
+        f'<h1>{_text(runs[0].question)}</h1></header><p class="answer">{_prose(answer)}</p>'
         f"{_grid([*keys, 'answer', ''], map(_cells, answers))}"
         f"{_grid([*keys, *headings], map(_cells, numbers)) if headings else ''}",
     )

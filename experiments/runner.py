@@ -49,8 +49,9 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
         _run_one(run, folder, command, force)
     if is_sweep:
         with writing(top):
-            write_text(top / "report.html", overview(runs, folders))
-            write_text(top / "summary.json", _of_sweep(runs[0], folders))
+            summary = _of_sweep(runs[0], folders)
+            write_text(top / "report.html", overview(runs, folders, summary["answer"]))
+            write_text(top / "summary.json", json.dumps(summary, indent=2) + "\n")
         print(f"sweep of {len(runs)}: {top / 'report.html'}")
     return top / "report.html"
 
@@ -107,15 +108,14 @@ def write_gallery(output: Path) -> Path:
     return output / "index.html"
 
 
-def _of_sweep(run: Run, folders: list[Path]) -> str:
+def _of_sweep(run: Run, folders: list[Path]) -> dict[str, Any]:
     """Sum up a sweep as one run is, by its first combination's pictures."""
     summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
-    answers = dict.fromkeys(summary["answer"] for summary in summaries)
-    told = next(iter(answers)) if len(answers) == 1 else f"{len(answers)} answers in {len(folders)} runs."
-    first = {
-        key: value and f"{folders[0].name}/{value}" for key, value in summaries[0].items() if key in ("figure", "video")
-    }
-    return json.dumps({"name": run.name, "question": run.question, "answer": told, **first}, indent=2) + "\n"
+    answers = list(dict.fromkeys(summary["answer"] for summary in summaries))
+    together = getattr(part(run.settings.experiment, "report"), "together", lambda _: None)(summaries)
+    told = together or (answers[0] if len(answers) == 1 else f"{len(answers)} answers in {len(folders)} runs.")
+    pictures = {name: (one := summaries[0][name]) and f"{folders[0].name}/{one}" for name in ("figure", "video")}
+    return {"name": run.name, "question": run.question, "answer": told, **pictures}
 
 
 def _can_draw() -> bool:

@@ -1,6 +1,7 @@
 """The answer of an optimisation experiment, computed from its numbers, and its pictures."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +13,8 @@ from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.words import capitalised, percent, quantity
 
+# A column in the page over a sweep.
+_AGAINST = "α-order against the better"
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
 
@@ -117,8 +120,18 @@ def headline(outcome: Outcome) -> dict[str, str]:
     }
     for difference in outcome.verdicts:
         kind = "worse" if difference.is_above else "better" if difference.is_below else "cannot be told"
-        cells["α-order against the better"] = f"{kind}: {_signed(difference)}"
+        cells[_AGAINST] = f"{kind}: {_signed(difference)}"
     return cells
+
+
+def together(summaries: Sequence[dict[str, Any]]) -> str | None:
+    """Say of a sweep how often α-order ends worse and better than the better of first and zeroth order."""
+    kinds = [summary["headline"].get(_AGAINST, "").partition(":")[0] for summary in summaries]
+    if "" in kinds:
+        return None
+    worse, better = kinds.count("worse"), kinds.count("better")
+    start = f"Worse on {worse} of {len(kinds)}" if worse else f"Never in {len(kinds)}"
+    return f"{start}; better on {better}; seeds cannot tell on {len(kinds) - worse - better}."
 
 
 def _comparison(difference: Difference) -> str:

@@ -13,7 +13,7 @@ from scipy import stats
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.optimisation.measure import Difference, Outcome, Run, problem
-from experiments.optimisation.report import drawings, findings, headline, tables, verdict, warnings
+from experiments.optimisation.report import drawings, findings, headline, tables, together, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.report import overview
 from experiments.theme import save
@@ -127,8 +127,18 @@ def test_a_sweep_whose_runs_have_other_methods_leaves_cells_empty(tmp_path):
     for folder, cells in zip(folders, ({"first": "1", "second": "2"}, {"first": "3"}), strict=True):
         folder.mkdir()
         (folder / "summary.json").write_text(json.dumps({"answer": "yes", "headline": cells}))
-    page = overview(runs, folders)
+    page = overview(runs, folders, "Both.")
     assert "<tr><td>a</td><td>1</td><td>2</td></tr><tr><td>b</td><td>3</td><td></td></tr>" in page
+
+
+def test_a_sweep_over_tasks_is_answered_by_how_often_alpha_order_ends_worse():
+    def summary(kind):
+        return {"headline": {"α-order against the better": f"{kind}: +1"}}
+
+    kinds = ("worse", "better", "cannot be told")
+    assert together([summary(kind) for kind in kinds]) == "Worse on 1 of 3; better on 1; seeds cannot tell on 1."
+    assert together([summary("better")] * 2) == "Never in 2; better on 2; seeds cannot tell on 0."
+    assert together([summary("better"), {"headline": {}}]) is None
 
 
 def test_the_interval_of_a_difference_is_that_of_welch():
