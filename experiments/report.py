@@ -162,7 +162,7 @@ def _video(report: Report, folder: Path) -> str:
         return f'<p class="missing"><b>No video.</b> {_prose(report.video_caption)}</p>' if report.video_caption else ""
     source = _data_uri(folder / report.video, "video/mp4")
     return (
-        f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
+        f'<figure><div class="scroll"><video controls loop muted autoplay playsinline src="{source}"></video></div>'
         f"<figcaption><b>Video.</b> {_prose(report.video_caption)}</figcaption></figure>"
     )
 

@@ -65,13 +65,22 @@ def answer(outcome: Outcome) -> str:
     swept, words = outcome.swept, _words(outcome)
     is_off = (swept.zeroth_order_high < swept.reference_low) | (swept.zeroth_order_low > swept.reference_high)
     zeroth = "throughout" if not is_off.any() else f"at {int((~is_off).sum())} of {is_off.size} points"
-    biased = swept.is_biased.any("angle").values
-    if not biased.any():
+    biased, is_blind = _bias_seen(swept)
+    is_wrong = (biased | is_blind).values
+    if not is_wrong.any():
         return f"Zeroth order is right {zeroth}; first order shows no bias either."
-    if biased[0]:
+    if is_wrong[0]:
         return f"Zeroth order is right {zeroth}; first order at no {words.knob}."
-    last = swept.stiffness.values[biased.argmax() - 1]
+    last = swept.stiffness.values[is_wrong.argmax() - 1]
     return f"Zeroth order is right {zeroth}; first order only up to {words.limit} {power(last)}{words.per}."
+
+
+def _bias_seen(swept: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """Say at which stiffness first order is biased somewhere, and at which it is too noisy to tell."""
+    biased = swept.is_biased.any("angle")
+    # No bias seen is no bias only where one of half the gradient's own size would have been seen.
+    half_width = (swept.bias_high - swept.bias_low) / 2
+    return biased, (half_width > abs(swept.reference).max("stiffness") / 2).any("angle") & ~biased
 
 
 def verdict(outcome: Outcome) -> str:
@@ -152,13 +161,10 @@ def _range(stiffness: xr.DataArray, rows: ArrayLike, words: Words) -> str:
 
 def _bias(outcome: Outcome) -> str:
     swept, words = outcome.swept, _words(outcome)
-    biased = swept.is_biased.any("angle")
+    biased, is_blind = _bias_seen(swept)
     if not biased.any():
         return f"No bias of the first-order estimate is seen in the sweep ({outcome.settings.confidence:.0%} over all cases)."
     parts = [f"The first-order estimate is measurably biased {_range(swept.stiffness, biased, words)}"]
-    # No bias seen is no bias only where one of half the gradient's own size would have been seen.
-    half_width = (swept.bias_high - swept.bias_low) / 2
-    is_blind = (half_width > abs(swept.reference).max("stiffness") / 2).any("angle") & ~biased
     if is_blind.any():
         parts.append(f"{_range(swept.stiffness, is_blind, words)} it is too noisy to tell")
     if (is_clean := ~biased & ~is_blind).any():

@@ -19,8 +19,8 @@ def say(kind, outcome):
     return part(kind, "report").answer(outcome)
 
 
-def throws(task, biased, zeroth=0.0):
-    """First order is biased from a stiffness on; zeroth order is off by some half widths of its interval at the first."""
+def throws(task, biased, zeroth=0.0, noisy=0):
+    """First order is biased, or too noisy, at some stiffnesses; zeroth order is off by some half widths at the first."""
     stiffness, zero = [10.0, 100.0, 1e4], np.zeros((3, 2))
     off = zero.copy()
     off[0, 0] = zeroth
@@ -29,6 +29,7 @@ def throws(task, biased, zeroth=0.0):
         "reference_low": zero - 1,
         "reference_high": zero + 1,
     }
+    cells |= {"reference": zero + 1, "bias_low": zero - 0.1, "bias_high": zero + 0.1 + np.array([[0], [noisy], [0]])}
     cells |= {"zeroth_order_low": off - 1, "zeroth_order_high": off + 1}
     swept = xr.Dataset(
         {name: (("stiffness", "angle"), value) for name, value in cells.items()}, {"stiffness": stiffness}
@@ -221,6 +222,11 @@ CASES = [
         "bias_variance",
         throws("ball_wall", [0, 0, 1]),
         "Zeroth order is right throughout; first order only up to stiffness 100 1/s².",
+    ),
+    (
+        "bias_variance",
+        throws("ball_wall", [0, 0, 1], noisy=3),
+        "Zeroth order is right throughout; first order only up to stiffness 10 1/s².",
     ),
     (
         "bias_variance",
