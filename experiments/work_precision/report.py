@@ -92,8 +92,8 @@ def answer(outcome: Outcome) -> str:
     )
     if not best:
         return f"No setting is known to reach {percent(target)} of the motion."
-    costs = sorted(1e3 * one.cost for one in best)
-    span = f"{costs[0]:.2g} to {costs[-1]:.2g}" if len(costs) > 1 else f"{costs[0]:.2g}"
+    costs = sorted(one.cost for one in best)
+    span = " to ".join(dict.fromkeys(map(_milliseconds, (costs[0], costs[-1]))))
     motion = f"{percent(target)} error: {span} ms a simulated second"
     return f"{motion}; gradients soonest by {ways.most_common(1)[0][0]}." if ways else f"{motion}."
 

@@ -6,13 +6,14 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from experiments.report import Figure, Report, Table, gallery, page
+from experiments.report import Figure, Report, Table, gallery, overview, page
 from mjxgrad.render import write_video
 
 BROWSER = os.environ.get("CHROME_BIN") or next(
@@ -28,10 +29,10 @@ PROBE = """\
  content="default-src 'none'; img-src data: file:; media-src data: file:; style-src 'unsafe-inline'; script-src 'nonce-probe'">
 <script nonce="probe">
 addEventListener("load", () => {
-  const wide = () => document.querySelector("img").getBoundingClientRect().width;
+  const zoom = document.querySelector(".zoom img");
+  const wide = () => zoom.getBoundingClientRect().width;
   const loaded = [...document.images].every(one => one.naturalWidth > 0);
   const found = {width: innerWidth, beyond: document.documentElement.scrollWidth - innerWidth, loaded};
-  const zoom = document.querySelector(".zoom img");
   if (zoom) {
     zoom.click();
     found.full = wide();
@@ -102,6 +103,18 @@ def test_a_click_shows_a_figure_at_full_size_and_another_brings_it_back(report, 
     # One point of the picture to one of the screen; before, no wider than the window.
     assert found["full"] >= PICTURE
     assert found["again"] < 900
+
+
+def test_the_page_over_a_sweep_fits_a_telephone_however_many_methods_it_compares(tmp_path):
+    runs = []
+    for task in ("push_soft", "push_stiff"):
+        runs.append(SimpleNamespace(name="many", question="Which?", varied={"task": task}))
+        (tmp_path / task).mkdir()
+        cells = {f"method {i}": "1234 ± 12" for i in range(20)}
+        (tmp_path / task / "summary.json").write_text(json.dumps({"answer": "First order.", "headline": cells}))
+    found, complaints = opened(overview(runs, [tmp_path / run.varied["task"] for run in runs], "Both."), tmp_path)
+    assert not complaints
+    assert found["beyond"] <= 0
 
 
 def test_a_gallery_fits_a_telephone_with_its_pictures(report, tmp_path):
