@@ -129,8 +129,9 @@ def _text(text: object) -> str:
 
 
 def _prose(text: str) -> str:
-    """Write a sentence, with what stands between backticks as code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", _text(text))
+    """Write a sentence, with what stands between backticks as code; no line ends within a name."""
+    whole = _text(text).replace("α-order", '<span class="whole">α-order</span>')
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", whole)
 
 
 def _data_uri(path: Path, media_type: str) -> str:
