@@ -308,7 +308,8 @@ def answer(outcome: Outcome) -> str:
 
 
 def _price(course: Course) -> str:
-    first, contact = fastest(course), capitalised(f"{course.contact} contact")
+    first = fastest(course)
+    contact = {"published": "Continuous force", "default": "MuJoCo's default"}[course.contact]
     if first is None:
         return f"{contact}: none within {TARGET:.0%}"
     return f"{contact}: {first.seconds:.2g} s, {_SHORT[first.method]}"

@@ -281,7 +281,7 @@ CASES = [
     (
         "cube_toss",
         toss(published=0.052, default=-1.0),
-        "Published contact: 0.052 s, event gradient; Default contact: none within 2%.",
+        "Continuous force: 0.052 s, event gradient; MuJoCo's default: none within 2%.",
     ),
     (
         "bounce",
