@@ -35,9 +35,9 @@ def answer(outcome: Outcome) -> str:
     found, precision = outcome.found, outcome.settings.precisions[0]
     ours, theirs = (_held(found.motion.sel(simulator=name)) for name in (precision, C_MUJOCO))
     right, judged = _right(found.derivative.sel(simulator=precision), found.motion.sel(simulator=precision))
-    gradient = f", gradients at {percent(right / judged)}" if judged else ""
+    gradient = f", gradients there at {percent(right / judged)}" if judged else ""
     unflagged = int((found.silent | found.missed).sum())
-    flags = f"{unflagged} failures carry no flag" if unflagged else "every failure is flagged"
+    flags = f"{unflagged} failures are unflagged" if unflagged else "every failure is flagged"
     return f"Motion holds at {ours} (C MuJoCo: {theirs}){gradient}; {flags}."
 
 
@@ -230,7 +230,7 @@ _EXPLICIT = (
 
 # In the order of the items.
 _MOTIONS = ("#c9e3f4", "#9ccbe8", "#56b4e9", "#0072b2", "#f0c36d", "#cc79a7", "#d55e00", "#22262e")
-_DERIVATIVES = ("#66c2a5", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
+_DERIVATIVES = ("#66c2a5", "#e8eaed", "#a6341b", "#8c6d31", "#7f3c8d", "#22262e")
 _NAMES = {
     "timestep": "time step, s",
     "time_constant": "time constant, s",

@@ -314,12 +314,12 @@ CASES = [
     (
         "stability",
         stable([0, 2, 4], [0, 4, 4], [0, 2, 5]),
-        "Motion holds at 67% (C MuJoCo: 33%), gradients at 50%; every failure is flagged.",
+        "Motion holds at 67% (C MuJoCo: 33%), gradients there at 50%; every failure is flagged.",
     ),
     (
         "stability",
         stable([0, 2, 4], [0, 4, 4], [0, 0, 0], silent=2),
-        "Motion holds at 67% (C MuJoCo: 33%), gradients at 100%; 2 failures carry no flag.",
+        "Motion holds at 67% (C MuJoCo: 33%), gradients there at 100%; 2 failures are unflagged.",
     ),
     (
         "learning",
