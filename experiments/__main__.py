@@ -1,4 +1,4 @@
-"""The command line: `python -m experiments run FILE.toml [key=value ...]` and `python -m experiments list`."""
+"""The command line: `python -m experiments run FILE.toml [key=value ...]`, `list` and `gallery`."""
 
 import argparse
 import signal
@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from experiments.config import FOLDER, ExperimentError, read_header
-from experiments.runner import run_file
+from experiments.runner import run_file, write_gallery
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -18,6 +18,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.command == "list":
             return _list()
+        if options.command == "gallery":
+            write_gallery(options.output)
+            return 0
         run_file(options.file, options.overrides, output=options.output, force=options.force)
     except KeyboardInterrupt:
         print("\ninterrupted; earlier results are as they were", file=sys.stderr)
@@ -47,9 +50,12 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     run.add_argument("--force", action="store_true", help="run even if nothing has changed")
     run.add_argument("--debug", action="store_true", help="show tracebacks")
     commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
+    gallery = commands.add_parser("gallery", help="write one page over all results, index.html")
+    gallery.add_argument("--output", type=Path, default=Path("runs"), help="folder of results (default: runs)")
+    gallery.set_defaults(debug=False)
     options, rest = parser.parse_known_args(arguments)
     # argparse takes overrides on one side of an option only; those on its other side are left over.
-    if options.command == "list" or any(item.startswith("-") for item in rest):
+    if options.command != "run" or any(item.startswith("-") for item in rest):
         if rest:
             parser.error(f"unrecognised arguments: {' '.join(rest)}")
     else:

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from scipy.optimize import minimize
 
 import mjxgrad as mg
-from experiments.report import Table
+from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film, shown_speed
@@ -234,10 +234,16 @@ def _objective(
 
 
 def answer(outcome: Outcome) -> str:
-    """Count what finds the stroke from balls that do not touch."""
+    """Name what finds the stroke from balls that do not touch, or what alone does not."""
     apart = [run for run in outcome.runs if not run.touches_at_start]
-    solved = sum(run.is_solved for run in apart)
-    return f"{solved} of {len(apart)} methods find the stroke when the balls do not touch."
+    if not apart:
+        return "Not answered: the balls touch at every start."
+    solved, failed = ([f"“{run.method.label}”" for run in apart if run.is_solved is found] for found in (True, False))
+    count = f"{len(solved)} of {len(apart)} ways find it"
+    if not failed or not solved:
+        return f"{count}."
+    short = f"{count}, but not {joined(failed, 'or')}." if len(failed) < len(solved) else f"{count}: {joined(solved)}."
+    return short if len(short.split()) <= MOST_WORDS else f"{count}."
 
 
 def verdict(outcome: Outcome) -> str:

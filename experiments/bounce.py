@@ -20,7 +20,7 @@ from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT, at_time_step, 
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
-from experiments.words import joined
+from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
@@ -221,8 +221,11 @@ _ORDER = (CONTINUOUS, EVENT, DISCRETE)
 def answer(outcome: Outcome) -> str:
     """Say how often the derivative is the slope, without and with the event."""
     fine = outcome.grid.isel(timestep=outcome.grid.timestep.values <= _FINE)
+    judged = int(fine.judged.sum())
+    if not judged:
+        return "At no contact is the slope known well enough: take more phases."
     shares = [f"{int(fine.holds.sel(arm=arm).sum())} ({arm})" for arm in _ORDER]
-    return f"Right at {joined(shares)} of {int(fine.judged.sum())} contacts and time steps."
+    return f"Right at {joined(shares)} of {judged} settings."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -263,12 +266,12 @@ def findings(outcome: Outcome) -> list[str]:
     if gentle.notnull().any():
         sentences.append(
             "Where contact sets in gently there is nothing to correct, and both gradients differ by "
-            f"{float(gentle.median()):.1%} of the slope in the median and {float(gentle.max()):.1%} at most."
+            f"{percent(float(gentle.median()))} of the slope in the median and {percent(float(gentle.max()))} at most."
         )
     wide = (abs(grid.wide - grid.slope.sel(arm=DISCRETE)) / slope).where(grid.judged)
     sentences.append(
-        f"Finite differences over one step's flight, two rollouts per parameter, are off by {float(wide.median()):.1%} of the "
-        f"slope in the median and {float(wide.max()):.0%} at most."
+        f"Finite differences over one step's flight, two rollouts per parameter, are off by {percent(float(wide.median()))} "
+        f"of the slope in the median and {percent(float(wide.max()))} at most."
     )
     if grid.closed_form.notnull().any():
         finest = grid.isel(timestep=0)
@@ -276,7 +279,8 @@ def findings(outcome: Outcome) -> list[str]:
         sentences.append(
             f"Quadrature and closed form agree to {float(abs(grid.truth - grid.closed_form).max()):.0e} where there is one. At "
             f"{1e3 * float(finest.timestep):g} ms the slope of the simulated height is within "
-            f"{float(off.sel(arm=DISCRETE)):.1%} of the truth, with an onset within {float(off.sel(arm=CONTINUOUS)):.1%}."
+            f"{percent(float(off.sel(arm=DISCRETE)))} of the truth, with an onset within "
+            f"{percent(float(off.sel(arm=CONTINUOUS)))}."
         )
     return sentences
 

@@ -91,6 +91,14 @@ METHODS = {
     "adaptive": "adaptive, differentiated",
     "quotient": "adaptive, difference quotient",
 }
+_SHORT = {
+    "discrete": "plain step",
+    "event": "event gradient",
+    "continuous": "continuous onset",
+    "substeps": "event substeps",
+    "adaptive": "adaptive steps",
+    "quotient": "difference quotient",
+}
 CONTACTS = {"published": "contact whose force begins continuously", "default": "MuJoCo's default contact"}
 
 
@@ -174,7 +182,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("derivatives", "points", len(settings.contacts) * (1 + len(jobs))) as advance_to:
         for contact in settings.contacts:
             task = cube_toss(contact)
-            workspace.check(task.scene)
+            workspace.check(task.scene, name=f"cube, {contact} contact")
             reference, _, failed = _taken(_DERIVATIVES["quotient"], task, jnp.asarray(_TOLERANCE))
             if bool(np.any(failed)):
                 raise ExperimentError(f"the reference with {contact} contact needs more steps than it may take")
@@ -293,6 +301,19 @@ def fastest(course: Course) -> Point | None:
                 break
             found.append(point)
     return min(found, key=lambda one: one.seconds, default=None)
+
+
+def answer(outcome: Outcome) -> str:
+    """Give the price of the cheapest right derivative by contact, and its way."""
+    return "; ".join(_price(course) for course in outcome.courses) + "."
+
+
+def _price(course: Course) -> str:
+    first = fastest(course)
+    contact = {"published": "Continuous force", "default": "MuJoCo's default"}[course.contact]
+    if first is None:
+        return f"{contact}: none within {TARGET:.0%}"
+    return f"{contact}: {first.seconds:.2g} s, {_SHORT[first.method]}"
 
 
 def verdict(outcome: Outcome) -> str:

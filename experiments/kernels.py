@@ -242,6 +242,14 @@ def _linear(
 _FAR = 4.0
 
 
+def answer(outcome: Outcome) -> str:
+    """Name the noise, and count where sampling agrees with the solver's average."""
+    noisy = [NAMES[name] for name, found in outcome.noise.items() if found.is_noise and found.stddev > 0]
+    close = outcome.linear.deviation.sel(way="zeroth order") <= _FAR
+    share = f"all {close.size}" if close.all() else f"{int(close.sum())} of {close.size}"
+    return f"{capitalised(joined(noisy or ['no']))} noise; sampling agrees in {share} derivatives."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say which profiles are noise, and whether the smoothed solver is the mean over it."""
     noisy = [NAMES[name] for name, found in outcome.noise.items() if found.is_noise and found.stddev > 0]

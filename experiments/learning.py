@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
+from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
@@ -18,7 +19,7 @@ from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
-from experiments.words import capitalised, joined, quantity
+from experiments.words import capitalised, joined, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
@@ -152,6 +153,14 @@ class Outcome:
         """The course whose policies are best in C MuJoCo, among those with contact as it comes if there are any."""
         plain = [course for course in self.courses if course.stiffness == self.settings.stiffness[0]]
         return max(plain, key=lambda course: course.judged.mean())
+
+    @property
+    def runner_up(self) -> tuple[Course, float]:
+        """The next best after the best, itself if there is no other, and the p-value of the rank test between the two."""
+        best = self.best
+        others = [one for one in self.courses if one.stiffness == best.stiffness and one is not best]
+        second = max(others, key=lambda course: course.judged.mean(), default=best)
+        return second, float(mannwhitneyu(best.judged, second.judged).pvalue)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -296,8 +305,20 @@ def _smooth(values: Float[np.ndarray, "updates seeds"]) -> Float[np.ndarray, "up
 
 
 def answer(outcome: Outcome) -> str:
-    """Name the gradient whose policy is worth most."""
-    return f"The highest return in C MuJoCo is that of {NAMES[outcome.best.method]}: {quantity(outcome.best.judged.mean())}."
+    """Name the gradient whose policies are worth most, or say that the seeds cannot tell; or what stiff contact leaves."""
+    soft, stiff = outcome.settings.stiffness[0], outcome.settings.stiffness[-1]
+    if soft != stiff:
+        worth = {(course.method, course.stiffness): course.judged.mean() for course in outcome.courses}
+        methods = outcome.settings.methods
+        kept = [NAMES[method] for method in methods if worth[method, stiff] >= worth[method, soft] / 2]
+        earn = "still earn" + "s" * (len(kept) == 1)
+        return f"With contact {stiff:g} times as stiff, {named(kept, len(methods), words=5)} {earn} half."
+    best = outcome.best
+    second, p_value = outcome.runner_up
+    if p_value <= 0.05 or second is best:
+        return f"The highest return in C MuJoCo is that of {NAMES[best.method]}: {quantity(best.judged.mean())}."
+    count = "One seed" if best.judged.size == 1 else f"{best.judged.size} seeds"
+    return f"{count} cannot tell {NAMES[best.method]} from {NAMES[second.method]}."
 
 
 def verdict(outcome: Outcome) -> str:

@@ -213,6 +213,17 @@ def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, se
     return task.with_smoothing(None if mode is None else Smoothing(scale * variant["length"], settings.kernel, mode))
 
 
+def answer(outcome: Outcome) -> str:
+    """Name the way that finds the bed with the fewest rollouts, and count the others."""
+    found = [one for one in outcome.descents if outcome.is_solved(one)]
+    if not found:
+        return f"None of {len(outcome.descents)} ways finds it."
+    least = outcome.settings.solved_below
+    soonest = min(found, key=lambda one: (one.steps_to(least) or 0) * one.num_samples)
+    plain = "too" if any(one.label == "first order" for one in found) else "does not"
+    return f"Soonest by “{soonest.label}”; {len(found)} of {len(outcome.descents)} ways find it, first order {plain}."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say what plain first order did, and what solved the task."""
     settings = outcome.settings

@@ -11,14 +11,18 @@ import subprocess
 import sys
 import time
 import zlib
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.config import Run, flatten, load_runs, part
+from pydantic import BaseModel
+
+from experiments.config import ExperimentError, Run, flatten, load_runs, part
 from experiments.output import building, keeping, recover, write_csv, write_text, write_toml, writing
 from experiments.parallel import num_cores
-from experiments.report import Report, overview, page
+from experiments.report import Report, gallery, overview, page
+from experiments.words import joined, merged
 from experiments.workspace import CompileClock, Workspace
 
 ROOT = Path(__file__).parent.parent
@@ -44,7 +48,9 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
         _run_one(run, folder, command, force)
     if is_sweep:
         with writing(top):
-            write_text(top / "report.html", overview(runs, folders))
+            summary = _of_sweep(runs[0], folders)
+            write_text(top / "report.html", overview(runs, folders, summary["answer"]))
+            write_text(top / "summary.json", json.dumps(summary, indent=2) + "\n")
         print(f"sweep of {len(runs)}: {top / 'report.html'}")
     return top / "report.html"
 
@@ -84,9 +90,34 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
         }
         with writing(folder):
             _write(run, report, partial, facts)
-    print(f"{report.verdict}\n{folder / 'report.html'}")
+    print(f"{report.answer}\n{report.verdict}\n{folder / 'report.html'}")
     if facts["lacks_video"]:
         print(f"no video: {report.video_caption}", file=sys.stderr)
+
+
+def write_gallery(output: Path) -> Path:
+    """Write the page over all results in a folder of runs; an `ExperimentError` if there are none."""
+    found = {path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in output.glob("*/summary.json")}
+    # Results of an earlier version have no question.
+    shown = {name: summary for name, summary in sorted(found.items()) if "question" in summary}
+    if not shown:
+        raise ExperimentError(f"there are no results in {output}: make demo leaves one; --output names another folder")
+    with writing(output):
+        write_text(output / "index.html", gallery(shown))
+    for name in sorted(set(found) - set(shown)):
+        print(f"left out: {output / name}, made by an earlier version; run it again", file=sys.stderr)
+    print(output / "index.html")
+    return output / "index.html"
+
+
+def _of_sweep(run: Run, folders: list[Path]) -> dict[str, Any]:
+    """Sum up a sweep as one run is, by its first combination's pictures."""
+    summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
+    answers = list(dict.fromkeys(summary["answer"] for summary in summaries))
+    together = getattr(part(run.settings.experiment, "report"), "together", lambda _: None)(summaries)
+    told = together or (answers[0] if len(answers) == 1 else f"{len(answers)} answers in {len(folders)} runs.")
+    pictures = {name: (one := summaries[0][name]) and f"{folders[0].name}/{one}" for name in ("figure", "video")}
+    return {"name": run.name, "question": run.question, "answer": told, **pictures}
 
 
 def _can_draw() -> bool:
@@ -102,6 +133,11 @@ def _call(run: Run, workspace: Workspace) -> Report:
         from experiments.theme import save
 
         measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
+        # Before anything is measured.
+        if missing := [name for name in ("answer", "verdict", "tables") if not callable(getattr(words, name, None))]:
+            raise ExperimentError(
+                f"experiment {run.settings.experiment} lacks {joined(missing)}: see experiments/README.md"
+            )
         outcome = measure.measure(run.settings, workspace)
         # A kind of one file may have imported a module of such a name.
         said: dict[str, Any] = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
@@ -110,8 +146,7 @@ def _call(run: Run, workspace: Workspace) -> Report:
         figures = save(pictures.drawings(outcome), outcome, workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
     # A scene warns of some of it when it is loaded.
-    sentences = dict.fromkeys([*report.warnings, *workspace.told, *workspace.warnings])
-    return Report(**{**vars(report), "warnings": list(sentences)})
+    return replace(report, warnings=merged([*report.warnings, *workspace.told, *workspace.warnings]))
 
 
 def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> None:
@@ -119,9 +154,17 @@ def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> Non
     write_toml(folder / "config.toml", run.settings.model_dump(mode="json"), header)
     write_csv(folder / "metrics.csv", report.metrics)
     (folder / "environment.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    summary = json.dumps({"answer": report.answer, "verdict": report.verdict, "headline": report.headline}, indent=2)
-    write_text(folder / "summary.json", summary + "\n")
     name = " · ".join([run.name, *(f"{key} = {value}" for key, value in run.varied.items())])
+    summary = {
+        "name": name,
+        "question": run.question,
+        "answer": report.answer,
+        "verdict": report.verdict,
+        "headline": report.headline,
+        "figure": report.figures[0].file if report.figures else None,
+        "video": report.video,
+    }
+    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     text = page(report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts))
     (folder / "report.html").write_text(text, encoding="utf-8")
 
@@ -130,7 +173,7 @@ def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
     commit = (facts["commit"] or "no repository")[:12] + (" with uncommitted changes" if facts["dirty"] else "")
     device = facts["device"]
     return {
-        "Settings": {key: _listed(value) for key, value in flatten(run.settings.model_dump(mode="json")).items()},
+        "Settings": _shown(run.settings),
         "Time": {name: f"{seconds:.1f} s" for name, seconds in facts["seconds"].items()},
         "Made with": {
             "command": facts["command"],
@@ -142,14 +185,30 @@ def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
+def _shown(settings: BaseModel) -> dict[str, Any]:
+    """Give settings by dotted key; of several tables each is a line."""
+    dumped, shown = settings.model_dump(mode="json"), {}
+    for key, value in settings:
+        if isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
+            shown[key] = [_line(one) for one in value]
+        else:
+            shown |= {name: _listed(one) for name, one in flatten({key: dumped[key]}).items()}
+    return shown
+
+
+def _line(table: BaseModel) -> str:
+    """Write a table in a line: its name in the report, and what is not as it comes."""
+    given = table.model_dump(mode="json", exclude_defaults=True)
+    label = getattr(table, "label", None)
+    rest = ", ".join(
+        f"{key} = {_listed(one)}" for key, one in given.items() if not label or key not in ("name", "label")
+    )
+    return ": ".join(filter(None, [label, rest]))
+
+
 def _listed(value: Any) -> str:
-    return ", ".join(map(_short, value)) if isinstance(value, list) else _short(value)
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_short(one)}" for key, one in value.items() if one is not None) + "}"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+    values = value if isinstance(value, list) else [value]
+    return ", ".join(f"{one:.10g}" if isinstance(one, float) else str(one) for one in values)
 
 
 def _previous(folder: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT, Read, at_time_
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
-from experiments.words import joined
+from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
@@ -299,11 +299,14 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
 
 
 def answer(outcome: Outcome) -> str:
-    """Say how much smaller the teeth are."""
+    """Say how much smaller the teeth are, and how often the mean derivative is then the slope."""
     smaller = _pooled(outcome, "smaller")
     if not smaller.size:
         return "Nothing touches in these motions: there are no teeth."
-    return f"When contacts begin within the step, the sawtooth is {np.median(smaller):.0f} times smaller."
+    right = percent(_pooled(outcome, "within", CONTINUOUS).mean())
+    return (
+        f"With an onset the sawtooth is {np.median(smaller):.0f} times smaller, its mean derivative right at {right}."
+    )
 
 
 def verdict(outcome: Outcome) -> str:

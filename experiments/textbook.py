@@ -20,7 +20,7 @@ from experiments.config import ExperimentError, suggest
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
-from experiments.words import joined, quantity
+from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
 from mjxgrad.diagnostics import Comparison, EmpiricalBias, Rollouts, compare, empirical_bias, first_order_samples
@@ -51,7 +51,7 @@ class EstimatorSettings(SettingsTable):
             parts.append(self.baseline.replace("_", " ") if self.baseline != "none" else "no baseline")
         parts += ["pairs"] if self.antithetic else []
         parts += [self.rule.replace("_", " ")] if self.rule else []
-        return self.name.replace("_", " ") + (f" ({', '.join(parts)})" if parts else "")
+        return self.name.replace("_", " ").replace("alpha ", "α-") + (f" ({', '.join(parts)})" if parts else "")
 
 
 class Settings(RunSettings):
@@ -232,6 +232,31 @@ def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:
     return found
 
 
+def answer(outcome: Outcome) -> str:
+    """Say which estimators see a jump; what a stiffness, what a ripple does to both orders."""
+    if outcome.by_stiffness is None:
+        labels, is_blind = outcome.is_biased.estimator.values, outcome.is_biased[-1].values
+        seeing, blind = list(labels[~is_blind]), list(labels[is_blind])
+        if not blind:
+            return "All of them see it."
+        if len(blind) <= len(seeing):
+            return f"All but {named(blind, len(labels), words=10)} see it."
+        return capitalised(f"{named(seeing, len(labels), words=10)} {'sees' if len(seeing) == 1 else 'see'} it.")
+    if not {"first order", "zeroth order"} <= set(outcome.by_stiffness.estimator.values):
+        return _closest(outcome)
+    errors = outcome.by_stiffness.rmse
+    first, zeroth = (
+        f"{float(e[-1] / e[0]):.2g}" for e in (errors.sel(estimator=f"{n} order") for n in ("first", "zeroth"))
+    )
+    if outcome.settings.problem == "quadratic_sine":
+        return f"It multiplies first order's error by {first}, zeroth order's by {zeroth}."
+    unseen = [
+        x for x, (_, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True) if not found.num_outlying
+    ]
+    missed = f"all samples miss from 1/ν = {power(unseen[0])}" if unseen else "samples never all miss"
+    return f"First order's error grows {first}×, zeroth order's {zeroth}×; {missed}."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say which estimator is closest, and which are biased."""
     return " ".join(sentence for sentence in (_closest(outcome), _bias(outcome), _crossing(outcome)) if sentence)
@@ -286,14 +311,15 @@ def _closest(outcome: Outcome) -> str:
     where = "" if shown is None else f" at {stiffness_name(outcome)} = {shown:g}"
     if few == many:
         return f"From {low} to {high} rollouts{where} the smallest error is that of {few}."
-    return f"With {low} rollouts{where} the smallest error is that of {few}, with {high} that of {many}."
+    return f"With {low} rollouts{where} the smallest error is that of {few}; with {high} that of {many}."
 
 
 def _best(table: xr.Dataset) -> str:
-    """Name the estimator of least error, with all whose intervals overlap its own."""
+    """Name the estimator of least error, and count those whose intervals overlap its own."""
     table = table.sortby("rmse")
     ties = table.estimator.values[table.rmse_low.values <= table.rmse_high.values[0]]
-    return joined(ties, "or") + (" (a tie)" if len(ties) > 1 else "")
+    others = "one other" if len(ties) == 2 else f"{len(ties) - 1} others"
+    return f"{ties[0]}, in a tie with {others}" if len(ties) > 1 else str(ties[0])
 
 
 def _bias(outcome: Outcome) -> str:
@@ -349,9 +375,8 @@ def _unseen(outcome: Outcome) -> str:
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    found: dict[str, Any] = {"problem": problem, "samples": samples}
-    found |= {} if outcome.by_stiffness is None else {"stiffness": stiffness}
-    return found | ({"missing": missing} if outcome.hits else {})
+    found: dict[str, Any] = {} if outcome.by_stiffness is None else {"stiffness": stiffness}
+    return found | {"samples": samples, "problem": problem} | ({"missing": missing} if outcome.hits else {})
 
 
 def stiffness_name(outcome: Outcome) -> str:
@@ -383,7 +408,7 @@ def problem(outcome: Outcome):
     shown = "" if settings.shown_stiffness is None else f" at stiffness {settings.shown_stiffness:g}"
     caption = (
         f"Left, the cost{shown}; right, the gradient that is to be estimated, and what first order converges to. Where the "
-        "two part, first order is biased. The dotted line marks the point of the estimates below."
+        "two part, first order is biased. The dotted line marks the point of the estimates."
     )
     return figure, "The cost and its gradient", caption
 

@@ -57,10 +57,11 @@ def shades(count: int) -> np.ndarray:
 
 
 def power(value: float) -> str:
-    """Write a number for an axis or a legend: 10⁴, 3×10⁵, 2500."""
+    """Write a number for an axis or a legend: 10⁴, 3×10³, 2500."""
     exponent = int(np.floor(np.log10(value) + 1e-12))
     mantissa = value / 10.0**exponent
-    if exponent in (0, 1, 2) or (exponent == 3 and not np.isclose(mantissa, 1)):
+    # 3×10³ stands beside 10³ and 10⁴; 2500 is shorter than its power.
+    if exponent in (0, 1, 2) or (exponent == 3 and not np.isclose(mantissa, round(mantissa))):
         return f"{value:g}"
     head = "" if np.isclose(mantissa, 1) else f"{mantissa:.3g}×"
     return f"{head}10{superscript(exponent)}"

@@ -1,6 +1,6 @@
 """Numbers and lists in the words of a report."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 def quantity(value: float, error: float | None = None) -> str:
@@ -38,6 +38,23 @@ def joined(parts: Iterable[str], last: str = "and") -> str:
     return f"{', '.join(first)} {last} {end}" if first else end
 
 
+def named(labels: Collection[str], among: int, *, words: int) -> str:
+    """List the labels, or count them where that takes more words than there is room for: "a and b", "5 of 8", "all 8"."""
+    listed = joined(labels) if labels else "none"
+    if len(listed.split()) <= words:
+        return listed
+    return f"all {among}" if len(labels) == among else f"{len(labels)} of {among}"
+
+
+def merged(sentences: Iterable[str]) -> list[str]:
+    """Say once what is said of several: "a: it is so" and "b: it is so" become "a and b: it is so"."""
+    subjects: dict[str, list[str]] = {}
+    for sentence in sentences:
+        subject, colon, text = sentence.partition(": ")
+        subjects.setdefault(text if colon else sentence, []).append(subject if colon else "")
+    return [f"{joined(dict.fromkeys(told))}: {text}" if told[0] else text for text, told in subjects.items()]
+
+
 def capitalised(text: str) -> str:
-    """Begin with a capital, and leave the rest as it is."""
-    return text[:1].upper() + text[1:]
+    """Begin with a capital, and leave the rest as it is; α stays what it is, for its capital reads as a Latin A."""
+    return text[:1].upper() + text[1:] if text[:1].isascii() else text

@@ -325,6 +325,16 @@ def list_experiments(*, as_json: Annotated[bool, cyclopts.Parameter(name="--json
     return 0
 
 
+@app.command
+def gallery(*, output: Path = Path("runs")) -> int:
+    """Write one page over all results of experiments, index.html.
+
+    Args:
+        output: folder of results.
+    """
+    return _experiments()(["gallery", "--output", str(output)])
+
+
 @functools.cache
 def _library() -> Any:
     """Return mjxgrad in double precision, in which jumps and slopes are told apart."""

@@ -102,6 +102,11 @@ def test_new_writes_a_short_program(scene):
     assert "'scene.xml'" in text
 
 
+def test_a_gallery_of_no_results_says_where_it_looked(tmp_path, capsys):
+    assert cli.main(["gallery", "--output", str(tmp_path)]) == 2
+    assert f"there are no results in {tmp_path}" in capsys.readouterr().err
+
+
 def test_list_names_every_experiment(scene, capsys):
     assert cli.main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == sorted(path.stem for path in (ROOT / "experiments").glob("*.toml"))

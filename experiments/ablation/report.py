@@ -12,6 +12,16 @@ from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplot
 from experiments.words import joined, percent
 
 
+def answer(outcome: Outcome) -> str:
+    """Say what leaving out what no motion needs saves of a step, and whether it changes anything."""
+    safe = [variant for scene in outcome.scenes if (variant := scene.find(NEEDED)) is not None]
+    saved = 1 - min((variant.step.ratio[1] for variant in safe if not variant.is_same_program), default=1.0)
+    num_changed = sum(not variant.is_unchanged for variant in safe)
+    changes = f"{num_changed} scene{'s' * (num_changed > 1)} change" if num_changed else "without it nothing changes"
+    cost = f"up to {percent(saved)} of a step" if saved > 0 else "nothing"
+    return f"What no motion needs costs {cost}; {changes}."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say what leaving out gains, and whether it changes anything."""
     gains = [

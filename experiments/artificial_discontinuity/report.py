@@ -8,7 +8,7 @@ from experiments.artificial_discontinuity.measure import GENTLE, PLAIN, TILT, WA
 from experiments.artificial_discontinuity.shapes import PATHS
 from experiments.report import Table
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, shades, subplots
-from experiments.words import joined, percent, quantity
+from experiments.words import capitalised, joined, named, percent, quantity
 from mjxgrad.diagnostics import Jumps
 
 # Standard errors from which a bias is beyond chance, of some dozens of estimates.
@@ -16,6 +16,16 @@ _FAR = 4.0
 _SMALL = 1e-4
 # Of a jump, what the continuous reference must do nearby for it to be the same change.
 _SAME = 0.5
+
+
+def answer(outcome: Outcome) -> str:
+    """Name the bodies whose geometry alone makes force jump, and count the biased gradients across their jumps."""
+    bodies = {name: statics for name, statics in outcome.by_shape.items() if not statics[0].is_lattice}
+    rough = [name for name in bodies if max(one.worst(GENTLE) for one in bodies[name]) > outcome.settings.threshold]
+    jumping = [one for one in outcome.slopes if one.jump]
+    biased = sum(one.deviation[0] > _FAR for one in jumping)
+    across = f"; first order is biased across {biased} of {len(jumping)} jumps" if jumping else ""
+    return f"{capitalised(named(rough, len(bodies), words=6))}{across}."
 
 
 def verdict(outcome: Outcome) -> str:

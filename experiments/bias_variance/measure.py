@@ -17,6 +17,7 @@ import mjxgrad as mg
 from experiments.bias_variance.settings import Settings
 from experiments.config import ExperimentError
 from experiments.theme import power
+from experiments.words import percent
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.objective import Objective, parameter_noise
@@ -100,8 +101,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     for i in np.flatnonzero((table.finite_share < 1).any("angle")):
         lost = 1 - float(table.finite_share[i].min())
         workspace.warnings.append(
-            f"At stiffness {power(stiffness[i])}, {lost:.2%} of the rollouts at one angle were not finite and were left out, so "
-            "its means are over the others."
+            f"At stiffness {power(stiffness[i])}, {percent(lost)} of the rollouts at one angle were not finite and left out, "
+            "so its means are over the others."
         )
     return Outcome(settings, table, _landscape(measured, settings.stddev), task)
 

@@ -31,18 +31,22 @@ class Words:
     at: str  # its unit, likewise
     cost: str  # with its unit
     gradient: str  # unit of the gradient, after a comma
+    variance: str  # of its variance, likewise
     shown: str  # what the landscape shows
+    limit: str  # what is swept, in a word
+    drawings: tuple[str, ...]  # in order of reading, the one that answers first
     lead: str = ""  # before a value of what is swept
 
 
 _WORDS = {
     "ball_wall": Words(
-        "contact stiffness", " 1/s²", "angle of the throw", " rad", "cost, m²", ", m²/rad",
+        "contact stiffness", " 1/s²", "angle of the throw", " rad", "cost, m²", ", m²/rad", ", (m²/rad)²",
         "where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer the wall the sharper",
+        "stiffness", ("choice", "landscape", "gradient", "bias_variance"),
     ),
     "ramp": Words(
-        "slope of the ramp", "", "parameter", "", "cost", "", "a ramp from 0 to −1, and the steeper the more it is a step",
-        "slope ",
+        "slope of the ramp", "", "parameter", "", "cost", "", "", "a ramp from −1 to 1, and the steeper the more it is a step",
+        "slope", ("gradient", "landscape", "bias_variance", "choice"), "slope ",
     ),
 }  # fmt: skip
 
@@ -54,6 +58,29 @@ def _words(outcome: Outcome) -> Words:
 def _titled(name: str, unit: str) -> str:
     """Name an axis."""
     return f"{name},{unit}" if unit else name
+
+
+def answer(outcome: Outcome) -> str:
+    """Say where each estimate is right: where its mean does not differ from the reference beyond chance."""
+    swept, words = outcome.swept, _words(outcome)
+    is_off = (swept.zeroth_order_high < swept.reference_low) | (swept.zeroth_order_low > swept.reference_high)
+    zeroth = "throughout" if not is_off.any() else f"at {int((~is_off).sum())} of {is_off.size} points"
+    biased, is_blind = _bias_seen(swept)
+    is_wrong = (biased | is_blind).values
+    if not is_wrong.any():
+        return f"Zeroth order is right {zeroth}; first order shows no bias either."
+    if is_wrong[0]:
+        return f"Zeroth order is right {zeroth}; first order at no {words.knob}."
+    last = swept.stiffness.values[is_wrong.argmax() - 1]
+    return f"Zeroth order is right {zeroth}; first order only up to {words.limit} {power(last)}{words.per}."
+
+
+def _bias_seen(swept: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """Say at which stiffness first order is biased somewhere, and at which it is too noisy to tell."""
+    biased = swept.is_biased.any("angle")
+    # No bias seen is no bias only where one of half the gradient's own size would have been seen.
+    half_width = (swept.bias_high - swept.bias_low) / 2
+    return biased, (half_width > abs(swept.reference).max("stiffness") / 2).any("angle") & ~biased
 
 
 def verdict(outcome: Outcome) -> str:
@@ -134,13 +161,10 @@ def _range(stiffness: xr.DataArray, rows: ArrayLike, words: Words) -> str:
 
 def _bias(outcome: Outcome) -> str:
     swept, words = outcome.swept, _words(outcome)
-    biased = swept.is_biased.any("angle")
+    biased, is_blind = _bias_seen(swept)
     if not biased.any():
         return f"No bias of the first-order estimate is seen in the sweep ({outcome.settings.confidence:.0%} over all cases)."
     parts = [f"The first-order estimate is measurably biased {_range(swept.stiffness, biased, words)}"]
-    # No bias seen is no bias only where one of half the gradient's own size would have been seen.
-    half_width = (swept.bias_high - swept.bias_low) / 2
-    is_blind = (half_width > abs(swept.reference).max("stiffness") / 2).any("angle") & ~biased
     if is_blind.any():
         parts.append(f"{_range(swept.stiffness, is_blind, words)} it is too noisy to tell")
     if (is_clean := ~biased & ~is_blind).any():
@@ -161,7 +185,8 @@ def _default(outcome: Outcome) -> list[str]:
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"landscape": landscape, "gradient": gradient, "bias_variance": bias_variance, "choice": choice}
+    every = {"landscape": landscape, "gradient": gradient, "bias_variance": bias_variance, "choice": choice}
+    return {name: every[name] for name in _words(outcome).drawings}
 
 
 def landscape(outcome: Outcome):
@@ -192,7 +217,7 @@ def landscape(outcome: Outcome):
     figure.legend(handles, labels, loc="outside right upper", title=_titled(words.knob, words.per))
     caption = (
         f"Left, the cost by {words.place}: {words.shown}. Right, what noise makes of it, and what both estimates are to "
-        "differentiate. Dotted lines mark the places examined below."
+        "differentiate. Dotted lines mark the places where gradients are estimated."
     )
     return figure, f"The cost against the {words.place}", caption
 
@@ -202,8 +227,7 @@ def gradient(outcome: Outcome):
     figure, axes = _panels(outcome, rows=1, height=3.6)
     for j, axis in enumerate(axes[0]):
         axis.axhline(0, color=MUTED, lw=0.8)
-        swept, one = outcome.swept.isel(angle=j), outcome.table.isel(angle=j)
-        axis.fill_between(swept.stiffness, swept.reference_low, swept.reference_high, color=REFERENCE, alpha=0.15, lw=0)
+        one = outcome.table.isel(angle=j)
         _bars(axis, one, "reference", REFERENCE, "_", "reference")
         _bars(axis, one, "zeroth_order", ZEROTH, "s", "zeroth order", shift=1.06)
         _bars(axis, one, "first_order", FIRST, "o", "first order", shift=1 / 1.06)
@@ -217,7 +241,7 @@ def gradient(outcome: Outcome):
     theme.legend_below(figure, axes[0, 0], 3)
     caption = (
         f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each place. "
-        "The reference comes from rollouts of its own; the grey band is its interval. Intervals that leave a panel are "
+        f"The reference comes from {outcome.settings.reference_samples} rollouts of its own. Intervals that leave a panel are "
         f"cut.{_diamond(outcome)}"
     )
     return figure, "Both estimates against the truth", caption
@@ -244,7 +268,7 @@ def bias_variance(outcome: Outcome):
         below.set_yscale("log")
     words = _words(outcome)
     axes[0, 0].set_ylabel(f"bias of first order{words.gradient}")
-    axes[1, 0].set_ylabel(f"variance of one sample{', (m²/rad)²' if words.gradient else ''}")
+    axes[1, 0].set_ylabel(f"variance of one sample{words.variance}")
     theme.legend_below(figure, axes[1, 0], 2)
     percent = f"{outcome.settings.confidence:.0%}"
     caption = (

@@ -152,7 +152,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     found, reference = {}, None
     for index, name in enumerate(settings.problems or settings.sizes.problems):
         one = problem(name, settings.sizes.num_times)
-        workspace.check(one.scene)
+        workspace.check(one.scene, name=one.title)
         rng = np.random.default_rng([settings.seed, index])
         found[name] = workspace.once(name, lambda one=one, rng=rng: _measure(settings, one, rng, workspace))
         if name == "double_pendulum":

@@ -11,6 +11,30 @@ from experiments.theme import ZEROTH as BLUE
 from experiments.words import capitalised, joined, percent, quantity
 
 
+def answer(outcome: Outcome) -> str:
+    """Say up to which horizon the best first-order estimate is better, and where windows help."""
+    found = outcome.found.values()
+    limits = ", ".join(f"{_limit(one)} ({one.title})" for one in found)
+    helped = [one.title for one in found if _window_helps(one)]
+    where = "everywhere" if len(helped) == len(found) else f"the {joined(helped)}" if helped else "nowhere"
+    return f"Better {limits}; windows help {where}."
+
+
+def _limit(one: Found) -> str:
+    """Say up to which horizon the best of the first-order estimates is ahead."""
+    longest = max(crossing.horizon for crossing in one.crossovers.values())
+    if longest == one.times[0]:
+        return "nowhere"
+    return f"to {longest:.2g} s" if np.isfinite(longest) else f"beyond {one.times[-1]:.2g} s"
+
+
+def _window_helps(one: Found) -> bool:
+    """Say whether some window is closer than zeroth order and than the whole horizon."""
+    cuts = one.windows.errors.values()
+    whole = min(errors.error[-1] for errors in cuts)
+    return bool(min(errors.error[:-1].min() for errors in cuts) < min(whole, one.windows.zeroth.error[0]))
+
+
 def verdict(outcome: Outcome) -> str:
     """Say up to which horizon first order is better, and what to do beyond."""
     crossings = [_crossing(outcome, one) for one in outcome.found.values()]
@@ -21,7 +45,7 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say what diverged, and how far the pendulum's steps are its motion."""
     found = [
-        f"{capitalised(one.title)}: derivatives of {1 - one.finite:.1%} of the rollouts are not finite."
+        f"{capitalised(one.title)}: derivatives of {percent(1 - one.finite)} of the rollouts are not finite."
         for one in outcome.found.values()
         if one.finite < 1
     ]

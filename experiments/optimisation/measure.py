@@ -114,15 +114,19 @@ class Difference:
 
     @property
     def is_below(self) -> bool:
-        """Say whether it ends lower beyond seed noise."""
-        return not self.is_above and self._is_beyond(-1)
+        """Say whether it ends lower beyond seed noise, by the ranks, too: three seeds have means that far apart by chance."""
+        return not self.is_above and self._is_beyond(-1) and self.is_ranked
+
+    @property
+    def is_ranked(self) -> bool:
+        """Say whether the ranks of the seeds tell the two apart."""
+        return self.p_value < 1 - self.confidence
 
     def _is_beyond(self, sign: int) -> bool:
         noise = ROUNDING * abs(self.other.mean)
         # To say which way the ranks point.
         shift = float(np.median(self.ours.final_cost) - np.median(self.other.final_cost))
-        is_ranked = self.p_value < 1 - self.confidence
-        return (self.low if sign > 0 else -self.high) > noise or (is_ranked and sign * shift > noise)
+        return (self.low if sign > 0 else -self.high) > noise or (self.is_ranked and sign * shift > noise)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The answer of an optimisation experiment, computed from its numbers, and its pictures."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,8 +11,10 @@ from scipy.stats import mannwhitneyu
 from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
-from experiments.words import quantity
+from experiments.words import capitalised, percent, quantity
 
+# A column in the page over a sweep.
+_AGAINST = "α-order against the better"
 # A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
 _AGREEMENT = 3.0
 
@@ -19,7 +22,7 @@ _AGREEMENT = 3.0
 def answer(outcome: Outcome) -> str:
     """Name the method that ends lowest, and whether the seeds can tell it from the next."""
     best = outcome.best
-    lowest = f"The lowest end is that of {best.method.label}."
+    lowest = f"{capitalised(best.method.label)} ends lowest, at {quantity(best.mean, best.spread)}."
     others = [run for run in outcome.runs if run is not best and run.kept.size]
     if not others or not best.kept.size:
         return lowest
@@ -61,7 +64,7 @@ def warnings(outcome: Outcome) -> list[str]:
         if run.num_skipped.any():
             parts.append(f"{run.num_skipped.sum()} steps were not taken, because the estimate was not finite")
         if run.finite_share < 1:
-            parts.append(f"{1 - run.finite_share:.2%} of the rollouts were not finite and were left out")
+            parts.append(f"{percent(1 - run.finite_share)} of the rollouts were not finite and were left out")
         if parts:
             sentences.append(f"{run.method.label}: {'; '.join(parts)}.")
     return sentences
@@ -116,22 +119,35 @@ def headline(outcome: Outcome) -> dict[str, str]:
         for run in outcome.runs
     }
     for difference in outcome.verdicts:
-        kind = "worse" if difference.is_above else "better" if difference.is_below else "no difference"
-        cells["α-order against the better"] = f"{kind}: {_signed(difference)}"
+        kind = "worse" if difference.is_above else "better" if difference.is_below else "cannot be told"
+        cells[_AGAINST] = f"{kind}: {_signed(difference)}"
     return cells
+
+
+def together(summaries: Sequence[dict[str, Any]]) -> str | None:
+    """Say of a sweep how often α-order ends worse and better than the better of first and zeroth order."""
+    kinds = [summary["headline"].get(_AGAINST, "").partition(":")[0] for summary in summaries]
+    if "" in kinds:
+        return None
+    worse, better = kinds.count("worse"), kinds.count("better")
+    start = f"Worse on {worse} of {len(kinds)}" if worse else f"Never in {len(kinds)}"
+    return f"{start}; better on {better}; seeds cannot tell on {len(kinds) - worse - better}."
 
 
 def _comparison(difference: Difference) -> str:
     ours, other = difference.ours, difference.other
     if not (ours.kept.size and other.kept.size):
         return f"{ours.is_lost.sum()} runs of α-order and {other.is_lost.sum()} of {other.method.label} were lost."
-    kind = "ends worse" if difference.is_above else "ends better" if difference.is_below else "is not worse"
-    noise = "" if difference.is_above or difference.is_below else ", beyond seed noise"
+    numbers = f"{_signed(difference)}, rank test p = {difference.p_value:.2g}"
+    against = f"{other.method.label}, the better of first and zeroth order"
     lost = f", with {ours.is_lost.sum()} runs lost" if ours.is_lost.any() else ""
-    return (
-        f"α-order {kind} than {other.method.label}, the better of first and zeroth order{noise}{lost} "
-        f"({_signed(difference)}, rank test p = {difference.p_value:.2g})."
-    )
+    if difference.is_above:
+        # What speaks against it counts by the means alone, too.
+        means = "" if difference.is_ranked or lost else " by the means alone"
+        return f"α-order ends worse than {against}{means}{lost} ({numbers})."
+    if difference.is_below:
+        return f"α-order ends better than {against}{lost} ({numbers})."
+    return f"{ours.kept.size} seeds cannot tell α-order from {against}{lost} ({numbers})."
 
 
 def _signed(difference: Difference) -> str:
@@ -277,10 +293,11 @@ def curves(outcome: Outcome):
         axis.yaxis.set_minor_formatter(NullFormatter())
     settings = outcome.settings
     caption = (
-        f"Lines are medians over {settings.seeds} seeds, bands reach from the lowest to the highest. The axis is the cost "
-        "above the lowest that any run has met, so a line that ends low on the logarithmic scale is as good as the best; "
-        "below, what one would otherwise use, with α-order for comparison. Both columns are of the same runs; the seconds "
-        "include the measurement of the noise-free cost, which is no rollout of the method."
+        f"Lines are medians over {settings.seeds} seeds; bands, of α-order and of what ends lowest, reach from the lowest seed "
+        "to the highest. The axis is the cost above the lowest that any run has met, so a line that ends low on the "
+        "logarithmic scale is as good as the best; below, what one would otherwise use, with α-order for comparison. Both "
+        "columns are of the same runs; the seconds include the measurement of the noise-free cost, which is no rollout of the "
+        "method."
     )
     return figure, "Cost against rollouts and against time", caption
 
@@ -319,8 +336,8 @@ def alpha(outcome: Outcome):
     right.grid(visible=False, axis="y")
     right.legend(loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=2, fontsize=8.5)
     caption = (
-        "Left, the weight of the first-order part, the mean over seeds and over a fiftieth of the steps; where there are "
-        "several blocks, over these, too. Right, how often each reason settled it."
+        "Left, the weight of the first-order part: the mean over seeds and blocks of parameters, smoothed over a fiftieth of the "
+        "steps. Right, how often each reason settled it."
     )
     return figure, "The weight of the first-order part", caption
 
@@ -338,7 +355,9 @@ def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
     cost = np.maximum(np.where(np.isfinite(run.cost), run.cost, np.nan) - _lowest(outcome), _floor(outcome))
     seen = np.isfinite(cost).any(axis=0)
     x, cost = x[seen], cost[:, seen]
-    axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.13, lw=0)
+    # Bands of all methods would hide each other, and the lines with them.
+    if run is outcome.best or run.method.is_default_alpha:
+        axis.fill_between(x, np.nanmin(cost, axis=0), np.nanmax(cost, axis=0), color=colour, alpha=0.16, lw=0)
     # Ours is a broad line beneath the others, so that those it agrees with are seen on it.
     width, order = (3.4, 2.5) if run.method.is_default_alpha else (1.4, 3.0)
     axis.plot(x, np.nanmedian(cost, axis=0), color=colour, lw=width, label=run.method.label, zorder=order)

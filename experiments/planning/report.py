@@ -20,6 +20,27 @@ from experiments.workspace import Workspace
 from mjxgrad.tasks.planar_pusher import planar_pusher
 
 
+def answer(outcome: Outcome) -> str:
+    """Say whether smoothed models solve the task, and what plain ones do."""
+    smoothed = [one for one in outcome.attempts if one.model != "none"]
+    plain = outcome.of("none")
+    if not smoothed:
+        return capitalised(f"{_yes(outcome, plain)}, with plain models.")
+    first = f"{_yes(outcome, smoothed)}, with smoothed models"
+    if not plain:
+        return f"{first}."
+    is_still = all(outcome.moved(one) == 0 for one in plain)
+    fate = "the rod does not move" if is_still else f"{_yes(outcome, plain).lower()}"
+    return f"{first}; with plain ones {fate}."
+
+
+def _yes(outcome: Outcome, attempts: list[Attempt]) -> str:
+    """Say whether attempts solve the task, and how many do."""
+    num_solved = sum(map(outcome.is_solved, attempts))
+    count = f" ({num_solved} of {len(attempts)})" if len(attempts) > 1 else ""
+    return f"{'Yes' if num_solved else 'No'}{count}"
+
+
 def verdict(outcome: Outcome) -> str:
     """Answer the question from the data: which linear models solve the task, and what the others do."""
     return capitalised("; ".join(_one(outcome, model) for model in outcome.settings.models)) + "."

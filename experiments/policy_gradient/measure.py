@@ -316,7 +316,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         for number, name in enumerate(settings.tasks):
             key, descent_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), number))
             one = problem(name, settings)
-            workspace.check(one.task.scene)
+            workspace.check(one.task.scene, name=one.title)
             for i, k in enumerate(jax.random.split(key, len(one.points))):
                 cells.append(workspace.once(f"{name} {i}", functools.partial(_cell, one, i, k, settings)))
             descend = functools.partial(_courses, one, descent_key, settings.num_seeds)

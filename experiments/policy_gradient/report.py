@@ -16,14 +16,17 @@ NEGLIGIBLE = 0.05
 
 
 def answer(outcome: Outcome) -> str:
-    """Count where either first-order gradient is biased, among points without a jump of the cost."""
+    """Count where either first-order gradient is biased, among points without a jump of the cost if there are any."""
     smooth = [cell for cell in outcome.cells if not cell.hits_and_misses]
+    if not smooth:
+        biased = sum(_is_biased(cell, ONSET) for cell in outcome.cells)
+        return f"It does not see hits and misses: biased at {biased} of {len(outcome.cells)} points."
     discrete, onset = (sum(_is_biased(cell, gradient) for cell in smooth) for gradient in (DISCRETE, ONSET))
-    return (
-        f"It cuts the points with a biased gradient from {discrete} to {onset} of {len(smooth)}."
-        if onset < discrete
-        else (f"It does not help: {onset} of {len(smooth)} points are biased, {discrete} without it.")
-    )
+    if not discrete and not onset:
+        return f"First order is right with and without it, at all {len(smooth)} points."
+    if onset < discrete:
+        return f"It cuts the points with a biased gradient from {discrete} to {onset} of {len(smooth)}."
+    return f"It does not help: {onset} of {len(smooth)} points are biased, {discrete} without it."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -61,7 +64,7 @@ def findings(outcome: Outcome) -> list[str]:
         return []
     cell = max(gentle, key=_change)
     return [
-        f"Where contact sets in gently it changes the first-order mean by at most {_change(cell):.1%} of the "
+        f"Where contact sets in gently it changes the first-order mean by at most {percent(_change(cell))} of the "
         f"gradient ({cell.label})."
     ]
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 
@@ -18,6 +18,7 @@ from experiments.stability.classes import BOUNCE, GAIN, Derivative, Motion
 from experiments.stability.measure import C_MUJOCO, NOT_ASKED, Outcome, SceneOutcome, against_c
 from experiments.stability.scenes import AXES, RADIUS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
+from experiments.words import percent
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.warnings import largest_stable_step, steepest
 
@@ -30,27 +31,39 @@ _LINES = {"derivative": "by the start", "derivative_by_parameters": "by paramete
 
 
 def answer(outcome: Outcome) -> str:
-    """Say whether every failure is flagged."""
-    found = outcome.found
+    """Say at which share of the points step and gradient hold, and whether every failure is flagged."""
+    found, precision = outcome.found, outcome.settings.precisions[0]
+    ours, theirs = (_held(found.motion.sel(simulator=name)) for name in (precision, C_MUJOCO))
+    right, judged = _right(found.derivative.sel(simulator=precision), found.motion.sel(simulator=precision))
+    gradient = f", gradients there at {percent(right / judged)}" if judged else ""
     unflagged = int((found.silent | found.missed).sum())
-    return "Every failure is flagged." if not unflagged else f"{unflagged} failures carry no flag."
+    flags = f"{unflagged} failures are unflagged" if unflagged else "every failure is flagged"
+    return f"Motion holds at {ours} (C MuJoCo: {theirs}){gradient}; {flags}."
+
+
+def _held(motion) -> str:
+    return percent(float((motion < Motion.GAINS_ENERGY).mean()))
 
 
 def verdict(outcome: Outcome) -> str:
     """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
     found, precisions = outcome.found, outcome.settings.precisions
+    silent, missed = int(found.silent.sum()), int(found.missed.sum())
     sentences = [
-        f"Over {found.sizes['point']} points, {' and '.join(precisions)}, {_count(found.silent)} left a rollout with a number "
-        f"that is not finite and no flag, and `soundness` missed {_count(found.missed)} of the gradients that are not finite "
-        "or explode."
+        f"{silent} rollouts have a number that is not finite, and no flag."
+        if silent
+        else "Every rollout with a number that is not finite is flagged.",
+        f"`soundness` misses {missed} gradients that explode or are not finite."
+        if missed
+        else "`soundness` tells every gradient that explodes or is not finite.",
     ]
     for name in precisions:
         signs = against_c(found, name)
         why = [reason for one in outcome.scenes for reason in reasons(one, name).values()]
         unexplained = f" ({why.count(UNEXPLAINED) or 'none'} without a reason found)" if why else ""
         sentences.append(
-            f"In {name} the motion is of a worse kind than that of C MuJoCo at {_count(signs > 0)} of the points{unexplained}, "
-            f"and of a better one at {_count(signs < 0)}."
+            f"In {name} {int((signs == 0).sum())} of {signs.size} motions are as good as C MuJoCo's, "
+            f"{_count(signs > 0)} worse{unexplained} and {_count(signs < 0)} better."
         )
     return " ".join(sentences)
 
@@ -66,7 +79,10 @@ def summary(outcome: Outcome) -> Table:
                 name,
                 _count(found.motion == Motion.UNSOLVED),
                 _count(found.untold),
-                *(_right(found[key], found.motion) for key in ("derivative", "derivative_by_parameters")),
+                *(
+                    "{} of {}".format(*_right(found[key], found.motion))
+                    for key in ("derivative", "derivative_by_parameters")
+                ),
                 _count(unflagged),
                 _count(unflagged & (found.derivative == Derivative.NON_FINITE)),
             ]
@@ -91,15 +107,10 @@ def findings(outcome: Outcome) -> list[str]:
     ratio = np.concatenate([load(one.scene, one.points) for one in singles])
     fails = np.concatenate([one.found.motion.sel(simulator="float64") for one in singles]) >= Motion.GAINS_ENERGY
     below = ratio < 1
-    exceptions = fails & below
-    sentence = (
-        f"Of {below.sum()} single bounces within the explicit limit {_count(exceptions)} "
-        f"{'gains' if exceptions.sum() == 1 else 'gain'} energy"
-    )
-    if exceptions.any():
+    sentence = f"Within the explicit limit {_count(fails & below)} of {below.sum()} single bounces gain energy"
+    if (fails & below).any():
         sentence += f", the earliest at {ratio[fails].min():.2g} times the largest stable time step"
-    spared = (~fails & ~below).sum()
-    return [f"{sentence}; of {(~below).sum()} beyond it " + (f"all but {spared} do." if spared else "all do.")]
+    return [f"{sentence}; beyond it {(fails & ~below).sum()} of {(~below).sum()} do."]
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -188,11 +199,11 @@ def _count(where) -> str:
     return str(int(where.sum()) or "none")
 
 
-def _right(kinds, motion) -> str:
-    """Give how many derivatives are right of those that can be judged, where the motion is fine."""
+def _right(kinds, motion) -> tuple[int, int]:
+    """Count the right derivatives, and those that can be judged, where the motion is fine."""
     judged = np.isin(kinds, (Derivative.RIGHT, Derivative.WRONG, Derivative.EXPLODES, Derivative.NON_FINITE))
     is_fine = (motion < Motion.GAINS_ENERGY).values
-    return f"{int(((kinds.values == Derivative.RIGHT) & is_fine).sum())} of {int((judged & is_fine).sum())}"
+    return int(((kinds.values == Derivative.RIGHT) & is_fine).sum()), int((judged & is_fine).sum())
 
 
 def _cells(values, kinds: type[Motion] | type[Derivative]) -> list[str]:
@@ -219,7 +230,7 @@ _EXPLICIT = (
 
 # In the order of the items.
 _MOTIONS = ("#c9e3f4", "#9ccbe8", "#56b4e9", "#0072b2", "#f0c36d", "#cc79a7", "#d55e00", "#22262e")
-_DERIVATIVES = ("#56b4e9", "#e8eaed", "#d55e00", "#f0c36d", "#cc79a7", "#22262e")
+_DERIVATIVES = ("#66c2a5", "#e8eaed", "#a6341b", "#8c6d31", "#7f3c8d", "#22262e")
 _NAMES = {
     "timestep": "time step, s",
     "time_constant": "time constant, s",
@@ -251,7 +262,10 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
         for j, (name, what) in enumerate(columns):
             axis = axes[i, j]
             values = one.points.plane(i, one.found[what].sel(simulator=name).values)
-            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES)
+            # What the eye is to find is where a column is another than the one that it stands beside.
+            model = C_MUJOCO if what == "motion" else precisions[0]
+            same = values == one.points.plane(i, one.found[what].sel(simulator=model).values) if name != model else None
+            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES, same)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
             if i == 0:
@@ -262,17 +276,19 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
     _legend(figure, one)
     caption = (
         f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all "
-        f"that is not on an axis is MuJoCo's default. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within "
+        f"that is not on an axis is MuJoCo's default. Pale: motion as in C MuJoCo, a gradient as in "
+        f"{precisions[0]}. {_LIMITS.get(one.scene.family, _EXPLICIT)}A bounce is right within "
         f"{BOUNCE:g} of its restitution; energy is gained beyond {GAIN:.0%}. Gradients are judged by central differences in "
         "float64; where the motion diverges there is none."
     )
     return figure, one.scene.name.capitalize(), caption
 
 
-def _image(axis: Axes, values: np.ndarray, colours: Sequence[str]) -> None:
-    palette = ListedColormap(list(colours))
-    norm = BoundaryNorm(np.arange(len(colours) + 1) - 0.5, len(colours))
-    axis.imshow(values, cmap=palette, norm=norm, origin="lower", aspect="auto", interpolation="nearest")
+def _image(axis: Axes, values: np.ndarray, colours: Sequence[str], pale: np.ndarray | None) -> None:
+    squares = to_rgba_array(colours)[np.maximum(values, 0)]
+    if pale is not None:
+        squares[pale, 3] = 0.25
+    axis.imshow(squares, origin="lower", aspect="auto", interpolation="nearest")
     axis.grid(visible=False)
 
 

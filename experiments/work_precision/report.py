@@ -83,6 +83,21 @@ def cheapest(estimates: Iterable[Estimate], target: float) -> Choice | None:
     return min(choices, key=lambda one: one.seconds, default=None)
 
 
+def answer(outcome: Outcome) -> str:
+    """Give the price of an error of the motion, and what gets a gradient to it soonest."""
+    target = max(outcome.settings.targets)
+    best = [one for course in outcome.courses if (one := _best(course, MG, target)) is not None]
+    ways = Counter(
+        one.estimate.estimator for course in outcome.courses if (one := cheapest(course.estimates, target)) is not None
+    )
+    if not best:
+        return f"No setting is known to reach {percent(target)} of the motion."
+    costs = sorted(one.cost for one in best)
+    span = " to ".join(dict.fromkeys(map(_milliseconds, (costs[0], costs[-1]))))
+    motion = f"{percent(target)} error: {span} ms a simulated second"
+    return f"{motion}; gradients soonest by {ways.most_common(1)[0][0]}." if ways else f"{motion}."
+
+
 def verdict(outcome: Outcome) -> str:
     """Say how the libraries stand at the largest target, over all scenes."""
     target = max(outcome.settings.targets)

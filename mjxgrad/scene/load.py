@@ -119,7 +119,8 @@ def load_scene(
 def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:
     """The C model of a source, ours to change, and how messages call it."""
     if isinstance(source, mujoco.MjModel):
-        return copy.deepcopy(source), "the model"
+        name = source.names.partition(b"\0")[0].decode(errors="replace")
+        return copy.deepcopy(source), name if name not in ("", "MuJoCo Model") else "the model"
     if isinstance(source, mujoco.MjSpec):
         return _parse(lambda spec: spec.copy().compile(), source, "the MjSpec")
     accepted = "an MJCF file, MJCF as a string (starting with '<'), a mujoco.MjSpec or a mujoco.MjModel"

@@ -13,7 +13,7 @@ from scipy import stats
 from experiments.__main__ import main
 from experiments.config import load_runs
 from experiments.optimisation.measure import Difference, Outcome, Run, problem
-from experiments.optimisation.report import drawings, findings, headline, tables, verdict, warnings
+from experiments.optimisation.report import drawings, findings, headline, tables, together, verdict, warnings
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.report import overview
 from experiments.theme import save
@@ -126,9 +126,19 @@ def test_a_sweep_whose_runs_have_other_methods_leaves_cells_empty(tmp_path):
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder, cells in zip(folders, ({"first": "1", "second": "2"}, {"first": "3"}), strict=True):
         folder.mkdir()
-        (folder / "summary.json").write_text(json.dumps({"verdict": "yes", "headline": cells}))
-    page = overview(runs, folders)
+        (folder / "summary.json").write_text(json.dumps({"answer": "yes", "headline": cells}))
+    page = overview(runs, folders, "Both.")
     assert "<tr><td>a</td><td>1</td><td>2</td></tr><tr><td>b</td><td>3</td><td></td></tr>" in page
+
+
+def test_a_sweep_over_tasks_is_answered_by_how_often_alpha_order_ends_worse():
+    def summary(kind):
+        return {"headline": {"α-order against the better": f"{kind}: +1"}}
+
+    kinds = ("worse", "better", "cannot be told")
+    assert together([summary(kind) for kind in kinds]) == "Worse on 1 of 3; better on 1; seeds cannot tell on 1."
+    assert together([summary("better")] * 2) == "Never in 2; better on 2; seeds cannot tell on 0."
+    assert together([summary("better"), {"headline": {}}]) is None
 
 
 def test_the_interval_of_a_difference_is_that_of_welch():
@@ -159,6 +169,19 @@ def test_a_method_is_worse_by_its_ranks_where_one_wild_seed_hides_it_from_the_me
     assert found.is_above
 
 
+def test_three_seeds_are_too_few_to_call_a_method_better():
+    """However far apart, two times three ranks fall so by chance in 2 of 20 orders: two-sided p is 0.1."""
+    few = [made_up("alpha_order", [1.0, 1.1, 0.9]), made_up("first_order", [500.0, 510.0, 490.0])]
+    found = outcome(*few).verdicts[0]
+    assert found.high < 0
+    assert found.p_value == pytest.approx(0.1)
+    assert not found.is_below
+    assert "3 seeds cannot tell α-order from first order" in verdict(outcome(*few))
+    assert "by the means alone" in verdict(outcome(made_up("alpha_order", [900.0, 901.0, 902.0]), few[1]))
+    many = [made_up("alpha_order", [1.0, 1.1, 0.9, 1.2]), made_up("first_order", [500.0, 510.0, 490.0, 480.0])]
+    assert "ends better than first order" in verdict(outcome(*many))
+
+
 def test_runs_that_differ_by_rounding_tie():
     costs = np.array([100.0, 200.0, 300.0, 400.0])
     shifted = made_up("alpha_order", np.full(4, 100.0) * (1 + 1e-12))
@@ -179,8 +202,7 @@ def test_alpha_order_is_compared_with_the_better_of_first_and_zeroth_order():
     alpha = made_up("alpha_order", [100.0, 101.0, 99.0])
     first, zeroth = made_up("first_order", [500.0, 510.0, 490.0]), made_up("zeroth_order", [100.5, 101.0, 99.5])
     found = outcome(first, zeroth, alpha)
-    assert "not worse than zeroth order, the better of first and zeroth order" in verdict(found)
-    assert "better than first order" in verdict(outcome(first, alpha))
+    assert "3 seeds cannot tell α-order from zeroth order, the better of first and zeroth order" in verdict(found)
 
 
 def test_the_rules_of_the_literature_are_not_taken_for_the_default():

@@ -63,6 +63,10 @@ def measure(settings, workspace):
     return Outcome(float(2 * jnp.asarray(settings.number)))
 
 
+def answer(outcome):
+    return f"It is {outcome.double}."
+
+
 def verdict(outcome):
     return f"Twice the number is {outcome.double}."
 
@@ -241,14 +245,54 @@ def test_a_sweep_leads_to_its_runs_and_goes_on_where_it_stopped(tmp_path, capsys
     assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
     capsys.readouterr()
     top = tmp_path / "runs" / "both-sweep"
-    assert sorted(path.name for path in top.iterdir()) == ["report.html", "seed=0", "seed=1"]
+    assert sorted(path.name for path in top.iterdir()) == ["report.html", "seed=0", "seed=1", "summary.json"]
     text = (top / "report.html").read_text()
     assert re.findall(r'href="([^"]*)"', text) == ["seed=0/report.html", "seed=1/report.html"]
+    answer = json.loads((top / "seed=0" / "summary.json").read_text())["answer"]
+    assert f"<td>{answer}</td>" in text
+    assert main(["gallery", "--output", str(tmp_path / "runs")]) == 0
+    cards = (tmp_path / "runs" / "index.html").read_text()
+    assert re.findall(r'href="([^"]*)"', cards) == ["both-sweep/report.html"], "one card for all combinations"
     shutil.rmtree(top / "seed=1")
     assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
     out = capsys.readouterr().out
     assert out.count("unchanged: ") == 1
     assert (top / "seed=1" / "report.html").is_file()
+
+
+def test_a_gallery_shows_each_result_by_its_answer_and_picture_and_names_what_it_leaves_out(copied, capsys):
+    top = copied / "runs"
+    moving = {"name": "moving", "question": "Does it <move>?", "answer": "Yes.", "figure": None, "video": "video.mp4"}
+    for name, summary in (("moving", moving), ("old", {"verdict": "Of an earlier version."})):
+        (top / name).mkdir()
+        (top / name / "summary.json").write_text(json.dumps(summary))
+    assert main(["gallery", "--output", str(top)]) == 0
+    assert "old" in capsys.readouterr().err
+    first, second = re.findall(r'<a class="card".*?</a>', (top / "index.html").read_text(), re.DOTALL)
+    assert 'href="moving/report.html"' in first
+    assert '<video loop muted autoplay playsinline src="moving/video.mp4">' in first
+    assert "Does it &lt;move&gt;?" in first
+    assert json.loads((top / "steep" / "summary.json").read_text())["answer"] in second
+    picture = re.search(r'<img src="([^"]*)"', second)
+    assert picture is not None
+    assert (top / picture[1]).is_file()
+
+
+def test_a_gallery_of_nothing_says_what_to_do(tmp_path, capsys):
+    assert main(["gallery", "--output", str(tmp_path)]) == 2
+    assert "make demo" in capsys.readouterr().err
+
+
+def test_methods_are_listed_by_their_labels_one_a_line():
+    shown = runner._shown(config.load_runs("heaviside", [])[0].settings)
+    assert shown["estimators"][:3] == [
+        "first order",
+        "zeroth order",
+        "zeroth order (zero noise): baseline = zero_noise",
+    ]
+    strokes = runner._shown(config.load_runs("billiards", [])[0].settings)
+    assert strokes["methods"][1:3] == ["first order, event: gradient = event", "first order, margin: margin = 0.4"]
+    assert strokes["video.speed"] == "0.5"
 
 
 def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monkeypatch):
@@ -375,7 +419,7 @@ def test_after_a_kill_a_run_goes_on_from_its_last_finished_part(tmp_path, monkey
     monkeypatch.setattr(experiments, "__path__", [*experiments.__path__, str(tmp_path)])
     assert main(arguments) == 0
     assert (tmp_path / "log").read_text() == "0 1 1 ", "the first part was not done again"
-    assert capsys.readouterr().out.startswith("Twice the number is 1.2")
+    assert "Twice the number is 1.2" in capsys.readouterr().out
     text = (tmp_path / "runs" / "trial" / "report.html").read_text()
     assert "part 0" in text, "what it warned of is told again"
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["trial"]
@@ -389,5 +433,5 @@ def test_a_kind_may_be_one_file_that_imports_jax(tmp_path, monkeypatch, capsys):
     assert config.kinds() == ["doubling"]
     assert run(tmp_path / "trial.toml", tmp_path / "runs") == 0
     # In float32 it would be 0.20000000298: float64 was chosen in time.
-    assert capsys.readouterr().out.startswith("Twice the number is 0.2.\n")
+    assert capsys.readouterr().out.startswith("It is 0.2.\nTwice the number is 0.2.\n")
     assert (tmp_path / "runs" / "trial" / "metrics.csv").read_text().split() == ["double", "0.2"]

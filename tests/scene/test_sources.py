@@ -34,6 +34,13 @@ def test_file_string_and_model_give_the_same_scene(falling_file):
         np.testing.assert_array_equal(scene.model.body_mass, model.body_mass)
 
 
+def test_a_model_is_called_by_its_own_name_if_it_has_one():
+    """Warnings begin with it, and a reader of several scenes' has to know which."""
+    named = mujoco.MjModel.from_xml_string(FALLING.replace("<mujoco>", '<mujoco model="falling">'))
+    assert load_scene(named).name == "falling"
+    assert load_scene(mujoco.MjModel.from_xml_string(FALLING)).name == "the model"
+
+
 def test_a_model_given_is_not_changed():
     model = mujoco.MjModel.from_xml_string(FALLING)
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY.value

@@ -1,0 +1,130 @@
+"""Pages as a browser shows them, where one is installed: on a telephone, without scripts, with nothing from elsewhere."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from experiments.report import Figure, Report, Table, gallery, overview, page
+from mjxgrad.render import write_video
+
+BROWSER = os.environ.get("CHROME_BIN") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser is installed: CHROME_BIN names one")
+
+WIDTH = 390  # of a telephone, in pixels
+PICTURE = 1000  # pixels from side to side
+# The page's own scripts, if it had any, would be refused; this one alone may run.
+PROBE = """\
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data: file:; media-src data: file:; style-src 'unsafe-inline'; script-src 'nonce-probe'">
+<script nonce="probe">
+addEventListener("load", () => {
+  const zoom = document.querySelector(".zoom img");
+  const wide = () => zoom.getBoundingClientRect().width;
+  const loaded = [...document.images].every(one => one.naturalWidth > 0);
+  const found = {width: innerWidth, beyond: document.documentElement.scrollWidth - innerWidth, loaded};
+  if (zoom) {
+    zoom.click();
+    found.full = wide();
+    zoom.click();
+    found.again = wide();
+  }
+  parent.postMessage(JSON.stringify(found), "*");
+});
+</script>
+"""
+# A window without a screen is never narrower than 500 pixels; a frame is what it is told to be.
+FRAME = """\
+<!DOCTYPE html>
+<html><body><script>addEventListener("message", event => document.body.append("FOUND " + event.data + " END"))</script>
+<iframe src="probed.html" width="{width}" height="800" style="border: 0"></iframe></body></html>
+"""
+
+
+def opened(text: str, place: Path, width: int = WIDTH) -> tuple[dict[str, Any], str]:
+    """Open a page and read what the probe found, and what the browser complained of."""
+    (place / "probed.html").write_text(text.replace("<head>", f"<head>\n{PROBE}", 1), encoding="utf-8")
+    (place / "frame.html").write_text(FRAME.format(width=width), encoding="utf-8")
+    command = [
+        str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={place / 'profile'}",
+        "--window-size=1280,800", "--enable-logging=stderr", "--dump-dom", (place / "frame.html").as_uri(),
+    ]  # fmt: skip
+    found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    complaints = "\n".join(line for line in found.stderr.splitlines() if "CONSOLE" in line)
+    told = re.search(r"FOUND (\{.*?\}) END", found.stdout)
+    assert told is not None, found.stderr
+    return json.loads(told[1]), complaints
+
+
+@pytest.fixture
+def report(tmp_path):
+    """A report of every part there is, with words and tables too wide for a telephone."""
+    plt.imsave(tmp_path / "picture.png", np.random.default_rng(0).random((400, PICTURE)))
+    write_video(tmp_path / "video.mp4", np.zeros((3, 64, 96, 3), np.uint8), fps=30)
+    wide = [f"column{i}" for i in range(30)]
+    made = Report(
+        answer="First order, `discrete`, up to 100 1/s².",
+        verdict="It is so.",
+        findings=["With `mjxgrad.diagnostics.first_order_samples_of_everything_that_there_is_to_be_found`."],
+        figures=[Figure("picture.png", "Picture", "All of it."), Figure("picture.png", "Once more", "As above.")],
+        tables=[Table(wide, [["1.234"] * 30], "Wide."), Table(wide, [["1.234"] * 30] * 20, "Wide and long.")],
+        metrics=[],
+        video="video.mp4",
+        video_caption="It moves.",
+        warnings=["hopper: the time step is too long."],
+    )
+    about = {
+        "Settings": {"a_key_that_is_longer_than_most": ["one", "two = " + "9" * 80]},
+        "Made with": {"command": "x" * 90},
+    }
+    return page(made, tmp_path, name="made up", question="Does it hold on a telephone?", expected="yes", about=about)
+
+
+def test_a_report_fits_a_telephone_runs_nothing_and_fetches_nothing(report, tmp_path):
+    found, complaints = opened(report, tmp_path)
+    assert not complaints
+    assert found["width"] == WIDTH
+    assert found["beyond"] <= 0, "pixels that the body is too wide"
+    assert found["loaded"]
+
+
+def test_a_click_shows_a_figure_at_full_size_and_another_brings_it_back(report, tmp_path):
+    found, _ = opened(report, tmp_path, width=900)
+    # One point of the picture to one of the screen; before, no wider than the window.
+    assert found["full"] >= PICTURE
+    assert found["again"] < 900
+
+
+def test_the_page_over_a_sweep_fits_a_telephone_however_many_methods_it_compares(tmp_path):
+    runs = []
+    for task in ("push_soft", "push_stiff"):
+        runs.append(SimpleNamespace(name="many", question="Which?", varied={"task": task}))
+        (tmp_path / task).mkdir()
+        cells = {f"method {i}": "1234 ± 12" for i in range(20)}
+        (tmp_path / task / "summary.json").write_text(json.dumps({"answer": "First order.", "headline": cells}))
+    found, complaints = opened(overview(runs, [tmp_path / run.varied["task"] for run in runs], "Both."), tmp_path)
+    assert not complaints
+    assert found["beyond"] <= 0
+
+
+def test_a_gallery_fits_a_telephone_with_its_pictures(report, tmp_path):
+    del report
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        shutil.copy(tmp_path / "picture.png", tmp_path / name)
+        shutil.copy(tmp_path / "video.mp4", tmp_path / name)
+    still = {"name": "first", "question": "Why?", "answer": "So.", "figure": "picture.png", "video": None}
+    found, complaints = opened(gallery({"first": still, "second": still | {"video": "video.mp4"}}), tmp_path)
+    assert not complaints
+    assert found["beyond"] <= 0
+    assert found["loaded"]
