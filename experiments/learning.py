@@ -343,7 +343,7 @@ def findings(outcome: Outcome) -> list[str]:
         if shortened and course.method != "zeroth":
             sentences.append(
                 f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were longer than "
-                "zeroth-order noise, and shortened to it."
+                "0.3 times zeroth-order noise, and shortened to that."
             )
         if lost or skipped or diverged:
             named = capitalised(_label(course, outcome))

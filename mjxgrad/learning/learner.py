@@ -38,7 +38,7 @@ class Settings:
         largest_norm: to which gradients are clipped.
         largest_entry: to which each of their numbers is clipped instead, unless None.
         largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
-            zeroth-order one over environments, see `window.Gradients.shortened`. Infinity shortens none.
+            zeroth-order one over environments: at 0.3 its variance is at most a tenth of that. Infinity shortens none.
         has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
         is_episodic: whether every window begins anew.
     """
@@ -60,7 +60,7 @@ class Settings:
     target_rate: float = 0.8
     largest_norm: float = 1.0
     largest_entry: float | None = None
-    largest_sample: float = 1.0
+    largest_sample: float = 0.3
     has_critic: bool = True
     is_episodic: bool = False
 

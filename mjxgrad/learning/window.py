@@ -76,8 +76,8 @@ class Gradients(eqx.Module):
     def shortened(self, most: float) -> tuple["Gradients", Bool[Array, "environments steps"]]:
         """Shorten first-order gradients to so many times the zeroth-order ones' root mean square, and say which were.
 
-        Through contact a few are a million times the others, so that a mean over any batch is that of a few. One that is longer
-        than zeroth-order noise tells no more than that does; shortened it has a small bias, which the rules see.
+        Through contact a few are a million times the others, so that a mean over any batch is that of a few. Those as long as
+        zeroth-order noise tell no more than that does; shortened they have a small bias, which the rules see.
         """
         norms = jnp.linalg.norm(self.first, axis=-1)
         limit = most * jnp.sqrt((self.zeroth**2).sum(axis=-1).mean(axis=0))
