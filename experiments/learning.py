@@ -165,6 +165,8 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Learn by every method at every stiffness."""
+    if "ppo" in settings.methods:
+        ppo.load()  # or say at once that it is not there
     environment = _environment(settings)
     workspace.check(environment.scene)
     courses = []

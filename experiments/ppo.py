@@ -36,7 +36,7 @@ def learn_ppo(
         What was learned, how to act by it without noise, and by name: `steps` and `seconds` until a reading, compilation left
         out, and `reward`, the mean per step of whole episodes then.
     """
-    ppo, networks, environment_of_brax = _brax()
+    ppo, networks, environment_of_brax = load()
     readings: list[tuple[float, float, float]] = []
 
     def note(steps: int, metrics: dict[str, Any]) -> None:
@@ -80,7 +80,8 @@ def learn_ppo(
     return params, act, {"steps": steps, "seconds": seconds, "reward": reward}
 
 
-def _brax() -> tuple[Any, Any, Any]:
+def load() -> tuple[Any, Any, Any]:
+    """Return brax's learner, its networks, and our environments for it; an `ExperimentError` without brax."""
     if not hasattr(jax, "device_put_replicated"):
         # Removed in jax 0.10; the last release of brax, 0.14.2, calls it.
         setattr(jax, "device_put_replicated", _replicated)  # noqa: B010

@@ -1,6 +1,7 @@
 """The experiment on policies: what it says is what was measured, and an interruption costs only what was not finished."""
 
 import csv
+import importlib.util
 import json
 
 import numpy as np
@@ -9,8 +10,9 @@ from numpy.testing import assert_allclose
 
 from experiments import learning
 from experiments.__main__ import main
-from experiments.config import load_runs
-from experiments.learning import Course, Outcome, Settings, Sizes, findings, verdict
+from experiments.config import ExperimentError, load_runs
+from experiments.learning import Course, Outcome, Settings, Sizes, findings, measure, verdict
+from experiments.workspace import Workspace
 
 QUICK = Settings(
     experiment="learning",
@@ -101,3 +103,9 @@ def test_an_interrupted_run_keeps_what_was_learned(tmp_path, monkeypatch):
     monkeypatch.setattr("mjxgrad.optimiser.checkpoint.save", written)
     assert main(command) == 0
     assert (tmp_path / "learn_cartpole" / "report.html").is_file()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("brax") is not None, reason="brax is installed")
+def test_without_brax_ppo_is_refused_before_the_others_learn(tmp_path):
+    with pytest.raises(ExperimentError, match=r"pip install 'mjxgrad\[playground\]'"):
+        measure(QUICK.model_copy(update={"methods": ("onset", "ppo")}), Workspace(tmp_path))
