@@ -238,6 +238,8 @@ def new(
     )
     output.write_text(text, encoding="utf-8")
     print(f"wrote {output}: write your cost into it, then python {output}")
+    if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
+        _say("its video needs what is not installed: pip install 'mjxgrad[render]'")
 
 
 @app.command

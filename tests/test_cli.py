@@ -102,6 +102,14 @@ def test_new_writes_a_short_program(scene):
     assert "'scene.xml'" in text
 
 
+def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
+    assert cli.main(["new", scene]) == 0
+    assert "video" not in capsys.readouterr().err
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["new", scene, "--force"]) == 0
+    assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
+
+
 def test_list_names_every_experiment(scene, capsys):
     assert cli.main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == sorted(path.stem for path in (ROOT / "experiments").glob("*.toml"))
