@@ -80,23 +80,24 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
-        if arguments is None and threading.active_count() > 1:
-            # A compilation that `check` gave up cannot be stopped otherwise, and leaving would wait for it.
-            sys.stdout.flush()
-            os._exit(status)
-        return status
     except KeyboardInterrupt:
         _say("interrupted")
-        return 130
+        status = 130
     except BrokenPipeError:  # whoever read has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
         _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
+        status = 2
     # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
-    return 2
+        status = 2
+    if arguments is None and threading.active_count() > 1:
+        # A compilation that `check` gave up cannot be stopped otherwise, and leaving would wait for it.
+        sys.stdout.flush()
+        os._exit(status)
+    return status
 
 
 def _say(text: str) -> None:
@@ -238,6 +239,8 @@ def new(
     )
     output.write_text(text, encoding="utf-8")
     print(f"wrote {output}: write your cost into it, then python {output}")
+    if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
+        _say("its video needs what is not installed: pip install 'mjxgrad[render]'")
 
 
 @app.command

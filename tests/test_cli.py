@@ -107,6 +107,14 @@ def test_a_gallery_of_no_results_says_where_it_looked(tmp_path, capsys):
     assert f"there are no results in {tmp_path}" in capsys.readouterr().err
 
 
+def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
+    assert cli.main(["new", scene]) == 0
+    assert "video" not in capsys.readouterr().err
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    assert cli.main(["new", scene, "--force"]) == 0
+    assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
+
+
 def test_list_names_every_experiment(scene, capsys):
     assert cli.main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == sorted(path.stem for path in (ROOT / "experiments").glob("*.toml"))

@@ -46,7 +46,7 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
-_COMPILED, _MOVED = 0.7, 0.25  # shares of the budget: when to give up compiling, and how long to follow motions at most
+_COMPILED, _MOVED = 0.8, 0.25  # shares of the budget: when to give up compiling, and how long to follow motions at most
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,17 @@ def check(
         spent["compiling"] = time.perf_counter() - compiling
         measuring = time.perf_counter()
         if "onset" in programs.kinds:
-            times = {"seconds": _MOVED * budget, "deadline": loaded + budget}
-            measured = measure(scene, motions, programs, rng, from_start=cost is not None, **times, log=say)
+            seconds = min(_MOVED * budget, loaded + budget - measuring)
+            measured = measure(
+                scene,
+                motions,
+                programs,
+                rng,
+                from_start=cost is not None,
+                seconds=seconds,
+                deadline=loaded + budget,
+                log=say,
+            )
             found += measured_findings(measured)
             spent["measuring"] = time.perf_counter() - measuring
         found += left_out_findings(programs.kinds, measured, budget)
