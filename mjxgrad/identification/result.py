@@ -26,6 +26,9 @@ from mjxgrad.scene import Scene
 _LEVEL = 0.95
 _SMALL_PART = 0.05  # of a combination: what takes part in it with less is not named
 _NOT_TOLD_APART = 1e-6  # of the clearest direction: the data would have to be a million times better along this one
+_RELATED = 0.5  # of the correlation of residuals: intervals are then too narrow by √3
+_REMOVED = 1e-3  # of the residuals at the start: what is left is that of numbers computed in another way
+_ENOUGH = 30  # numbers: among fewer, noise alone is as correlated once in a hundred times
 _NO_PART = 1e-4  # of a direction that is not determined: what has no more is determined all the same
 
 
@@ -66,6 +69,7 @@ class Identification:
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         held_out_rms: the same of the recordings that were held out; None without any.
         offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        correlation: of residuals with those of the same signal one time later. About 0 if all that is left is independent noise.
         removable: share of the sum of squares that the derivative at the end could still remove within the bounds. About 0
             at a minimum of a smooth motion.
         num_numbers: measured numbers that took part.
@@ -88,6 +92,7 @@ class Identification:
     rms: tuple[float, float]
     held_out_rms: tuple[float, float] | None
     offsets: tuple[np.ndarray, ...] | None
+    correlation: float
     removable: float
     num_numbers: int
     num_steps: int
@@ -144,6 +149,12 @@ class Identification:
             found.append(
                 f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step helps. "
                 "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
+            )
+        if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
+            starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
+            found.append(
+                f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
+                f"not as in the scene. {starts}Values may be off by more than their intervals, which take independent noise."
             )
         if self.without_effect:
             found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Leave them out.")

@@ -165,6 +165,7 @@ def search(
         rms=(first, float(after / np.sqrt(numbers))),
         held_out_rms=program.held_out_rms(nominal, values),
         offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
+        correlation=_correlation(program.windows, explained),
         removable=removable,
         num_numbers=numbers,
         num_steps=num_steps,
@@ -344,6 +345,19 @@ def _linear_model(
         blocks = jax.scipy.linalg.block_diag(*(window for one in found for window in one[2])) / size
         slope = jnp.concatenate([slope, blocks], axis=1)
     return point, residual, slope
+
+
+def _correlation(windows: Sequence[Windows], found: list[tuple[np.ndarray, ...]]) -> float:
+    """Return how much residuals are like those of the same signal one time before, from -1 to 1."""
+    products = squares = 0.0
+    for window, (residual, *_) in zip(windows, found, strict=True):
+        shapes = [weight.shape for weight in window.weight.values()]
+        ends = np.cumsum([math.prod(shape[1:]) for shape in shapes])
+        for shape, part in zip(shapes, np.split(residual, ends[:-1], axis=1), strict=True):
+            signal = part.reshape(shape)
+            products += float((signal[:, 1:] * signal[:, :-1]).sum())
+            squares += float((signal**2).sum())
+    return products / squares if squares else 0.0
 
 
 def _without_offsets(found: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, int]:

@@ -213,3 +213,21 @@ def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
 def test_refusals_name_the_remedy(cart, build, message):
     with pytest.raises(ValueError, match=message):
         build(cart)
+
+
+def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
+    """0.1 m/s that the recording does not tell: the gear takes them up, and what is left is a curve and no noise.
+
+    Of 41 independent numbers the correlation is within 3/√41 = 0.47 of zero; that of the cart's places is above 0.5.
+    """
+    noise = 0.001 * np.random.default_rng(0).normal(size=_STEPS + 1)
+    recording = Recording({"place": _course(v=0.1) + noise}, _DRIVE[:, None], noise={"place": 0.001})
+    parameters = {"gear": identification.gear(cart, "motor", bounds=(1.0, 9.0))}
+    wrong = mg.identify(cart, parameters, [recording])
+    assert abs(wrong.values["gear"] - 3.0) > wrong.half_width["gear"]
+    assert wrong.correlation > 0.5
+    assert "free_start=True" in " ".join(wrong.warnings())
+    right = mg.identify(cart, parameters, [recording], free_start=True)
+    assert abs(right.values["gear"] - 3.0) < right.half_width["gear"]
+    assert abs(right.correlation) < 0.47
+    assert right.warnings() == []
