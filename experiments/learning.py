@@ -15,7 +15,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
-from experiments.report import Table
+from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
@@ -162,6 +162,15 @@ class Outcome:
         second = max(others, key=lambda course: course.judged.mean(), default=best)
         return second, float(mannwhitneyu(best.judged, second.judged).pvalue)
 
+    @property
+    def soonest(self) -> list[Course]:
+        """The courses, of contact as it comes, that first come half of the way from the lowest reward of all to the highest."""
+        plain = [course for course in self.courses if course.stiffness == self.settings.stiffness[0]]
+        curves = np.stack([course.reward.mean(axis=1) for course in plain])
+        has_come = curves >= (np.nanmin(curves) + np.nanmax(curves)) / 2
+        first = has_come.any(axis=0).argmax()
+        return [course for course, come in zip(plain, has_come[:, first], strict=True) if come]
+
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Learn by every method at every stiffness."""
@@ -305,7 +314,7 @@ def _smooth(values: Float[np.ndarray, "updates seeds"]) -> Float[np.ndarray, "up
 
 
 def answer(outcome: Outcome) -> str:
-    """Name the gradient whose policies are worth most, or say that the seeds cannot tell; or what stiff contact leaves."""
+    """Name the gradients that learn soonest and whose policies are worth most, or what stiff contact leaves of them."""
     soft, stiff = outcome.settings.stiffness[0], outcome.settings.stiffness[-1]
     if soft != stiff:
         worth = {(course.method, course.stiffness): course.judged.mean() for course in outcome.courses}
@@ -314,11 +323,22 @@ def answer(outcome: Outcome) -> str:
         earn = "still earn" + "s" * (len(kept) == 1)
         return f"With contact {stiff:g} times as stiff, {named(kept, len(methods), words=5)} {earn} half."
     best = outcome.best
+    if outcome.settings.environment == "quadruped":
+        speed, turning = (quantity(off.mean()) for off in _off_command(best))
+        return f"{capitalised(NAMES[best.method])} is off its command by {speed} m/s and {turning} rad/s."
+    worth, num_updates = quantity(best.judged.mean()), outcome.settings.sizes.num_updates
+    if outcome.settings.environment == "trot" or len(outcome.courses) == 1:
+        spent = f"{quantity(num_updates * outcome.settings.num_steps)} steps, {quantity(num_updates * best.seconds)} s"
+        return f"After {spent}, {NAMES[best.method]} returns {worth} in C MuJoCo."
+    soonest = [NAMES[course.method] for course in outcome.soonest]
+    kind = "Soonest and worth most" if soonest == [NAMES[best.method]] else f"Soonest: {joined(soonest)}; worth most"
+    told = f"{kind}: {NAMES[best.method]}, {worth}"
     second, p_value = outcome.runner_up
-    if p_value <= 0.05 or second is best:
-        return f"The highest return in C MuJoCo is that of {NAMES[best.method]}: {quantity(best.judged.mean())}."
-    count = "One seed" if best.judged.size == 1 else f"{best.judged.size} seeds"
-    return f"{count} cannot tell {NAMES[best.method]} from {NAMES[second.method]}."
+    if p_value <= 0.05:
+        return f"{told}."
+    count = "one seed" if best.judged.size == 1 else f"{best.judged.size} seeds"
+    doubt = f"{told}; {count} cannot tell it from {NAMES[second.method]}."
+    return doubt if len(doubt.split()) <= MOST_WORDS else f"{told} (unproven)."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -336,30 +356,27 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say how good the gradients were, and what was left out."""
     sentences = []
+    shares = [(course, float(course.history["shortened"].mean())) for course in outcome.courses]
+    if each := [f"{100 * share:.2g}% ({_label(c, outcome)})" for c, share in shares if share and c.method != "zeroth"]:
+        sentences.append(
+            f"Derivatives longer than 0.3 times zeroth-order noise were shortened to that: {joined(each)}."
+        )
+    lost = []
     for course in outcome.courses:
-        lost = float(course.history["not_finite"].mean())
+        share = float(course.history["not_finite"].mean())
         skipped, diverged = int(course.history["skipped"].sum()), int(course.history["diverged"].sum())
-        shortened = float(course.history["shortened"].mean())
-        if shortened and course.method != "zeroth":
-            sentences.append(
-                f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were longer than "
-                "0.3 times zeroth-order noise, and shortened to that."
+        if share or skipped or diverged:
+            lost.append(
+                f"{capitalised(_label(course, outcome))}: {100 * share:.2g}% of the derivatives were no numbers, {diverged} "
+                f"steps diverged, {skipped} updates were skipped."
             )
-        if lost or skipped or diverged:
-            named = capitalised(_label(course, outcome))
-            sentences.append(
-                f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
-                f"{skipped} updates were skipped."
-            )
-    if not any("no numbers" in sentence for sentence in sentences):
-        sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")
+    sentences += lost or ["Every derivative was a number, no step diverged, and no update was skipped."]
     if outcome.settings.environment == "quadruped":
+        each = []
         for course in outcome.courses:
-            speed, turning = (np.sqrt(-course.terms[name].mean(axis=1)) for name in ("speed", "turning"))
-            sentences.append(
-                f"{capitalised(_label(course, outcome))} is off its command by {quantity(speed.mean(), _spread(speed))} m/s and "
-                f"{quantity(turning.mean(), _spread(turning))} rad/s, root mean squares in C MuJoCo, pushes included."
-            )
+            speed, turning = (quantity(off.mean(), _spread(off)) for off in _off_command(course))
+            each.append(f"{_label(course, outcome)} {speed} m/s and {turning} rad/s")
+        sentences.append(f"Off the command, root mean squares in C MuJoCo, pushes included: {'; '.join(each)}.")
     measured = [course for course in outcome.courses if course.method != "ppo"]
     if not measured:
         return sentences
@@ -490,6 +507,11 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
     model = with_coarse_shadows(environment.scene.to_mujoco())
     camera = "side" if outcome.settings.environment == "cartpole" else "track"
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
+
+
+def _off_command(course: Course) -> list[Float[np.ndarray, " seeds"]]:
+    """Return by how much a quadruped misses its command, in m/s and rad/s: root mean squares in C MuJoCo."""
+    return [np.sqrt(-course.terms[name].mean(axis=1)) for name in ("speed", "turning")]
 
 
 def _label(course: Course, outcome: Outcome) -> str:

@@ -171,18 +171,27 @@ def stable(ours, theirs, derivative, silent=0):
     return SimpleNamespace(found=found, settings=SimpleNamespace(precisions=("float64",)))
 
 
-def taught(stiffness=(1.0,), **returns):
-    """Returns of each seed by method, at the first stiffness; a tenth of them at the last, but for the onset."""
+def taught(stiffness=(1.0,), environment="hopper", late=(), **returns):
+    """Returns of each seed by method, at the first stiffness; a tenth of them at the last, but for the onset.
+
+    The reward rises from 0 to 1 in the second update, of those that are late in the third.
+    """
     courses = [
         SimpleNamespace(
-            method=method, stiffness=k, judged=np.array(values) * (1 if k == 1 or method == "onset" else 0.1)
+            method=method,
+            stiffness=k,
+            judged=np.array(values) * (1 if k == 1 or method == "onset" else 0.1),
+            reward=np.array([[0.0], [0.2 if method in late else 1.0], [1.0]]),
+            seconds=0.5,
         )
         for method, values in returns.items()
         for k in stiffness
     ]
     from experiments.learning import Outcome
 
-    settings = SimpleNamespace(stiffness=stiffness, methods=tuple(returns))
+    sizes = SimpleNamespace(num_updates=3)
+    names = {"environment": environment, "sizes": sizes, "num_steps": 100}
+    settings = SimpleNamespace(stiffness=stiffness, methods=tuple(returns), **names)
     return Outcome(settings, courses, None)
 
 
@@ -323,13 +332,28 @@ CASES = [
     ),
     (
         "learning",
-        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4]),
-        "The highest return in C MuJoCo is that of first order: 9.00.",
+        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4], late=("zeroth",)),
+        "Soonest and worth most: first order, 9.00.",
     ),
     (
         "learning",
-        taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3]),
-        "3 seeds cannot tell first order without an onset from first order by event gradients.",
+        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4], late=("onset",)),
+        "Soonest: zeroth order; worth most: first order, 9.00.",
+    ),
+    (
+        "learning",
+        taught(alpha=[9.0, 9, 9], onset=[1.0, 2, 3], late=("onset",)),
+        "Soonest and worth most: α-order, 9.00; 3 seeds cannot tell it from first order.",
+    ),
+    (
+        "learning",
+        taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3], late=("discrete",)),
+        "Soonest: first order by event gradients; worth most: first order without an onset, 9.00 (unproven).",
+    ),
+    (
+        "learning",
+        taught(environment="trot", onset=[-24.0]),
+        "After 300 steps, 1.50 s, first order returns −24.0 in C MuJoCo.",
     ),
     (
         "learning",
