@@ -26,7 +26,8 @@ def answer(outcome: Outcome) -> str:
     plain = outcome.of("none")
     if not smoothed:
         return capitalised(f"{_yes(outcome, plain)}, with plain models.")
-    first = f"{_yes(outcome, smoothed)}, with smoothed models"
+    fails = not any(map(outcome.is_solved, outcome.attempts))
+    first = f"{_yes(outcome, smoothed)}, {'not even ' * fails}with smoothed models"
     if not plain:
         return f"{first}."
     is_still = all(outcome.moved(one) == 0 for one in plain)

@@ -278,6 +278,12 @@ CASES = [
         "Yes (1 of 2), with smoothed models; with plain ones no (0 of 2).",
     ),
     (
+        "planning",
+        planned(analytic=[0.5], none=[0]),
+        "No, not even with smoothed models; with plain ones the rod does not move.",
+    ),
+    ("long_horizon", long(("hopper", 0.8, 0.6)), "Better to 0.8 s (hopper); windows do not help."),
+    (
         "long_horizon",
         long(("double pendulum", 1.3, 0.1), ("hopper", 0.8, 0.2)),
         "Better to 1.3 s (double pendulum), to 0.8 s (hopper); windows help everywhere.",
