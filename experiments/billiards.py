@@ -294,12 +294,12 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def _listed(runs: list[Run]) -> str:
-    return joined(f"{run.method.label} ({run.final_cost:.3f})" for run in runs)
+    return joined(f"“{run.method.label}” ({run.final_cost:.3f})" for run in runs)
 
 
 def _ending(run: Run) -> str:
     what = "solved" if run.is_solved else "no progress" if run.is_stuck else "in between"
-    return f"{run.method.label}: {what} ({run.final_cost:.3f})"
+    return f"“{run.method.label}”: {what} ({run.final_cost:.3f})"
 
 
 def drawings(outcome: Outcome) -> Drawings:
