@@ -361,14 +361,20 @@ CASES = [
     ),
     (
         "optimisation",
-        ended(first_order=list(range(8)), zeroth_order=list(range(10, 18))),
-        "First order ends lowest, at 3.5 ± 2.3.",
+        ended(first_order=[float(i) for i in range(8)], zeroth_order=[10.0 + i for i in range(8)]),
+        "First order ends lowest (3.50), zeroth order highest (13.5).",
     ),
     (
         "optimisation",
-        ended(first_order=[1.0, 1.1, 1.2], zeroth_order=[2.0, 2.1, 2.2]),
-        "3 seeds cannot tell first order from zeroth order, the two lowest.",
+        ended(first_order=[1.0, 1.1, 1.2], zeroth_order=[2.0, 2.1, 2.2], MPPI=[9.0, 9.0, 9.0]),
+        "First order ends lowest (1.10; 3 seeds cannot prove it), MPPI highest (9.00).",
     ),
+    (
+        "optimisation",
+        ended(**{"zeroth_order_(zero_noise,_pairs)": [1.0], "zeroth_order_(no_baseline,_pairs)": [2.0]}),
+        "Zeroth order (zero noise, pairs) ends lowest (1.00; one seed cannot prove it).",
+    ),
+    ("optimisation", ended(lone=[1.0, 2.0]), "Lone ends lowest, at 1.50 ± 0.50."),
     ("policy_gradient", pushed((True, 0.5, 0.5)), "It does not see hits and misses: biased at 1 of 1 points."),
     (
         "policy_gradient",
