@@ -239,7 +239,7 @@ def answer(outcome: Outcome) -> str:
     if not apart:
         return "Not answered: the balls touch at every start."
     solved, failed = ([f"“{run.method.label}”" for run in apart if run.is_solved is found] for found in (True, False))
-    count = f"{len(solved)} of {len(apart)} ways find it"
+    count = f"{len(solved)} of {len(apart)} find it to 1%"
     if not failed or not solved:
         return f"{count}."
     short = f"{count}, but not {joined(failed, 'or')}." if len(failed) < len(solved) else f"{count}: {joined(solved)}."

@@ -260,9 +260,9 @@ CASES = [
     (
         "billiards",
         stroke(first_order=2, event=2, margin=0, kernel=0, noise=0),
-        "3 of 5 ways find it, but not “first order” or “event”.",
+        "3 of 5 find it to 1%, but not “first order” or “event”.",
     ),
-    ("billiards", stroke(first_order=2, margin=0, touching=-1), "1 of 2 ways find it: “margin”."),
+    ("billiards", stroke(first_order=2, margin=0, touching=-1), "1 of 2 find it to 1%: “margin”."),
     ("billiards", stroke(touching=-1), "Not answered: the balls touch at every start."),
     ("planning", planned(analytic=[1], none=[0]), "Yes, with smoothed models; with plain ones the rod does not move."),
     (
