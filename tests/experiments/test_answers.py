@@ -128,7 +128,7 @@ def bounced(judged, **holds):
 
 def shaken(found, slopes=()):
     """Bodies by name with the largest jump under a gentle contact; slopes are (jump, deviation of first order)."""
-    by_shape = {name: [SimpleNamespace(is_lattice=False, worst=lambda _, x=x: x)] for name, x in found.items()}
+    by_shape = {name: [SimpleNamespace(is_lattice="×" in name, worst=lambda _, x=x: x)] for name, x in found.items()}
     slopes = [SimpleNamespace(jump=jump, deviation=[deviation]) for jump, deviation in slopes]
     return SimpleNamespace(by_shape=by_shape, slopes=slopes, settings=SimpleNamespace(threshold=0.05))
 
@@ -306,6 +306,7 @@ CASES = [
         shaken({"box": 0.4, "ball": 0.0}, [(1.0, 9.0), (1.0, 1.0), (0.0, 9.0)]),
         "Box; first order is biased across 1 of 2 jumps.",
     ),
+    ("artificial_discontinuity", shaken({"box": 0.4, "ball": 0.0, "2 × 2 points": 0.9}), "Box and points."),
     ("artificial_discontinuity", shaken(dict.fromkeys(["a b c", "d e f", "g h"], 1.0) | {"ball": 0.0}), "3 of 4."),
     (
         "ablation",
