@@ -164,12 +164,14 @@ class Outcome:
 
     @property
     def soonest(self) -> list[Course]:
-        """The courses, of contact as it comes, that first come half of the way from the lowest reward of all to the highest."""
+        """The courses, of contact as it comes, that first are half of the way from the lowest reward to the highest, for good."""
         plain = [course for course in self.courses if course.stiffness == self.settings.stiffness[0]]
         curves = np.stack([course.reward.mean(axis=1) for course in plain])
-        has_come = curves >= (np.nanmin(curves) + np.nanmax(curves)) / 2
-        first = has_come.any(axis=0).argmax()
-        return [course for course, come in zip(plain, has_come[:, first], strict=True) if come]
+        is_there = curves >= (np.nanmin(curves) + np.nanmax(curves)) / 2
+        # A reward that falls again has not been learned.
+        stays = np.logical_and.accumulate(is_there[:, ::-1], axis=1)[:, ::-1]
+        first = stays.any(axis=0).argmax()
+        return [course for course, there in zip(plain, stays[:, first], strict=True) if there]
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -330,13 +332,13 @@ def answer(outcome: Outcome) -> str:
     if outcome.settings.environment == "trot" or len(outcome.courses) == 1:
         spent = f"{quantity(num_updates * outcome.settings.num_steps)} steps, {quantity(num_updates * best.seconds)} s"
         return f"After {spent}, {NAMES[best.method]} returns {worth} in C MuJoCo."
-    soonest = [NAMES[course.method] for course in outcome.soonest]
+    soonest = [NAMES[course.method] for course in outcome.soonest] or ["none"]
     kind = "Soonest and worth most" if soonest == [NAMES[best.method]] else f"Soonest: {joined(soonest)}; worth most"
     told = f"{kind}: {NAMES[best.method]}, {worth}"
     second, p_value = outcome.runner_up
     if p_value <= 0.05:
         return f"{told}."
-    count = "one seed" if best.judged.size == 1 else f"{best.judged.size} seeds"
+    count = _counted(best.judged.size, "seed", "seeds")
     doubt = f"{told}; {count} cannot tell it from {NAMES[second.method]}."
     return doubt if len(doubt.split()) <= MOST_WORDS else f"{told} (unproven)."
 
@@ -381,9 +383,10 @@ def findings(outcome: Outcome) -> list[str]:
     if not measured:
         return sentences
     ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in measured]
+    span = joined(dict.fromkeys((quantity(min(ratio)), quantity(max(ratio)))), "to")
     sentences.append(
-        f"The variance of the zeroth-order gradient is {min(ratio):.2g} to {max(ratio):.2g} times that of the first order, "
-        "by actions, in the median over updates."
+        f"The variance of the zeroth-order gradient is {span} times that of the first order, by actions, in the median over "
+        "updates."
     )
     return sentences
 
@@ -437,7 +440,8 @@ def course_of_learning(outcome: Outcome):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
     axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
-    axes[0, 1].set(title="By time", xlabel=f"seconds for {settings.sizes.num_seeds} policies, without compilation")
+    policies = _counted(settings.sizes.num_seeds, "policy", "policies")
+    axes[0, 1].set(title="By time", xlabel=f"seconds for {policies}, without compilation")
     for axis in axes[0]:
         plain(axis.yaxis)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value < 1e4 else f"{value / 1e6:g} M")
@@ -446,7 +450,8 @@ def course_of_learning(outcome: Outcome):
     axes[0, 0].set_ylim(np.quantile(ends, 0.01) - 0.1 * np.ptp(ends), ends.max() + 0.05 * np.ptp(ends))
     legend_below(figure, axes[0, 0], 3)
     caption = (
-        f"Mean reward per step over ten updates; thin, each of {settings.sizes.num_seeds} seeds, thick their mean."
+        f"Mean reward per step over ten updates; thin, each of {_counted(settings.sizes.num_seeds, 'seed', 'seeds')}, thick "
+        "their mean. Lines that coincide cover each other."
     )
     return figure, "Learning", caption
 
@@ -507,6 +512,10 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
     model = with_coarse_shadows(environment.scene.to_mujoco())
     camera = "side" if outcome.settings.environment == "cartpole" else "track"
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
+
+
+def _counted(number: int, one: str, several: str) -> str:
+    return f"one {one}" if number == 1 else f"{number} {several}"
 
 
 def _off_command(course: Course) -> list[Float[np.ndarray, " seeds"]]:

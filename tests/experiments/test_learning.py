@@ -57,6 +57,13 @@ def test_what_was_shortened_is_said_once_of_all():
     )
 
 
+def test_a_reward_that_falls_again_is_not_the_soonest():
+    """Means over the updates so far: 0, 1, 2/3 and 1/2 against 0, 3/2, -1 and -3/4; half of the way is 1/4."""
+    rewards = {"onset": [0, 2, 0, 0], "zeroth": [0, 3, -6, 0]}
+    courses = [course(name, [[1, 1]] * 2, reward=np.repeat([r], 2, axis=0).T) for name, r in rewards.items()]
+    assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["onset"]
+
+
 def test_a_quadruped_is_judged_by_its_command():
     """Squares of 0.04 m²/s² and 0.09 rad²/s² are 0.2 m/s and 0.3 rad/s."""
     settings = QUICK.model_copy(update={"environment": "quadruped"})
