@@ -146,9 +146,10 @@ def priced(*costs, estimator=None):
     """Scenes by seconds per simulated second of a step that is right; none where the step is wrong."""
     from experiments.work_precision.outcome import MG, Estimate, Knobs, Point, Variant
 
-    estimates = [Estimate(estimator, 10, 2e-3, 1.0, 0.01, (0, 0), 0.0, 0.0, 1e-4, (1.0,), 0.0)] if estimator else []
+    names = estimator if isinstance(estimator, tuple) else (estimator,) * len(costs)
     courses = []
-    for cost in costs:
+    for cost, name in zip(costs, names, strict=True):
+        estimates = [Estimate(name, 10, 2e-3, 1.0, 0.01, (0, 0), 0.0, 0.0, 1e-4, (1.0,), 0.0)] if name else []
         points = [Point(Variant(MG), Knobs(2e-3, 1e-8), *((0.001,) if cost else (1.0,)) * 2, (cost or 1.0,))]
         course = SimpleNamespace(estimates=estimates, floor=lambda _: 0.0, in_batch=lambda p=points: p)
         courses.append(course)
@@ -317,7 +318,17 @@ CASES = [
     (
         "work_precision",
         priced(5e-4, 2e-3, estimator="first order, onset"),
-        "1% error: 0.5 to 2 ms a simulated second; gradients soonest by first order, onset.",
+        "1% error: 0.5–2 ms a simulated second; gradients: first order, onset.",
+    ),
+    (
+        "work_precision",
+        priced(5e-4, None, 2e-3, estimator="first order, onset"),
+        "1% error: 0.5–2 ms a second on 2 of 3 scenes; gradients: first order, onset.",
+    ),
+    (
+        "work_precision",
+        priced(5e-4, 5e-4, estimator=("α-order, onset", "zeroth order")),
+        "1% error: 0.5 ms a simulated second; gradients: 2 ways tie.",
     ),
     ("work_precision", priced(None), "No setting is known to reach 1% of the motion."),
     (
