@@ -239,7 +239,7 @@ def answer(outcome: Outcome) -> str:
     if not apart:
         return "Not answered: the balls touch at every start."
     solved, failed = ([f"“{run.method.label}”" for run in apart if run.is_solved is found] for found in (True, False))
-    count = f"{len(solved)} of {len(apart)} ways find it"
+    count = f"{len(solved)} of {len(apart)} find it to 1%"
     if not failed or not solved:
         return f"{count}."
     short = f"{count}, but not {joined(failed, 'or')}." if len(failed) < len(solved) else f"{count}: {joined(solved)}."
@@ -294,12 +294,12 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def _listed(runs: list[Run]) -> str:
-    return joined(f"{run.method.label} ({run.final_cost:.3f})" for run in runs)
+    return joined(f"“{run.method.label}” ({run.final_cost:.3f})" for run in runs)
 
 
 def _ending(run: Run) -> str:
     what = "solved" if run.is_solved else "no progress" if run.is_stuck else "in between"
-    return f"{run.method.label}: {what} ({run.final_cost:.3f})"
+    return f"“{run.method.label}”: {what} ({run.final_cost:.3f})"
 
 
 def drawings(outcome: Outcome) -> Drawings:

@@ -15,7 +15,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
-from experiments.report import Table
+from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
@@ -162,6 +162,17 @@ class Outcome:
         second = max(others, key=lambda course: course.judged.mean(), default=best)
         return second, float(mannwhitneyu(best.judged, second.judged).pvalue)
 
+    @property
+    def soonest(self) -> list[Course]:
+        """The courses, of contact as it comes, that first are half of the way from the lowest reward to the highest, for good."""
+        plain = [course for course in self.courses if course.stiffness == self.settings.stiffness[0]]
+        curves = np.stack([course.reward.mean(axis=1) for course in plain])
+        is_there = curves >= (np.nanmin(curves) + np.nanmax(curves)) / 2
+        # A reward that falls again has not been learned.
+        stays = np.logical_and.accumulate(is_there[:, ::-1], axis=1)[:, ::-1]
+        first = stays.any(axis=0).argmax()
+        return [course for course, there in zip(plain, stays[:, first], strict=True) if there]
+
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Learn by every method at every stiffness."""
@@ -307,7 +318,7 @@ def _smooth(values: Float[np.ndarray, "updates seeds"]) -> Float[np.ndarray, "up
 
 
 def answer(outcome: Outcome) -> str:
-    """Name the gradient whose policies are worth most, or say that the seeds cannot tell; or what stiff contact leaves."""
+    """Name the gradients that learn soonest and whose policies are worth most, or what stiff contact leaves of them."""
     soft, stiff = outcome.settings.stiffness[0], outcome.settings.stiffness[-1]
     if soft != stiff:
         worth = {(course.method, course.stiffness): course.judged.mean() for course in outcome.courses}
@@ -316,11 +327,22 @@ def answer(outcome: Outcome) -> str:
         earn = "still earn" + "s" * (len(kept) == 1)
         return f"With contact {stiff:g} times as stiff, {named(kept, len(methods), words=5)} {earn} half."
     best = outcome.best
+    if outcome.settings.environment == "quadruped":
+        speed, turning = (quantity(off.mean()) for off in _off_command(best))
+        return f"{capitalised(NAMES[best.method])} is off its command by {speed} m/s and {turning} rad/s."
+    worth, num_updates = quantity(best.judged.mean()), outcome.settings.sizes.num_updates
+    if outcome.settings.environment == "trot" or len(outcome.courses) == 1:
+        spent = f"{quantity(num_updates * outcome.settings.num_steps)} steps, {quantity(num_updates * best.seconds)} s"
+        return f"After {spent}, {NAMES[best.method]} returns {worth} in C MuJoCo."
+    soonest = [NAMES[course.method] for course in outcome.soonest] or ["none"]
+    kind = "Soonest and worth most" if soonest == [NAMES[best.method]] else f"Soonest: {joined(soonest)}; worth most"
+    told = f"{kind}: {NAMES[best.method]}, {worth}"
     second, p_value = outcome.runner_up
-    if p_value <= 0.05 or second is best:
-        return f"The highest return in C MuJoCo is that of {NAMES[best.method]}: {quantity(best.judged.mean())}."
-    count = "One seed" if best.judged.size == 1 else f"{best.judged.size} seeds"
-    return f"{count} cannot tell {NAMES[best.method]} from {NAMES[second.method]}."
+    if p_value <= 0.05:
+        return f"{told}."
+    count = _counted(best.judged.size, "seed", "seeds")
+    doubt = f"{told}; {count} cannot tell it from {NAMES[second.method]}."
+    return doubt if len(doubt.split()) <= MOST_WORDS else f"{told} (unproven)."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -338,37 +360,35 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say how good the gradients were, and what was left out."""
     sentences = []
+    shares = [(course, float(course.history["shortened"].mean())) for course in outcome.courses]
+    if each := [f"{100 * share:.2g}% ({_label(c, outcome)})" for c, share in shares if share and c.method != "zeroth"]:
+        sentences.append(
+            f"Derivatives longer than 0.3 times zeroth-order noise were shortened to that: {joined(each)}."
+        )
+    lost = []
     for course in outcome.courses:
-        lost = float(course.history["not_finite"].mean())
+        share = float(course.history["not_finite"].mean())
         skipped, diverged = int(course.history["skipped"].sum()), int(course.history["diverged"].sum())
-        shortened = float(course.history["shortened"].mean())
-        if shortened and course.method != "zeroth":
-            sentences.append(
-                f"{capitalised(_label(course, outcome))}: {100 * shortened:.2g}% of the derivatives were longer than "
-                "0.3 times zeroth-order noise, and shortened to that."
+        if share or skipped or diverged:
+            lost.append(
+                f"{capitalised(_label(course, outcome))}: {100 * share:.2g}% of the derivatives were no numbers, {diverged} "
+                f"steps diverged, {skipped} updates were skipped."
             )
-        if lost or skipped or diverged:
-            named = capitalised(_label(course, outcome))
-            sentences.append(
-                f"{named}: {lost:.2g} of the derivatives were no numbers, {diverged} steps diverged, "
-                f"{skipped} updates were skipped."
-            )
-    if not any("no numbers" in sentence for sentence in sentences):
-        sentences.append("Every derivative was a number, no step diverged, and no update was skipped.")
+    sentences += lost or ["Every derivative was a number, no step diverged, and no update was skipped."]
     if outcome.settings.environment == "quadruped":
+        each = []
         for course in outcome.courses:
-            speed, turning = (np.sqrt(-course.terms[name].mean(axis=1)) for name in ("speed", "turning"))
-            sentences.append(
-                f"{capitalised(_label(course, outcome))} is off its command by {quantity(speed.mean(), _spread(speed))} m/s and "
-                f"{quantity(turning.mean(), _spread(turning))} rad/s, root mean squares in C MuJoCo, pushes included."
-            )
+            speed, turning = (quantity(off.mean(), _spread(off)) for off in _off_command(course))
+            each.append(f"{_label(course, outcome)} {speed} m/s and {turning} rad/s")
+        sentences.append(f"Off the command, root mean squares in C MuJoCo, pushes included: {'; '.join(each)}.")
     measured = [course for course in outcome.courses if course.method != "ppo"]
     if not measured:
         return sentences
     ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in measured]
+    span = joined(dict.fromkeys((quantity(min(ratio)), quantity(max(ratio)))), "to")
     sentences.append(
-        f"The variance of the zeroth-order gradient is {min(ratio):.2g} to {max(ratio):.2g} times that of the first order, "
-        "by actions, in the median over updates."
+        f"The variance of the zeroth-order gradient is {span} times that of the first order, by actions, in the median over "
+        "updates."
     )
     return sentences
 
@@ -422,7 +442,8 @@ def course_of_learning(outcome: Outcome):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
     axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
-    axes[0, 1].set(title="By time", xlabel=f"seconds for {settings.sizes.num_seeds} policies, without compilation")
+    policies = _counted(settings.sizes.num_seeds, "policy", "policies")
+    axes[0, 1].set(title="By time", xlabel=f"seconds for {policies}, without compilation")
     for axis in axes[0]:
         plain(axis.yaxis)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value < 1e4 else f"{value / 1e6:g} M")
@@ -431,7 +452,8 @@ def course_of_learning(outcome: Outcome):
     axes[0, 0].set_ylim(np.quantile(ends, 0.01) - 0.1 * np.ptp(ends), ends.max() + 0.05 * np.ptp(ends))
     legend_below(figure, axes[0, 0], 3)
     caption = (
-        f"Mean reward per step over ten updates; thin, each of {settings.sizes.num_seeds} seeds, thick their mean."
+        f"Mean reward per step over ten updates; thin, each of {_counted(settings.sizes.num_seeds, 'seed', 'seeds')}, thick "
+        "their mean. Lines that coincide cover each other."
     )
     return figure, "Learning", caption
 
@@ -492,6 +514,15 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
     model = with_coarse_shadows(environment.scene.to_mujoco())
     camera = "side" if outcome.settings.environment == "cartpole" else "track"
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
+
+
+def _counted(number: int, one: str, several: str) -> str:
+    return f"one {one}" if number == 1 else f"{number} {several}"
+
+
+def _off_command(course: Course) -> list[Float[np.ndarray, " seeds"]]:
+    """Return by how much a quadruped misses its command, in m/s and rad/s: root mean squares in C MuJoCo."""
+    return [np.sqrt(-course.terms[name].mean(axis=1)) for name in ("speed", "turning")]
 
 
 def _label(course: Course, outcome: Outcome) -> str:

@@ -214,14 +214,13 @@ def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, se
 
 
 def answer(outcome: Outcome) -> str:
-    """Name the way that finds the bed with the fewest rollouts, and count the others."""
+    """Count the ways that find the bed, and name the one that ends nearest to what is wanted."""
     found = [one for one in outcome.descents if outcome.is_solved(one)]
     if not found:
         return f"None of {len(outcome.descents)} ways finds it."
-    least = outcome.settings.solved_below
-    soonest = min(found, key=lambda one: (one.steps_to(least) or 0) * one.num_samples)
-    plain = "too" if any(one.label == "first order" for one in found) else "does not"
-    return f"Soonest by “{soonest.label}”; {len(found)} of {len(outcome.descents)} ways find it, first order {plain}."
+    best = min(found, key=lambda one: one.costs[-1])
+    plain = "does, too" if any(one.label == "first order" for one in found) else "alone does not"
+    return f"{len(found)} of {len(outcome.descents)} ways find it, best “{best.label}”; first order {plain}."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -281,7 +280,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def _listed(descents: list[Descent]) -> str:
-    return joined(f"{one.label} ({quantity(one.costs[-1])})" for one in descents)
+    return joined(f"“{one.label}” ({quantity(one.costs[-1])})" for one in descents)
 
 
 def drawings(outcome: Outcome) -> Drawings:

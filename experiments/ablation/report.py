@@ -147,6 +147,7 @@ def ratios(outcome: Outcome):
         axis.set_title(title)
         axis.set_xlim(0, max(1.12, 1.03 * axis.get_xlim()[1]))
         axis.set_xlabel("share")
+        axis.locator_params(axis="x", nbins=4)
     axes[0, 0].set_yticks(range(len(drawn)), [f"{scene.name}: {v.name}" for scene, v in drawn])
     axes[0, 0].set_ylim(len(drawn) - 0.5, -0.5)
     looks = {_look(variant) for _, variant in drawn}

@@ -16,6 +16,8 @@ def answer(outcome: Outcome) -> str:
     found = outcome.found.values()
     limits = ", ".join(f"{_limit(one)} ({one.title})" for one in found)
     helped = [one.title for one in found if _window_helps(one)]
+    if len(found) == 1:
+        return f"Better {limits}; windows {'help' if helped else 'do not help'}."
     where = "everywhere" if len(helped) == len(found) else f"the {joined(helped)}" if helped else "nowhere"
     return f"Better {limits}; windows help {where}."
 

@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import mannwhitneyu
 
 from experiments.optimisation.measure import Difference, Outcome, Run
-from experiments.report import Table
+from experiments.report import MOST_WORDS, Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.words import capitalised, percent, quantity
 
@@ -20,16 +20,21 @@ _AGREEMENT = 3.0
 
 
 def answer(outcome: Outcome) -> str:
-    """Name the method that ends lowest, and whether the seeds can tell it from the next."""
+    """Name the methods that end lowest and highest, and say where the seeds cannot tell the lowest from the next."""
     best = outcome.best
-    lowest = f"{capitalised(best.method.label)} ends lowest, at {quantity(best.mean, best.spread)}."
     others = [run for run in outcome.runs if run is not best and run.kept.size]
+    lowest = f"{capitalised(best.method.label)} ends lowest"
     if not others or not best.kept.size:
-        return lowest
-    second = min(others, key=lambda run: run.mean)
-    if mannwhitneyu(best.kept, second.kept).pvalue <= 0.05:
-        return lowest
-    return f"{best.kept.size} seeds cannot tell {best.method.label} from {second.method.label}, the two lowest."
+        return f"{lowest}, at {quantity(best.mean, best.spread)}."
+    second, highest = (choose(others, key=lambda run: run.mean) for choose in (min, max))
+    is_proven = mannwhitneyu(best.kept, second.kept).pvalue <= 0.05
+    told = f"{lowest} ({quantity(best.mean)}{'' if is_proven else f'; {_seeds(best)} cannot prove it'})"
+    whole = f"{told}, {highest.method.label} highest ({quantity(highest.mean)})."
+    return whole if len(whole.split()) <= MOST_WORDS else f"{told}."
+
+
+def _seeds(run: Run) -> str:
+    return "one seed" if run.kept.size == 1 else f"{run.kept.size} seeds"
 
 
 def verdict(outcome: Outcome) -> str:
@@ -235,8 +240,8 @@ def final(outcome: Outcome):
     left.set_ylim(-0.6, len(rows) - 0.4)
     low = min([*(float(cost) for run in outcome.runs for cost in run.kept), limit])
     if limit > _WIDE * low > 0:
-        _log_scale(left)
         left.set_xlim(low / 1.08, limit * 1.08)
+        _log_scale(left)
     else:
         margin = 0.04 * (limit - low or 1.0)
         left.set_xlim(low - margin, limit + margin)

@@ -13,7 +13,7 @@ from experiments.planning.measure import Attempt, Outcome
 from experiments.planning.settings import NAMES
 from experiments.report import Table
 from experiments.settings import VideoSettings
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, shades, subplots
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, plain, shades, subplots
 from experiments.video import film, shown_speed
 from experiments.words import capitalised, quantity
 from experiments.workspace import Workspace
@@ -26,7 +26,8 @@ def answer(outcome: Outcome) -> str:
     plain = outcome.of("none")
     if not smoothed:
         return capitalised(f"{_yes(outcome, plain)}, with plain models.")
-    first = f"{_yes(outcome, smoothed)}, with smoothed models"
+    fails = not any(map(outcome.is_solved, outcome.attempts))
+    first = f"{_yes(outcome, smoothed)}, {'not even ' * fails}with smoothed models"
     if not plain:
         return f"{first}."
     is_still = all(outcome.moved(one) == 0 for one in plain)
@@ -55,7 +56,7 @@ def _one(outcome: Outcome, model: str) -> str:
         ways = f"a way, the shortest of {len(best.controls)} steps" if num_solved else "a way"
         return f"with {name} {num_solved or 'none'} of {len(attempts)} trees {'find' if num_solved else 'finds'} {ways}"
     if num_solved:
-        return f"with {name} the rod reaches its goal"
+        return f"with {name} the rod reaches its goal to {_end(outcome, best)}"
     fate = "does not move at all" if outcome.moved(best) == 0 else f"ends {_end(outcome, best)} from its goal"
     return f"with {name} the rod {fate}"
 
@@ -113,8 +114,8 @@ _DECISION = 0.1  # s
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    first = {"cost": cost} if outcome.settings.method == "trajectory" else {"tree": tree}
-    return first | {"plane": plane, "pose": pose}
+    how = {"cost": cost} if outcome.settings.method == "trajectory" else {"tree": tree}
+    return {"plane": plane, **how, "pose": pose}
 
 
 def cost(outcome: Outcome):
@@ -130,9 +131,12 @@ def cost(outcome: Outcome):
             right.plot(1 + np.arange(len(smoothed)), 1e3 * attempt.course["length"], color=REFERENCE)
     left.set_yscale("log")
     left.set(title="Cost", xlabel="iteration")
+    for axis in (left, right):
+        axis.xaxis.get_major_locator().set_params(integer=True)
     left.legend(loc="center right")
     right.set_yscale("log")
     right.set(title="Smoothing length in mm", xlabel="iteration")
+    plain(right.yaxis)
     caption = (
         "Left, the cost of the scene itself under the controls of each iteration (thick), and of the smoothed scene that the "
         "iteration works on (thin). Right, the smoothing length. Both costs meet as the smoothing vanishes; a cost that rises "

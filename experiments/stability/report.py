@@ -270,9 +270,9 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
             _limit(axis, one, i)
             if i == 0:
                 where = name if name == C_MUJOCO else f"mjxgrad, {name}"
-                axis.set_title(f"{'Motion' if what == 'motion' else 'Gradient'}\n{where}", fontsize=9)
-            axis.set_xlabel(_NAMES[across], fontsize=8)
-        axes[i, 0].set_ylabel(_NAMES[up], fontsize=8)
+                axis.set_title(f"{'Motion' if what == 'motion' else 'Gradient'}\n{where}", fontsize=9.5)
+            axis.set_xlabel(_NAMES[across], fontsize=9)
+        axes[i, 0].set_ylabel(_NAMES[up], fontsize=9)
     _legend(figure, one)
     caption = (
         f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all "
@@ -298,7 +298,6 @@ def _scales(axis: Axes, across: str, up: str, count: int) -> None:
     for name, put in ((across, axis.set_xticks), (up, axis.set_yticks)):
         values = AXES[name](np.linspace(0, 1, count))[at]
         put(at, [_short(value) for value in values])
-    axis.tick_params(labelsize=7)
 
 
 def _short(value: float) -> str:
@@ -342,4 +341,4 @@ def _legend(figure: Picture, one: SceneOutcome) -> None:
     handles += [
         Patch(color=_DERIVATIVES[k], label=f"gradient {Derivative(k).label}") for k in slopes if k != Derivative.NONE
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9)

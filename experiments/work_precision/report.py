@@ -93,9 +93,14 @@ def answer(outcome: Outcome) -> str:
     if not best:
         return f"No setting is known to reach {percent(target)} of the motion."
     costs = sorted(one.cost for one in best)
-    span = " to ".join(dict.fromkeys(map(_milliseconds, (costs[0], costs[-1]))))
-    motion = f"{percent(target)} error: {span} ms a simulated second"
-    return f"{motion}; gradients soonest by {ways.most_common(1)[0][0]}." if ways else f"{motion}."
+    span = "–".join(dict.fromkeys(map(_milliseconds, (costs[0], costs[-1]))))
+    count = len(outcome.courses)
+    where = "a simulated second" if len(best) == count else f"a second on {len(best)} of {count} scenes"
+    motion = f"{percent(target)} error: {span} ms {where}"
+    soonest = [name for name, times in ways.items() if times == max(ways.values())]
+    if not soonest:
+        return f"{motion}."
+    return f"{motion}; gradients: {soonest[0] if len(soonest) == 1 else f'{len(soonest)} ways tie'}."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -114,6 +119,8 @@ def verdict(outcome: Outcome) -> str:
     sentences = []
     if times:
         sentences.append(f"For {percent(target)} error of the motion mg.step takes {joined(times)}.")
+    if times and (beyond := sum(_best(course, MG, target) is None for course in outcome.courses)):
+        sentences.append(f"On {beyond} of {len(found)} scenes no setting of it is known to get there.")
     if ways:
         sentences.append(f"{percent(target)} error of the gradient is soonest reached by {'; '.join(ways)}.")
     if lost and sentences:

@@ -81,17 +81,10 @@ def stroke(**ends):
     return SimpleNamespace(runs=runs)
 
 
-def rolled(**steps):
-    """Descents by name, each the number of its steps to the bed, or None."""
-    descents = [
-        SimpleNamespace(label=label.replace("_", " "), num_samples=2, steps_to=lambda _, n=n: n)
-        for label, n in steps.items()
-    ]
-    return SimpleNamespace(
-        descents=descents,
-        is_solved=lambda one: one.steps_to(0) is not None,
-        settings=SimpleNamespace(solved_below=0.1),
-    )
+def rolled(**ends):
+    """Descents by name, each with its final cost: below 0.1 the bed is found."""
+    descents = [SimpleNamespace(label=label.replace("_", " "), costs=[1.0, end]) for label, end in ends.items()]
+    return SimpleNamespace(descents=descents, is_solved=lambda one: one.costs[-1] < 0.1)
 
 
 def noise(deviation):
@@ -135,7 +128,7 @@ def bounced(judged, **holds):
 
 def shaken(found, slopes=()):
     """Bodies by name with the largest jump under a gentle contact; slopes are (jump, deviation of first order)."""
-    by_shape = {name: [SimpleNamespace(is_lattice=False, worst=lambda _, x=x: x)] for name, x in found.items()}
+    by_shape = {name: [SimpleNamespace(is_lattice="×" in name, worst=lambda _, x=x: x)] for name, x in found.items()}
     slopes = [SimpleNamespace(jump=jump, deviation=[deviation]) for jump, deviation in slopes]
     return SimpleNamespace(by_shape=by_shape, slopes=slopes, settings=SimpleNamespace(threshold=0.05))
 
@@ -153,9 +146,10 @@ def priced(*costs, estimator=None):
     """Scenes by seconds per simulated second of a step that is right; none where the step is wrong."""
     from experiments.work_precision.outcome import MG, Estimate, Knobs, Point, Variant
 
-    estimates = [Estimate(estimator, 10, 2e-3, 1.0, 0.01, (0, 0), 0.0, 0.0, 1e-4, (1.0,), 0.0)] if estimator else []
+    names = estimator if isinstance(estimator, tuple) else (estimator,) * len(costs)
     courses = []
-    for cost in costs:
+    for cost, name in zip(costs, names, strict=True):
+        estimates = [Estimate(name, 10, 2e-3, 1.0, 0.01, (0, 0), 0.0, 0.0, 1e-4, (1.0,), 0.0)] if name else []
         points = [Point(Variant(MG), Knobs(2e-3, 1e-8), *((0.001,) if cost else (1.0,)) * 2, (cost or 1.0,))]
         course = SimpleNamespace(estimates=estimates, floor=lambda _: 0.0, in_batch=lambda p=points: p)
         courses.append(course)
@@ -171,18 +165,27 @@ def stable(ours, theirs, derivative, silent=0):
     return SimpleNamespace(found=found, settings=SimpleNamespace(precisions=("float64",)))
 
 
-def taught(stiffness=(1.0,), **returns):
-    """Returns of each seed by method, at the first stiffness; a tenth of them at the last, but for the onset."""
+def taught(stiffness=(1.0,), environment="hopper", late=(), **returns):
+    """Returns of each seed by method, at the first stiffness; a tenth of them at the last, but for the onset.
+
+    The reward rises from 0 to 1 in the second update, of those that are late in the third.
+    """
     courses = [
         SimpleNamespace(
-            method=method, stiffness=k, judged=np.array(values) * (1 if k == 1 or method == "onset" else 0.1)
+            method=method,
+            stiffness=k,
+            judged=np.array(values) * (1 if k == 1 or method == "onset" else 0.1),
+            reward=np.array([[0.0], [0.2 if method in late else 1.0], [1.0]]),
+            seconds=0.5,
         )
         for method, values in returns.items()
         for k in stiffness
     ]
     from experiments.learning import Outcome
 
-    settings = SimpleNamespace(stiffness=stiffness, methods=tuple(returns))
+    sizes = SimpleNamespace(num_updates=3)
+    names = {"environment": environment, "sizes": sizes, "num_steps": 100}
+    settings = SimpleNamespace(stiffness=stiffness, methods=tuple(returns), **names)
     return Outcome(settings, courses, None)
 
 
@@ -251,16 +254,16 @@ CASES = [
     ("kernels", noise([1.0, 9.0]), "Gaussian and logistic noise; sampling agrees in 1 of 2 derivatives."),
     (
         "rolling_pin",
-        rolled(first_order=None, larger_pin=3, contact_loss=5),
-        "Soonest by “larger pin”; 2 of 3 ways find it, first order does not.",
+        rolled(first_order=1.0, contact_loss=0.01, larger_pin=0.002),
+        "2 of 3 ways find it, best “larger pin”; first order alone does not.",
     ),
-    ("rolling_pin", rolled(first_order=None), "None of 1 ways finds it."),
+    ("rolling_pin", rolled(first_order=1.0), "None of 1 ways finds it."),
     (
         "billiards",
         stroke(first_order=2, event=2, margin=0, kernel=0, noise=0),
-        "3 of 5 ways find it, but not “first order” or “event”.",
+        "3 of 5 find it to 1%, but not “first order” or “event”.",
     ),
-    ("billiards", stroke(first_order=2, margin=0, touching=-1), "1 of 2 ways find it: “margin”."),
+    ("billiards", stroke(first_order=2, margin=0, touching=-1), "1 of 2 find it to 1%: “margin”."),
     ("billiards", stroke(touching=-1), "Not answered: the balls touch at every start."),
     ("planning", planned(analytic=[1], none=[0]), "Yes, with smoothed models; with plain ones the rod does not move."),
     (
@@ -268,6 +271,12 @@ CASES = [
         planned(analytic=[1, 0.2], none=[0, 0.1]),
         "Yes (1 of 2), with smoothed models; with plain ones no (0 of 2).",
     ),
+    (
+        "planning",
+        planned(analytic=[0.5], none=[0]),
+        "No, not even with smoothed models; with plain ones the rod does not move.",
+    ),
+    ("long_horizon", long(("hopper", 0.8, 0.6)), "Better to 0.8 s (hopper); windows do not help."),
     (
         "long_horizon",
         long(("double pendulum", 1.3, 0.1), ("hopper", 0.8, 0.2)),
@@ -278,6 +287,7 @@ CASES = [
         long(("double pendulum", np.inf, 0.1), ("hopper", 0.1, 0.6)),
         "Better beyond 2 s (double pendulum), nowhere (hopper); windows help the double pendulum.",
     ),
+    ("cube_toss", toss(default=-1.0), "None comes within 2%; the nearest, event gradient, is 100% off."),
     (
         "cube_toss",
         toss(published=0.052, default=-1.0),
@@ -298,6 +308,7 @@ CASES = [
         shaken({"box": 0.4, "ball": 0.0}, [(1.0, 9.0), (1.0, 1.0), (0.0, 9.0)]),
         "Box; first order is biased across 1 of 2 jumps.",
     ),
+    ("artificial_discontinuity", shaken({"box": 0.4, "ball": 0.0, "2 × 2 points": 0.9}), "Box and points."),
     ("artificial_discontinuity", shaken(dict.fromkeys(["a b c", "d e f", "g h"], 1.0) | {"ball": 0.0}), "3 of 4."),
     (
         "ablation",
@@ -308,7 +319,17 @@ CASES = [
     (
         "work_precision",
         priced(5e-4, 2e-3, estimator="first order, onset"),
-        "1% error: 0.5 to 2 ms a simulated second; gradients soonest by first order, onset.",
+        "1% error: 0.5–2 ms a simulated second; gradients: first order, onset.",
+    ),
+    (
+        "work_precision",
+        priced(5e-4, None, 2e-3, estimator="first order, onset"),
+        "1% error: 0.5–2 ms a second on 2 of 3 scenes; gradients: first order, onset.",
+    ),
+    (
+        "work_precision",
+        priced(5e-4, 5e-4, estimator=("α-order, onset", "zeroth order")),
+        "1% error: 0.5 ms a simulated second; gradients: 2 ways tie.",
     ),
     ("work_precision", priced(None), "No setting is known to reach 1% of the motion."),
     (
@@ -323,13 +344,28 @@ CASES = [
     ),
     (
         "learning",
-        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4]),
-        "The highest return in C MuJoCo is that of first order: 9.00.",
+        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4], late=("zeroth",)),
+        "Soonest and worth most: first order, 9.00.",
     ),
     (
         "learning",
-        taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3]),
-        "3 seeds cannot tell first order without an onset from first order by event gradients.",
+        taught(onset=[9.0, 9, 9, 9], zeroth=[1.0, 2, 3, 4], late=("onset",)),
+        "Soonest: zeroth order; worth most: first order, 9.00.",
+    ),
+    (
+        "learning",
+        taught(alpha=[9.0, 9, 9], onset=[1.0, 2, 3], late=("onset",)),
+        "Soonest and worth most: α-order, 9.00; 3 seeds cannot tell it from first order.",
+    ),
+    (
+        "learning",
+        taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3], late=("discrete",)),
+        "Soonest: first order by event gradients; worth most: first order without an onset, 9.00 (unproven).",
+    ),
+    (
+        "learning",
+        taught(environment="trot", onset=[-24.0]),
+        "After 300 steps, 1.50 s, first order returns −24.0 in C MuJoCo.",
     ),
     (
         "learning",
@@ -338,14 +374,20 @@ CASES = [
     ),
     (
         "optimisation",
-        ended(first_order=list(range(8)), zeroth_order=list(range(10, 18))),
-        "First order ends lowest, at 3.5 ± 2.3.",
+        ended(first_order=[float(i) for i in range(8)], zeroth_order=[10.0 + i for i in range(8)]),
+        "First order ends lowest (3.50), zeroth order highest (13.5).",
     ),
     (
         "optimisation",
-        ended(first_order=[1.0, 1.1, 1.2], zeroth_order=[2.0, 2.1, 2.2]),
-        "3 seeds cannot tell first order from zeroth order, the two lowest.",
+        ended(first_order=[1.0, 1.1, 1.2], zeroth_order=[2.0, 2.1, 2.2], MPPI=[9.0, 9.0, 9.0]),
+        "First order ends lowest (1.10; 3 seeds cannot prove it), MPPI highest (9.00).",
     ),
+    (
+        "optimisation",
+        ended(**{"zeroth_order_(zero_noise,_pairs)": [1.0], "zeroth_order_(no_baseline,_pairs)": [2.0]}),
+        "Zeroth order (zero noise, pairs) ends lowest (1.00; one seed cannot prove it).",
+    ),
+    ("optimisation", ended(lone=[1.0, 2.0]), "Lone ends lowest, at 1.50 ± 0.50."),
     ("policy_gradient", pushed((True, 0.5, 0.5)), "It does not see hits and misses: biased at 1 of 1 points."),
     (
         "policy_gradient",

@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.testing import assert_allclose
 from experiments import learning
 from experiments.__main__ import main
 from experiments.config import ExperimentError, load_runs
-from experiments.learning import Course, Outcome, Settings, Sizes, findings, measure, verdict
+from experiments.learning import Course, Outcome, Settings, Sizes, answer, findings, measure, verdict
 from experiments.workspace import Workspace
 
 QUICK = Settings(
@@ -42,11 +43,38 @@ def test_what_was_left_out_is_said():
     lost = course("onset", [[1, 1], [1, 1]], not_finite=[[0, 0], [0, 0], [0, 0], [0.25, 0.25]], skipped=np.eye(4, 2))
     sentences = findings(Outcome(QUICK, [lost], None))
     assert sentences[0] == (
-        "First order: 0.062 of the derivatives were no numbers, 0 steps diverged, 2 updates were skipped."
+        "First order: 6.2% of the derivatives were no numbers, 0 steps diverged, 2 updates were skipped."
     )
     assert findings(Outcome(QUICK, [course("onset", [[1, 1], [1, 1]])], None))[0].startswith(
         "Every derivative was a number"
     )
+
+
+def test_what_was_shortened_is_said_once_of_all():
+    """A quarter of the values is one half: an eighth. Zeroth order has no derivatives to shorten."""
+    shortened = np.repeat([[0.5], [0], [0], [0]], 2, axis=1)
+    courses = [course(method, [[1, 1]] * 2, shortened=shortened) for method in ("onset", "alpha", "zeroth")]
+    assert findings(Outcome(QUICK, courses, None))[0] == (
+        "Derivatives longer than 0.3 times zeroth-order noise were shortened to that: 12% (first order) and 12% (α-order)."
+    )
+
+
+def test_a_reward_that_falls_again_is_not_the_soonest():
+    """Means over the updates so far: 0, 1, 2/3 and 1/2 against 0, 3/2, -1 and -3/4; half of the way is 1/4."""
+    rewards = {"onset": [0, 2, 0, 0], "zeroth": [0, 3, -6, 0]}
+    courses = [course(name, [[1, 1]] * 2, reward=np.repeat([r], 2, axis=0).T) for name, r in rewards.items()]
+    assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["onset"]
+
+
+def test_a_quadruped_is_judged_by_its_command():
+    """Squares of 0.04 m²/s² and 0.09 rad²/s² are 0.2 m/s and 0.3 rad/s."""
+    settings = QUICK.model_copy(update={"environment": "quadruped"})
+    one = replace(
+        course("onset", [[1, 1]] * 2), terms={"speed": np.full((2, 2), -0.04), "turning": np.full((2, 2), -0.09)}
+    )
+    outcome = Outcome(settings, [one], None)
+    assert answer(outcome) == "First order is off its command by 0.200 m/s and 0.300 rad/s."
+    assert findings(outcome)[1].endswith("pushes included: first order 0.200 m/s and 0.300 rad/s.")
 
 
 def test_curves_are_means_of_the_last_ten():

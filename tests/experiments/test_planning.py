@@ -62,9 +62,9 @@ def test_the_shortest_solved_way_is_shown_and_otherwise_the_nearest():
 
 def test_the_verdict_on_a_trajectory_says_who_arrives_and_who_does_not_move():
     found = outcome(TRAJECTORY, [attempt("analytic", 0.099), attempt("none", 0.0)])
-    assert (
-        verdict(found)
-        == "With analytic models the rod reaches its goal; with no smoothing the rod does not move at all."
+    assert verdict(found) == (
+        "With analytic models the rod reaches its goal to 1.0 mm and 0.000 rad; "
+        "with no smoothing the rod does not move at all."
     )
     assert tables(found)[0].rows[0][3:7] == ["1.0 mm", "0.000 rad", "4", "1 of 2"]
 

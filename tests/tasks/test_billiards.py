@@ -79,6 +79,6 @@ def test_the_verdict_tells_solved_from_stuck():
     runs = (run_of("near", 1.395), run_of("idle", 1.9999), run_of("half", 1.7), run_of("touching", 1.39, touches=True))
     settings = Settings(experiment="billiards", methods=tuple(run.method for run in runs))
     text = verdict(Outcome(settings, runs))
-    assert "near (1.395) reach the optimum of 1.3965" in text
-    assert "No progress beyond standing still (cost 2): idle (2.000); in between: half (1.700)." in text
-    assert "touching: solved (1.390)" in text
+    assert "“near” (1.395) reach the optimum of 1.3965" in text
+    assert "No progress beyond standing still (cost 2): “idle” (2.000); in between: “half” (1.700)." in text
+    assert "“touching”: solved (1.390)" in text

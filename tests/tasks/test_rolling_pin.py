@@ -117,8 +117,8 @@ def test_a_cost_counts_as_reached_only_where_it_stays(outcome):
 def test_the_verdict_names_what_stayed_what_solved_and_what_did_not(outcome):
     said = verdict(outcome)
     assert "its gradient is zero, exactly" in said
-    assert "Solved, with a true cost below 0.1 of the untouched bed's 1, by margin (0.0200)" in said
-    assert "Not solved by zeroth order (0.700)" in said
+    assert "Solved, with a true cost below 0.1 of the untouched bed's 1, by “margin” (0.0200)" in said
+    assert "Not solved by “zeroth order” (0.700)" in said
     shown = tables(outcome)[0]
     assert [row[0] for row in shown.rows] == ["first order", "margin", "zeroth order"]
     assert [row[4:6] for row in shown.rows] == [["never", ""], ["3", "6"], ["never", ""]]
