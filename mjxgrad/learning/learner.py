@@ -36,7 +36,6 @@ class Settings:
         critic_batches: parts of such a pass.
         target_rate: share by which the target value function follows the value function.
         largest_norm: to which gradients are clipped.
-        largest_entry: to which each of their numbers is clipped instead, unless None.
         largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
             zeroth-order one over environments: at 0.3 its variance is at most a tenth of that. Infinity shortens none.
         has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
@@ -59,7 +58,6 @@ class Settings:
     critic_batches: int = 4
     target_rate: float = 0.8
     largest_norm: float = 1.0
-    largest_entry: float | None = None
     largest_sample: float = 0.3
     has_critic: bool = True
     is_episodic: bool = False
@@ -85,7 +83,9 @@ class Settings:
 def apg(**changes: Any) -> Settings:
     """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
 
-    Windows follow one another. There the size of the noise is learned, from 0.07; here it falls linearly to 0.01.
+    Windows follow one another. Two things are not as there: the size of the noise is learned, from 0.07, and falls linearly to
+    0.01 here; and each number of a gradient is clipped to 1, where here the whole is, and long derivatives are shortened, by
+    which ten times the rate is still learned from.
 
     Args:
         changes: settings that are to be others.
@@ -102,8 +102,6 @@ def apg(**changes: Any) -> Settings:
         "actor_scale": 0.01,
         "actor_rate": 1e-4,
         "actor_decay": 0.997,
-        "largest_entry": 1.0,
-        "largest_sample": float("inf"),
         "has_critic": False,
     }
     return Settings(**(settings | changes))
@@ -199,8 +197,6 @@ def optimisers(
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Return those of policy and value function."""
     clip = optax.clip_by_global_norm(settings.largest_norm)
-    if settings.largest_entry is not None:
-        clip = optax.clip(settings.largest_entry)
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
         return optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95))
