@@ -307,7 +307,7 @@ def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_S
     is_split = total > 0
     # Without partial contacts the solve with p₊ is all there is.
     weight = jnp.where(is_split, jnp.sum(counts * share) / jnp.where(is_split, total, 1.0), 1.0)
-    rest = jnp.where(is_split, 1 - weight, 1.0)
+    rest = jnp.where(is_split & (weight < 1), 1 - weight, 1.0)
     early, late = share - weight, share / weight
     before = jnp.where(early > 0, early / rest, 0.0)
     before = jnp.where((share == 1) | ~is_split, share, before)

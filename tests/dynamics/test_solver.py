@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import newton
+from mjxgrad.dynamics import constraint, implicit, newton
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import DenseRows, JoinedRows
 from mjxgrad.dynamics.kinematics import Inertia
@@ -211,3 +211,27 @@ def test_in_single_precision_it_ends_when_what_is_left_is_rounding():
     assert count.max() <= 20
     # Conditions of 10² of M, more of H, times eps.
     np.testing.assert_allclose(acceleration, expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("size", [4, 18])  # by the factorisation written out, and by LAPACK's
+def test_a_row_so_stiff_that_rounding_hides_the_mass_leaves_a_finite_response(size: int):
+    """(1 + w j jᵀ)⁻¹ f is f less its part along j, if w is large; from 10⁷ on, single precision has no Cholesky factor of it."""
+    random, batch = np.random.default_rng(0), 512
+    row, force = random.normal(size=(2, batch, size))
+    row /= np.linalg.norm(row, axis=1, keepdims=True)
+    weight = 10 ** random.uniform(3, 9, size=(batch, 1))
+    single = [jnp.asarray(x, jnp.float32) for x in (row[:, None], force, weight)]
+
+    def response(row, force, weight):
+        rows = Rows(jnp.zeros_like(weight), weight, jnp.zeros_like(weight), ())
+        entries = JoinedRows((DenseRows(row),))
+        system = System(Inertia(jnp.eye(size, dtype=force.dtype)), force, entries, jnp.ones(1, bool), rows)
+        return implicit.respond(RowLayout(0, 0, 1), system, constraint.Bend(weight, ()), force)
+
+    found = jax.jit(jax.vmap(response))(*single)
+    expected = force - row * ((row * force).sum(1) / (1 + 1 / weight[:, 0]))[:, None]
+    assert np.isfinite(found).all()
+    error = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(force, axis=1)
+    # The condition times eps, and a few roundings.
+    resolved = weight[:, 0] < 1e5
+    assert (error <= 10 * weight[:, 0] * np.finfo(np.float32).eps)[resolved].all()
