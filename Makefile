@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow bench throughput costs gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow bench throughput costs identify-bench gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -59,6 +59,9 @@ throughput: .venv/.installed  ## measure a sweep over softness in one program ag
 
 costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
 	@$(BIN)/python -m experiments.benchmarks costs $(ARGS)
+
+identify-bench: .venv/.installed  ## measure identification against mujoco.sysid, answers included
+	@$(BIN)/python -m experiments.identification_bench $(ARGS)
 
 gallery: .venv/.installed  ## write runs/index.html, a page over all results with moving pictures
 	@$(BIN)/python -m experiments gallery

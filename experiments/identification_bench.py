@@ -1,0 +1,249 @@
+"""Which identifies faster, `mg.identify` or `mujoco.sysid`, and do both give the same answer? `make identify-bench`.
+
+A chain of hinges is driven by motors. C MuJoCo simulates windows of 100 steps, each from another start, and the joint angles are
+recorded with noise. Unknown are, joint by joint, the armature, the damping and the mass of the link. Both begin at the same wrong
+values and minimise the same residuals in double precision. They take turns, so that load meets both alike.
+
+- Theirs: one-sided differences of simulations by C MuJoCo, with as many threads as there are cores.
+- Ours, search: on JAX's default device, without tracing and compiling; the first step, which holds them, counts as the others.
+- Ours, called again: the whole call where the programs are in JAX's cache on disk. Every call traces anew.
+- Ours, first call: with an empty cache.
+
+Of what `mujoco[sysid]` brings, absl-py, colorama, pyyaml, scipy and tabulate are needed here.
+"""
+
+import argparse
+import contextlib
+import gc
+import io
+import itertools
+import logging
+import os
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
+from mujoco import sysid
+
+import mjxgrad as mg
+from mjxgrad import identification
+
+_NUM_STEPS = 100
+_NOISE = 1e-3  # rad
+_NOMINAL = {"armature": 0.02, "damping": 0.1, "mass": 0.5}  # kg m², N m s/rad, kg
+_BOUNDS = (0.1, 10.0)  # of the nominal value, as ours has them by default
+_LENGTH = 0.2  # of a link (m)
+# The defaults of both, written out because they are printed, but for two. Without contact an onset has nothing to do. At their
+# own xtol, 1e-8, rounding refuses the last step of the largest problem 140 times: 67 s in place of 23.
+_THEIRS: dict[str, Any] = {"optimizer": "mujoco", "xtol": 1e-6, "gtol": 1e-8, "max_iters": 200}
+_OURS: dict[str, Any] = {"max_steps": 100, "onset": None}
+_HEAD = (
+    "| parameters | windows | runs | theirs, s | steps | ours: search, s | steps | called again, s | first call, s "
+    "| values differ, of intervals | relatively | intervals differ |\n" + "|---" * 12 + "|"
+)
+
+
+class Problem(NamedTuple):
+    """What both are given: parameters as kind and joint, the chain with wrong values, and what was recorded."""
+
+    unknown: list[tuple[str, int]]
+    spec: Any
+    starts: np.ndarray
+    times: np.ndarray
+    controls: np.ndarray
+    measured: np.ndarray
+
+
+class Answer(NamedTuple):
+    """Values, half widths of their 95 % intervals, steps, seconds of the whole call, and of the search alone."""
+
+    values: np.ndarray
+    half_width: np.ndarray
+    num_steps: int
+    seconds: float
+    searching: float
+
+
+class Row(NamedTuple):
+    """Seconds of each run, steps of theirs and ours, and largest differences: in half widths, relative, of half widths."""
+
+    theirs: list[float]
+    search: list[float]
+    again: list[float]
+    first: list[float]
+    num_steps: tuple[int, int]
+    apart: tuple[float, float, float]
+
+
+def problem(num_parameters: int, num_windows: int) -> Problem:
+    """Return a chain, and windows of its motion with numbers that are up to half smaller or larger."""
+    kinds, random = list(_NOMINAL), np.random.default_rng(0)
+    unknown = [(kinds[i % len(kinds)], i // len(kinds)) for i in range(num_parameters)]
+    num_joints = unknown[-1][1] + 1
+    spec = _chain(num_joints)
+    truth = spec.copy()
+    for kind, joint in unknown:
+        _set(truth, kind, joint, _NOMINAL[kind] * random.uniform(0.5, 1.5))
+    model, shape = truth.compile(), (num_windows, num_joints)
+    moving = [0.5 * random.normal(size=shape), random.normal(size=shape)]  # rad, rad/s
+    starts = np.concatenate([np.zeros((num_windows, 1)), *moving], axis=1)
+    times = model.opt.timestep * np.arange(_NUM_STEPS + 1)
+    rates, phases = random.uniform(3, 10, shape)[:, None], random.uniform(0, 2 * np.pi, shape)[:, None]
+    controls = np.sin(rates * times[:, None] + phases)  # N m
+    states = np.asarray(mujoco.rollout.rollout(model, mujoco.MjData(model), starts, controls[:, :-1])[0], float)
+    angles = states[:, :, 1 : 1 + num_joints]
+    return Problem(unknown, spec, starts, times, controls, angles + _NOISE * random.normal(size=angles.shape))
+
+
+def _chain(num_joints: int) -> Any:
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 0.005
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "fromto": [0, 0, 0, _LENGTH, 0, 0], "size": [0.03, 0, 0]}
+    body = spec.worldbody
+    for i in range(num_joints):
+        body = body.add_body(name=f"link{i}", pos=[_LENGTH * (i > 0), 0, 0])
+        body.add_joint(name=f"joint{i}", axis=[0, 1 - i % 2, i % 2])
+        body.add_geom(name=f"link{i}", **capsule)
+        spec.add_actuator(name=f"motor{i}", target=f"joint{i}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        for kind, value in _NOMINAL.items():
+            _set(spec, kind, i, value)
+    return spec
+
+
+def _set(spec: Any, kind: str, joint: int, value: float) -> None:
+    if kind == "mass":
+        spec.geom(f"link{joint}").mass = value
+    elif kind == "damping":
+        spec.joint(f"joint{joint}").damping[0] = value
+    else:
+        spec.joint(f"joint{joint}").armature = value
+
+
+def solve_theirs(given: Problem) -> Answer:
+    """Return the answer of `mujoco.sysid`."""
+    spec = given.spec.copy()
+    model = spec.compile()
+    names = [(f"joint{i}_qpos", sysid.SignalType.MjStateQPos) for i in range(model.nv)]
+    controls = [sysid.TimeSeries(given.times, one) for one in given.controls]
+    measured = [sysid.TimeSeries.from_names(given.times[1:], one, model, names) for one in given.measured]
+    windows = [f"window{i}" for i in range(len(controls))]
+    sequences = sysid.ModelSequences("chain", spec, windows, list(given.starts), controls, measured, True)
+    parameters = sysid.ParameterDict()
+    for kind, joint in given.unknown:
+
+        def write(spec: Any, parameter: Any, kind: str = kind, joint: int = joint) -> None:
+            _set(spec, kind, joint, parameter.value[0])
+
+        low, high = (_NOMINAL[kind] * bound for bound in _BOUNDS)
+        parameters.add(sysid.Parameter(f"{kind}{joint}", _NOMINAL[kind], low, high, modifier=write))
+    residual = sysid.build_residual_fn(models_sequences=[sequences])
+    begin = time.perf_counter()
+    # The intervals need the last derivative, which is kept only where each step is printed.
+    with contextlib.redirect_stdout(io.StringIO()):
+        _, found = sysid.optimize(parameters, residual, verbose=False, **_THEIRS)
+    left, _, _ = residual(found.x, parameters, return_pred_all=True)
+    _, half_width = sysid.calculate_intervals(left, found.jac)
+    seconds = time.perf_counter() - begin
+    return Answer(found.x, half_width, len(found.extras["objective"]) - 1, seconds, seconds)
+
+
+def solve_ours(given: Problem) -> Answer:
+    """Return the answer of `mg.identify`."""
+    scene = mg.load_scene(given.spec.compile())
+    unknown = {
+        f"{kind}{i}": getattr(identification, kind)(scene, f"link{i}" if kind == "mass" else f"joint{i}")
+        for kind, i in given.unknown
+    }
+    recordings = []
+    for start, controls, measured in zip(given.starts, given.controls, given.measured, strict=True):
+        qpos, qvel = np.split(start[1:], 2)
+        state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
+        noise = {"qpos": np.linalg.norm(measured, axis=0) / np.sqrt(2)}  # as theirs weighs each column
+        one = identification.Recording({"qpos": measured}, controls[:-1], given.times[1:], noise=noise, start=state)
+        recordings.append(one)
+    moments = [time.perf_counter()]
+    found = mg.identify(scene, unknown, recordings, log=lambda *_: moments.append(time.perf_counter()), **_OURS)
+    moments.append(time.perf_counter())
+    searching = (moments[-1] - moments[1]) * found.num_steps / max(found.num_steps - 1, 1)
+    values, widths = (np.concatenate([np.ravel(x) for x in part.values()]) for part in (found.values, found.half_width))
+    return Answer(values, widths, found.num_steps, moments[-1] - moments[0], searching)
+
+
+def compare(given: Problem, runs: int, limit: float) -> Row:
+    """Solve a problem in turns, ours once before; after `limit` seconds no turn but the first begins."""
+    begin, first, theirs, ours = time.perf_counter(), solve_ours(given), [], []
+    while not theirs or (len(theirs) < runs and time.perf_counter() - begin < limit):
+        theirs.append(solve_theirs(given))
+        ours.append(solve_ours(given))
+    (expected, *_), (found, *_) = theirs, ours
+    apart = (
+        (found.values - expected.values) / expected.half_width,
+        found.values / expected.values - 1,
+        found.half_width / expected.half_width - 1,
+    )
+    search, again = [one.searching for one in ours], [one.seconds for one in ours]
+    steps = (expected.num_steps, found.num_steps)
+    difference, values, widths = (float(abs(x).max()) for x in apart)
+    return Row([one.seconds for one in theirs], search, again, [first.seconds], steps, (difference, values, widths))
+
+
+def _print(case: tuple[int, int], row: Row) -> None:
+    theirs, search, again = (f"{statistics.median(x):.3g} ({min(x):.3g})" for x in (row.theirs, row.search, row.again))
+    times = (theirs, row.num_steps[0], search, row.num_steps[1], again, f"{row.first[0]:.3g}")
+    cells = (*case, len(row.theirs), *times, *(f"{x:.0e}" for x in row.apart))
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
+def verdict(rows: Mapping[tuple[int, int], Row]) -> str:
+    """Say in one line where ours is faster by medians, and how far the values are apart."""
+    parts = []
+    for name, key in {"search alone": "search", "called again": "again", "with compiling": "first"}.items():
+        ratios = {case: statistics.median(x.theirs) / statistics.median(getattr(x, key)) for case, x in rows.items()}
+        won = [f"{p} × {w} ({ratio:.2g} times)" for (p, w), ratio in ratios.items() if ratio > 1]
+        parts.append(f"{name} at {', '.join(won) or 'none'}")
+    apart = max(row.apart[0] for row in rows.values())
+    return f"Ours is faster, {'; '.join(parts)}; theirs elsewhere. Values differ by at most {apart:.0e} of an interval."
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the table and where ours is faster."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parameters", type=int, nargs="*", default=[1, 8, 30])
+    parser.add_argument("--windows", type=int, nargs="*", default=[1, 10, 100])
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--limit", type=float, default=120, help="of a problem, after which no other run begins (s)")
+    options = parser.parse_args(arguments)
+    logging.getLogger("absl").setLevel(logging.ERROR)  # theirs warns of each window that angles are no sensors
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    print(
+        f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; "
+        f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}\n"
+        f"theirs: {_THEIRS}\nours: {_OURS}, ends when 1e-3 of a standard error is left to go\n"
+        f"seconds are the median of the runs (and the least), differences the largest\n\n{_HEAD}"
+    )
+    rows = {}
+    for case in itertools.product(options.parameters, options.windows):
+        # Nothing of one problem helps the next to compile, or is searched for garbage while theirs runs.
+        jax.clear_caches()
+        gc.collect()
+        with tempfile.TemporaryDirectory() as empty:
+            jax.config.update("jax_compilation_cache_dir", empty)
+            compilation_cache.reset_cache()
+            rows[case] = compare(problem(*case), options.runs, options.limit)
+        _print(case, rows[case])
+    print(f"\n{verdict(rows)}")
+
+
+if __name__ == "__main__":
+    main()
