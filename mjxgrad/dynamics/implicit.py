@@ -120,8 +120,8 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
 
     Where it is not needed it is zero.
 
-    In single precision S may exceed M so far (impedance near 1) that rounding leaves the sum not positive definite. Then the least
-    share of its diagonal that mends it, by powers of four from rounding on, is added: where M is lost, less moves.
+    In single precision S may exceed M so far (impedance near 1) that rounding leaves the sum not positive definite. Then the
+    least share of its diagonal that mends it, by powers of four from rounding on, is added: where M is lost, less moves.
     """
 
     def apply(x: _Vector) -> _Vector:
