@@ -139,7 +139,12 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
             return jnp.where(is_known, known, found), is_known | ~is_lost, diagonal, jnp.maximum(4 * share, rounding)
 
         rounding = float(jnp.finfo(force.dtype).eps)
-        first = (jnp.zeros_like(force), jnp.zeros(force.shape[1:], bool), jnp.zeros_like(force), jnp.zeros((), force.dtype))
+        first = (
+            jnp.zeros_like(force),
+            jnp.zeros(force.shape[1:], bool),
+            jnp.zeros_like(force),
+            jnp.zeros((), force.dtype),
+        )
         return jax.lax.while_loop(lambda s: ~s[1].all() & (s[3] < _MOST), attempt, first)[0]
 
     def run_where(system, bend, force, is_needed):
