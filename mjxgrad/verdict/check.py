@@ -191,12 +191,13 @@ def check(
     if derivatives and (motions.bad_steps < 0).any():
         say("compiling three kinds of derivative")
         compiling, loaded = time.perf_counter(), started + spent["loading"]
-        programs = Programs(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, loaded + _COMPILED * budget)
+        size, end = _BATCHES[scene.model.nv > _SMALL], loaded + budget
+        programs = Programs(scene, size, outcomes, deadline=loaded + _COMPILED * budget, end=end)
         programs.wait()
         spent["compiling"] = time.perf_counter() - compiling
         measuring = time.perf_counter()
         if "onset" in programs.kinds:
-            seconds = min(_MOVED * budget, loaded + budget - measuring)
+            seconds = min(_MOVED * budget, end - measuring)
             measured = measure(
                 scene,
                 motions,
@@ -204,7 +205,6 @@ def check(
                 rng,
                 from_start=cost is not None,
                 seconds=seconds,
-                deadline=loaded + budget,
                 log=say,
             )
             found += measured_findings(measured)

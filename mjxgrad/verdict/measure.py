@@ -118,10 +118,9 @@ def measure(
     *,
     from_start: bool,
     seconds: int | float,
-    deadline: float,
     log: Callable[[str], None],
 ) -> Measured:
-    """Measure along lines and under noise, in about so many seconds, and leave out what would not end by the deadline."""
+    """Measure along lines and under noise, in about so many seconds, and leave out what does not end before the programs do."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
@@ -155,7 +154,12 @@ def measure(
     def in_time(_: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
         # Going by what the steps before it took, beside each other.
         seconds = num_batches * num_steps / CHUNK * programs.chunk_seconds
-        return task() if time.perf_counter() + seconds < deadline else None
+        if time.perf_counter() + seconds > programs.end:
+            return None
+        try:
+            return task()
+        except TimeoutError:
+            return None
 
     # By worth, for the last ones are left out where time is short.
     asked = [lines[0], noises[0], *lines[1:], *noises[1:]]

@@ -6,6 +6,7 @@ shorter ones within it. Contact parameters are arguments, so that a sweep over s
 one direction compiles in half the time of reverse mode, and gives the change of every outcome at every time.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -83,6 +84,7 @@ class Programs:
         deadline: by `time.perf_counter`. What is not compiled by then is given up; a compilation that has begun cannot be
             stopped, and goes on until it ends.
         kinds: that are compiled, once `wait` has returned.
+        end: when no more steps are begun, likewise.
     """
 
     scene: Scene
@@ -90,6 +92,7 @@ class Programs:
     outcomes: Outcomes
     deadline: float
     kinds: tuple[str, ...] = ()
+    end: float = math.inf
 
     def __post_init__(self):
         self.contact = contact_of(self.scene.model)
@@ -156,7 +159,11 @@ class Programs:
         lengths: Sequence[int],
         contact: dict[str, Array] | None = None,
     ) -> Moved:
-        """Move a batch, with its change along a direction, and judge it after so many steps, which are multiples of `CHUNK`."""
+        """Move a batch, with its change along a direction, and judge it after so many steps, which are multiples of `CHUNK`.
+
+        Raises:
+            TimeoutError: at the `end`. Some states take a hundred times as long to solve as others, so nobody knows before.
+        """
         program = self._compiled[kind].result()
         contact = self.contact if contact is None else contact
         dtype = states.qpos.dtype
@@ -169,6 +176,8 @@ class Programs:
         pieces, bad, crowded, start = [], np.zeros(self.size, bool), np.zeros(self.size, bool), states
         start_change = change
         for begin in range(0, lengths[-1], CHUNK):
+            if time.perf_counter() > self.end:
+                raise TimeoutError
             here, called = slice(begin, begin + CHUNK), time.perf_counter()
             (states, kept), (change, kept_change), (diverged, is_crowded) = program(
                 contact, states, change, controls[:, here], control_change[:, here]

@@ -3,6 +3,7 @@
 import itertools
 import json
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import gymnasium
@@ -20,7 +21,7 @@ from mjxgrad.verdict.findings import left_out_findings, measured_findings, recom
 from mjxgrad.verdict.measure import Line, Measured, _estimates, measure
 from mjxgrad.verdict.motions import random_motions
 from mjxgrad.verdict.page import page
-from mjxgrad.verdict.programs import Moved, Programs, change_of_poses
+from mjxgrad.verdict.programs import Direction, Moved, Programs, change_of_poses
 
 BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></default><worldbody>
   <geom name="floor" type="plane" size="5 5 .1"/>
@@ -165,10 +166,8 @@ class OutOfTime(Programs):
 def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
     scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
     motions, programs = random_motions(scene, rng), OutOfTime(*kinds)
-    deadline = time.perf_counter() + 1000
-    measured = measure(
-        scene, motions, programs, rng, from_start=False, seconds=1, deadline=deadline, log=lambda _: None
-    )  # fmt: skip
+    programs.end = time.perf_counter() + 1000
+    measured = measure(scene, motions, programs, rng, from_start=False, seconds=1, log=lambda _: None)
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
     (told,) = left_out_findings(kinds, measured, 60)
     for words in ("budget of 60 s", 'gradient="event"', "a line along the controls", "noise of 0.3", "contacts at"):
@@ -181,6 +180,39 @@ def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
     assert (advice.gradient, advice.onset) == ("discrete", "discrete" not in kinds)
     drawn = page("scene", "headline", (), "", {}, measured, ("speed",))
     assert drawn.count('class="plain"') == (65 if "discrete" in kinds else 0)  # 2 panels of 32 dots, and a legend
+
+
+class Endless(OutOfTime):
+    """Programs that begin in good time, and then meet states that take for ever."""
+
+    chunk_seconds = 1e-9
+
+    def move(self, kind, states, controls, direction, lengths, contact=None):
+        if len(lengths) > 1:
+            raise TimeoutError
+        return super().move(kind, states, controls, direction, lengths, contact)
+
+
+def test_what_outlasts_the_budget_is_given_up_and_named():
+    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
+    motions = random_motions(scene, rng)
+    measured = measure(scene, motions, Endless("onset"), rng, from_start=False, seconds=1, log=lambda _: None)
+    assert (measured.lines, measured.noises, len(measured.left_out)) == ((), (), 7)
+    assert {finding.kind for finding in measured_findings(measured)} <= {"slope", "order", "note"}
+    assert recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None).estimator == "alpha_order"
+
+
+def test_no_steps_are_begun_after_the_end():
+    """Of a program that would be called."""
+    scene = mg.load_scene(ball())
+    programs, program = object.__new__(Programs), Future()
+    program.set_result(None)
+    programs.size, programs.scene, programs.contact, programs.end = 1, scene, {}, 0.0
+    programs._compiled = {"onset": program}
+    states = jax.tree.map(lambda leaf: np.array(leaf)[None], mg.initial_state(scene))
+    still = Direction(np.zeros(scene.model.nv), np.zeros(scene.model.nv), np.zeros((10, scene.model.nu)))
+    with pytest.raises(TimeoutError):
+        programs.move("onset", states, np.zeros((1, 10, scene.model.nu)), still, [10])
 
 
 def test_hit_or_miss_is_named_with_its_pair(wall):
