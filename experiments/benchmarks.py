@@ -124,7 +124,8 @@ def main(arguments: list[str] | None = None) -> None:
     options.run(options)
 
 
-def _announce(work: str) -> None:
+def announce(work: str) -> None:
+    """Print the machine, the work and the versions."""
     print(
         f"{len(jax.devices())} × {jax.devices()[0].device_kind}, {num_cores()} cores, {work}; "
         f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}"
@@ -149,7 +150,7 @@ def _bench(options: argparse.Namespace) -> None:
     """Print one table per scene and batch, and draw them."""
     if options.per_core:
         jax.config.update("jax_num_cpu_devices", num_cores())
-    _announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
+    announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
     found: dict[str, dict[int, list[Row]]] = {}
     for name in options.scene:
         for batch in options.batch:
@@ -349,7 +350,7 @@ def _print(row: Row, base: Row, steps: int) -> None:
 
 def _costs(options: argparse.Namespace) -> None:
     """Print one table per scene."""
-    _announce(f"batch {options.batch}, {_NUM_STEPS} steps")
+    announce(f"batch {options.batch}, {_NUM_STEPS} steps")
     for name, (place, height) in _STARTS.items():
         scene = mg.load_scene(_SCENES[name])
         _cost(name, scene, scene.data.qpos.at[place].add(height), options)
@@ -387,7 +388,7 @@ def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespa
 def _throughput(options: argparse.Namespace) -> None:
     """Print the time of the sweep, in one program and in ten, and a table of memory."""
     jax.config.update("jax_enable_compilation_cache", False)
-    _announce(f"{options.samples} samples, float32")
+    announce(f"{options.samples} samples, float32")
     task, key = mg.tasks.ball_wall(), jax.random.key(0)
 
     def estimates(stiffness: jax.Array, key: jax.Array, num_samples: int = options.samples) -> list:

@@ -19,7 +19,6 @@ import io
 import itertools
 import logging
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -34,6 +33,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from mujoco import sysid
 
 import mjxgrad as mg
+from experiments.benchmarks import announce
 from mjxgrad import identification
 
 _NUM_STEPS = 100
@@ -226,9 +226,8 @@ def main(arguments: list[str] | None = None) -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    announce(f"load {os.getloadavg()[0]:.1f} before")
     print(
-        f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; "
-        f"Python {platform.python_version()}, jax {jax.__version__}, mujoco {mujoco.__version__}\n"
         f"theirs: {_THEIRS}\nours: {_OURS}, ends when 1e-3 of a standard error is left to go\n"
         f"seconds are the median of the runs (and the least), differences the largest\n\n{_HEAD}"
     )

@@ -33,7 +33,7 @@ _Truth = Bool[Array, ""]
 _Scalar = Float[Array, ""]
 _Vector = Float[Array, " nv"]
 CHECKPOINT_NAME = "acceleration"
-# Of the diagonal of H, added where rounding has made it indefinite.
+# Of the diagonal of H: what is added where rounding has made it indefinite stays below.
 _MOST = 0.01
 
 

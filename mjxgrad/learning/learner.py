@@ -83,9 +83,8 @@ class Settings:
 def apg(**changes: Any) -> Settings:
     """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
 
-    Windows follow one another. Two things are not as there: the size of the noise is learned, from 0.07, and falls linearly to
-    0.01 here; and each number of a gradient is clipped to 1, where here the whole is, and long derivatives are shortened, by
-    which ten times the rate is still learned from.
+    Windows follow one another. Two things are not as there. The noise, from 0.07, is not learned, but falls linearly to 0.01.
+    Gradients are clipped as a whole, not number by number, and long derivatives are shortened: that stands larger rates.
 
     Args:
         changes: settings that are to be others.
@@ -196,9 +195,9 @@ def optimisers(
     settings: Settings, num_updates: int
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Return those of policy and value function."""
-    clip = optax.clip_by_global_norm(settings.largest_norm)
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
+        clip = optax.clip_by_global_norm(settings.largest_norm)
         return optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95))
 
     per_update = settings.critic_iterations * settings.critic_batches

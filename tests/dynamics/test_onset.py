@@ -13,6 +13,8 @@ import mjxgrad as mg
 from experiments.sawtooth import case
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics.collision import collide
+from mjxgrad.dynamics.onset import _split
+from mjxgrad.dynamics.rows import Block
 from mjxgrad.tasks import wall_softness
 from tests.dynamics.scenes import ASSETS
 
@@ -496,3 +498,19 @@ def test_the_distance_of_a_ball_from_a_box_is_cs_inside_and_outside():
         np.testing.assert_allclose(normal, theirs.frame[:3], atol=1e-9)
         np.testing.assert_allclose(pos, theirs.pos, atol=1e-9)
     assert num_inside > 10
+
+
+def test_a_weight_that_rounds_to_one_keeps_its_derivative():
+    """In single precision that of several contacts just short of whole does, and nothing is left of the step before them."""
+    block = object.__new__(Block)
+    for name, value in {"residual": jnp.zeros(5), "rows_each": 1}.items():
+        object.__setattr__(block, name, value)
+
+    def weight_and_before(shares):
+        found = _split([block], [jnp.append(shares, jnp.float32(1))], [None])
+        return found.weight, found.before
+
+    shares = 1 - jnp.array([2, 3, 1, 3], jnp.float32) * 2.0**-24
+    weight, _ = weight_and_before(shares)
+    assert weight == 1
+    assert np.isfinite(jax.jacrev(lambda x: weight_and_before(x)[1])(shares)).all()

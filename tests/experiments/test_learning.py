@@ -85,8 +85,8 @@ def test_curves_are_means_of_the_last_ten():
     assert_allclose(smooth[11], values[2:].mean(axis=0))
 
 
-def test_the_trot_is_learned_as_published():
-    """MuJoCo's notebook: 64 windows of 32; brax's decay of the rate, and no discount."""
+def test_the_trot_is_learned_as_published_but_for_the_rate():
+    """MuJoCo's notebook: 64 windows of 32; five times brax's rate, its decay, and no discount."""
     (published,) = load_runs("learn_trot", ['size="full"'])
     how = learning._how(published.settings, "onset")
     assert (how.num_environments, how.window, how.actor_layers) == (64, 32, (256, 128))
