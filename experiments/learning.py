@@ -115,7 +115,7 @@ class Course:
 
     @property
     def seconds(self) -> float:
-        """Of an update of all seeds, without compilation: the median, for a machine may be busy at times."""
+        """Of an update of all that learned side by side, without compilation: the median, for a machine may be busy at times."""
         return float(np.median(self.history["seconds"]))
 
     @property
@@ -180,14 +180,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         ppo.load()  # or say at once that it is not there
     environment = _environment(settings)
     workspace.check(environment.scene)
-    courses = []
-    cases = list(itertools.product(settings.stiffness, settings.methods))
-    with workspace.stage("learning", "updates", len(cases) * settings.sizes.num_updates) as advance_to:
-        for number, (stiffness, method) in enumerate(cases):
-            before = number * settings.sizes.num_updates
-            courses.append(
-                _course(settings, workspace, environment, method, stiffness, lambda n, b=before: advance_to(b + n))
-            )
+    courses, each = [], settings.sizes.num_updates
+    with workspace.stage("learning", "updates", len(settings.methods) * each) as advance_to:
+        for number, method in enumerate(settings.methods):
+            courses += _courses(settings, workspace, environment, method, lambda n, b=number * each: advance_to(b + n))
     return Outcome(settings, courses, environment)
 
 
@@ -196,24 +192,40 @@ def _environment(settings: Settings) -> Environment:
     return _LOADERS[settings.environment](**substeps)
 
 
-def _course(
-    settings: Settings, workspace: Workspace, environment: Environment, method: Method, stiffness: float, advance_to
-) -> Course:
-    key = jax.random.key(settings.seed)
-    stiffer = environment if stiffness == 1 else environment.with_softness(_stiffer(environment, stiffness))
+def _courses(
+    settings: Settings,
+    workspace: Workspace,
+    environment: Environment,
+    method: Method,
+    advance_to: Callable[[int], None],
+) -> list[Course]:
+    """Learn by one method: at every stiffness side by side, in one program, but for PPO."""
+    factors, num_updates = settings.stiffness, settings.sizes.num_updates
+    environments = [environment if k == 1 else environment.with_softness(_stiffer(environment, k)) for k in factors]
     if method == "ppo":
-        return _judged_course(settings, stiffer, method, stiffness, *_by_ppo(settings, stiffer, advance_to))
-    learned = learning.learn(
-        _stepped(stiffer, method),
-        jax.random.split(key, settings.sizes.num_seeds),
-        num_updates=settings.sizes.num_updates,
-        settings=_how(settings, method),
-        log=lambda done, _: advance_to(done),
-        log_every=_every(settings),
-        checkpoint=workspace.keep(f"{method}-{stiffness:g}"),
-    )
-    history = {name: np.asarray(values) for name, values in learned.history.items()}
-    return _judged_course(settings, stiffer, method, stiffness, learned.policy, _act, history)
+        learned = [
+            _by_ppo(settings, one, lambda done, i=i: advance_to((i * num_updates + done) // len(factors)))
+            for i, one in enumerate(environments)
+        ]
+    else:
+        found = learning.learn(
+            [_stepped(one, method) for one in environments],
+            jax.random.split(jax.random.key(settings.seed), settings.sizes.num_seeds),
+            num_updates=num_updates,
+            settings=_how(settings, method),
+            log=lambda done, _: advance_to(done),
+            log_every=_every(settings),
+            checkpoint=workspace.keep(method),
+        )
+        history = {name: np.asarray(values) for name, values in found.history.items()}
+        learned = [
+            (jax.tree.map(lambda x, i=i: x[i], found.policy), _act, {name: x[:, i] for name, x in history.items()})
+            for i in range(len(factors))
+        ]
+    return [
+        _judged_course(settings, one, method, k, *each)
+        for one, k, each in zip(environments, factors, learned, strict=True)
+    ]
 
 
 def _act(policy: learning.Policy, obs):
@@ -408,7 +420,8 @@ def tables(outcome: Outcome) -> list[Table]:
     heads = ("gradient", "return in C MuJoCo", "reward per step", "α", "variance, zeroth over first", "seconds")
     caption = (
         "Mean over seeds with their standard deviation. Reward per step: while learning, of the last updates. α: weight of the "
-        "first order. Seconds: of all seeds together, without compilation."
+        "first order. Seconds: of all seeds together, without compilation"
+        + ("." if len(outcome.settings.stiffness) == 1 else "; but for PPO of all stiffnesses, too.")
     )
     return [Table(heads, rows, caption)]
 
@@ -442,7 +455,7 @@ def course_of_learning(outcome: Outcome):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
     axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
-    policies = _counted(settings.sizes.num_seeds, "policy", "policies")
+    policies = _counted(settings.sizes.num_seeds * len(settings.stiffness), "policy", "policies")
     axes[0, 1].set(title="By time", xlabel=f"seconds for {policies}, without compilation")
     for axis in axes[0]:
         plain(axis.yaxis)

@@ -20,7 +20,7 @@ References:
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +48,12 @@ class Learned(eqx.Module):
     """
 
     policy: Policy
-    history: dict[str, Float[Array, "updates *seeds"]]
+    history: dict[str, Float[Array, "updates *policies"]]
     learner: Learner
 
 
 def learn(
-    environment: Environment,
+    environment: Environment | Sequence[Environment],
     key: Key[Array, "*seeds"] | UInt32[Array, "*seeds 2"],
     *,
     num_updates: int,
@@ -78,7 +78,8 @@ def learn(
     - `seconds`, of the clock for an update of all policies, without compilation.
 
     Args:
-        environment: to learn in.
+        environment: to learn in; or several that differ in numbers alone, such as the stiffness of contact. All learn side by
+            side from the same keys, and what is returned gets a first axis for them.
         key: consumed here; an array of several learns as many policies side by side, and what is returned gets an axis for them.
         num_updates: in all, those before a checkpoint included.
         settings: how; None are the defaults.
@@ -88,7 +89,7 @@ def learn(
             environment and key are needed; the result is that of an uninterrupted run to the bit, but for `seconds`.
 
     Raises:
-        ValueError: if a number is below 1, or the checkpoint is of another run.
+        ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is of another run.
     """
     settings = Settings() if settings is None else settings
     for name, number in (("num_updates", num_updates), ("log_every", log_every)):
@@ -97,30 +98,40 @@ def learn(
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.wrap_key_data(key)
     place, jit = _on_all_devices()
-    # As arguments, the environment's numbers are no part of the program: one that is stiffer needs no other.
-    arrays, structure = eqx.partition(environment, eqx.is_array)
-    arrays = place(arrays)
+    # As arguments, the environments' numbers are no part of the program: one that is stiffer needs no other.
+    is_one = isinstance(environment, Environment)
+    environments = [environment] if is_one else list(environment)
+    own, common, structure = _apart(environments)
+    arrays = place((own, common))
 
-    def of_each(function: Callable, arrays: Environment) -> Callable:
-        one = functools.partial(function, eqx.combine(arrays, structure), settings=settings, num_updates=num_updates)
-        return jax.vmap(one) if key.ndim else one
+    def of_each(function: Callable, arrays: tuple[Environment, Environment]) -> Callable:
+        def in_one(own: Environment, state: Any) -> Any:
+            one = functools.partial(
+                function, eqx.combine(own, arrays[1], structure), settings=settings, num_updates=num_updates
+            )
+            return (jax.vmap(one) if key.ndim else one)(state)
 
+        in_all = in_one if is_one else jax.vmap(in_one, axis_size=len(environments))
+        return functools.partial(in_all, arrays[0])
+
+    shape = key.shape if is_one else (len(environments), *key.shape)
     # As numbers on the host, a key is the same in all processes.
     numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
+    numbers = np.broadcast_to(numbers, (*shape, *numbers.shape[key.ndim :]))
     start = jit(lambda arrays, numbers: of_each(begin, arrays)(jax.random.wrap_key_data(numbers, impl=kind)))
     learner = start(arrays, numbers)
     found = jax.eval_shape(lambda arrays, learner: of_each(update, arrays)(learner)[1], arrays, learner)
-    found["seconds"] = jax.ShapeDtypeStruct(key.shape, np.float64)
+    found["seconds"] = jax.ShapeDtypeStruct(shape, np.float64)
     history = {name: np.zeros((0, *x.shape), x.dtype) for name, x in found.items()}
     path = None if checkpoint is None else Path(checkpoint)
-    fingerprint = _fingerprint(environment, settings, num_updates, key)
+    fingerprint = _fingerprint(environments, settings, num_updates, key)
     if path is not None and path.is_file():
         learner, history = checkpoints.load(path, (learner, history), fingerprint)
         learner = place(learner)
 
     @functools.lru_cache
-    def several(count: int) -> Callable[[Environment, Learner], tuple[Learner, dict[str, Array]]]:
-        def run(arrays: Environment, learner: Learner) -> tuple[Learner, dict[str, Array]]:
+    def several(count: int) -> Callable[[Any, Learner], tuple[Learner, dict[str, Array]]]:
+        def run(arrays: Any, learner: Learner) -> tuple[Learner, dict[str, Array]]:
             return jax.lax.scan(lambda now, _: of_each(update, arrays)(now), learner, length=count)
 
         return jit(run).lower(arrays, learner).compile()
@@ -130,7 +141,7 @@ def learn(
         count = min(log_every, num_updates - done)
         program, start_time = several(count), time.perf_counter()
         learner, found = jax.block_until_ready(program(arrays, learner))
-        seconds = np.full((count, *key.shape), (time.perf_counter() - start_time) / count)
+        seconds = np.full((count, *shape), (time.perf_counter() - start_time) / count)
         found = {name: np.asarray(values) for name, values in found.items()} | {"seconds": seconds}
         history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
         if path is not None and is_first:
@@ -138,6 +149,18 @@ def learn(
         if log is not None and is_first:
             log(int(learner.num_updates.max()), {name: _mean(values) for name, values in found.items()})
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
+
+
+def _apart(environments: Sequence[Environment]) -> tuple[Environment, Environment, Environment]:
+    """Return arrays that environments have each their own of, stacked, those that all share, and what is no array."""
+    parts = [eqx.partition(one, eqx.is_array) for one in environments]
+    (first, structure), *others = parts
+    if not all(eqx.tree_equal(structure, other) for _, other in others):
+        raise ValueError("environments that learn side by side must differ in numbers alone: learn in each by itself")
+    is_common = jax.tree.map(lambda *x: len(set(map(checkpoints.digest, x))) == 1, *(x for x, _ in parts))
+    common, own = eqx.partition(first, is_common)
+    others = [eqx.filter(x, is_common, inverse=True) for x, _ in others]
+    return jax.tree.map(lambda *x: jnp.stack(x), own, *others), common, structure
 
 
 def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Any]]:
@@ -159,13 +182,13 @@ def _mean(values: np.ndarray) -> float:
 
 
 def _fingerprint(
-    environment: Environment, settings: Settings, num_updates: int, key: Key[Array, "*seeds"]
+    environments: Sequence[Environment], settings: Settings, num_updates: int, key: Key[Array, "*seeds"]
 ) -> dict[str, Any]:
     """Return what must agree between a checkpoint and the run that goes on from it."""
     return {
         "settings": repr(settings),
         "num_updates": num_updates,
-        "environment": type(environment).__qualname__,
-        "numbers of the environment": checkpoints.digest(eqx.filter(environment, eqx.is_array)),
+        "environment": type(environments[0]).__qualname__,
+        "numbers of the environment": checkpoints.digest(eqx.filter(environments, eqx.is_array)),
         "key": checkpoints.digest(key),
     }

@@ -1,11 +1,13 @@
 """The loop: it goes on to the bit, says what it left out, and ends with a policy that does the job in C MuJoCo."""
 
+import dataclasses
 import functools
 import os
 import subprocess
 import sys
 import textwrap
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -17,6 +19,7 @@ from numpy.testing import assert_allclose
 from mjxgrad import envs, learning
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.estimators.rules import FixedAlpha
+from mjxgrad.learning.learn import _apart
 from mjxgrad.learning.logs import to_all, to_csv, to_tracker
 
 SMALL = learning.Settings(num_environments=4, window=3, actor_layers=(6,), critic_layers=(6,), critic_iterations=2)
@@ -257,16 +260,38 @@ def _numbers(kind, folder, count=1):
         return [archive[name] for name in archive.files]
 
 
+def _stronger(cartpole):
+    return dataclasses.replace(
+        cartpole, scene=cartpole.scene.with_model(actuator_gainprm=3 * cartpole.scene.model.actuator_gainprm)
+    )
+
+
 @pytest.mark.slow
-def test_seeds_side_by_side_learn_as_each_alone(cartpole, key):
-    """Up to the order of sums in a batch."""
-    keys = jax.random.split(key, 2)
-    both = learning.learn(cartpole, keys, num_updates=2, settings=SMALL)
-    assert both.history["reward"].shape == (2, 2)
-    alone = learning.learn(cartpole, keys[1], num_updates=2, settings=SMALL)
-    pairs = zip(jax.tree.leaves(both.policy), jax.tree.leaves(alone.policy), strict=True)
-    for together, mine in pairs:
-        assert_allclose(together[1], mine, rtol=1e-8, atol=1e-10)
+def test_seeds_and_environments_side_by_side_learn_as_each_alone(cartpole, key):
+    """Up to the order of sums in a batch; of three environments with two seeds each, the second seed of the last."""
+    keys, stronger = jax.random.split(key, 2), _stronger(cartpole)
+    together = learning.learn([cartpole, cartpole, stronger], keys, num_updates=2, settings=SMALL)
+    assert together.history["reward"].shape == (2, 3, 2)
+    alone = learning.learn(stronger, keys[1], num_updates=2, settings=SMALL)
+    pairs = zip(jax.tree.leaves(together.policy), jax.tree.leaves(alone.policy), strict=True)
+    for all_of_them, mine in pairs:
+        assert_allclose(all_of_them[2, 1], mine, rtol=1e-8, atol=1e-10)
+        assert_allclose(all_of_them[0], all_of_them[1], rtol=1e-8, atol=1e-10)
+    assert not np.allclose(together.history["reward"][:, 0], together.history["reward"][:, 2], rtol=1e-3)
+
+
+def test_environments_that_differ_in_more_than_numbers_are_refused(cartpole, key):
+    other = dataclasses.replace(cartpole, frame_skip=3)
+    with pytest.raises(ValueError, match="must differ in numbers alone"):
+        learning.learn([cartpole, other], key, num_updates=1, settings=SMALL)
+
+
+def test_environments_share_all_numbers_but_those_that_differ(cartpole):
+    """What all share is not copied for each of them."""
+    own, common, _ = _apart([cartpole, _stronger(cartpole)])
+    (gain,) = jax.tree.leaves(own)
+    assert_allclose(gain[1], 3 * gain[0], rtol=1e-6)
+    assert len(jax.tree.leaves(common)) == len(jax.tree.leaves(eqx.filter(cartpole, eqx.is_array))) - 1
 
 
 @pytest.mark.slow
