@@ -439,7 +439,9 @@ def drawings(outcome: Outcome) -> Drawings:
     found: dict[str, Any] = {"course": course_of_learning}
     if len(outcome.settings.stiffness) > 1:
         found["stiffness"] = by_stiffness
-    return found | {"variance": quality}
+    if any(course.method != "ppo" for course in outcome.courses):
+        found["variance"] = quality
+    return found
 
 
 def course_of_learning(outcome: Outcome):
