@@ -51,7 +51,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     run.add_argument("--debug", action="store_true", help="show tracebacks")
     commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
     gallery = commands.add_parser("gallery", help="write one page over all results, index.html")
-    gallery.add_argument("--output", type=Path, default=Path("runs"), help="folder of results (default: runs)")
+    gallery.add_argument("--output", type=_folder, default=Path("runs"), help="folder of results (default: runs)")
     gallery.set_defaults(debug=False)
     options, rest = parser.parse_known_args(arguments)
     # argparse takes overrides on one side of an option only; those on its other side are left over.

@@ -71,7 +71,9 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     except UnicodeDecodeError as error:
         raise ConfigurationError(path.name, [f"not UTF-8, at byte {error.start}; save it as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(path.name, [f"not TOML: {error}"]) from None
+        # tomllib's own words for a key that is there twice.
+        told = str(error).replace("Cannot overwrite a value", "a key is given twice")
+        raise ConfigurationError(path.name, [f"not TOML: {told}"]) from None
     except RecursionError:
         raise ConfigurationError(path.name, ["arrays or tables are nested too deeply"]) from None
 

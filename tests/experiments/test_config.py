@@ -166,6 +166,7 @@ def test_a_file_without_a_comment_has_no_question():
     [
         (b"\xcd # Is it so?", "not UTF-8, at byte 0; save it as UTF-8"),
         (f"seed = {'9' * 5000}".encode(), "not TOML: a number is too long"),
+        (VALID.encode() + b"stddev = 1\n", "not TOML: a key is given twice (at line 11, column 11)"),
         (b"experiment = ['bias_variance']", 'experiment: there is no experiment ["bias_variance"]; did you mean'),
         (b"[experiment]", "experiment: there is no experiment {}; choose one of ablation"),
         (b"", "experiment: required, and missing; choose one of ablation"),
