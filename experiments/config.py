@@ -173,14 +173,13 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
     except ValidationError as error:
-        return None, [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
-
-
-def _follows(detail: ErrorDetails, error: ValidationError) -> bool:
-    """Tell whether an array is only too short for the mistakes within it, which are reported themselves."""
-    place = detail["loc"]
-    inner = (other["loc"][: len(place)] for other in error.errors() if len(other["loc"]) > len(place))
-    return detail["type"] == "too_short" and place in inner
+        details = error.errors()
+        # An array that is only too short for the mistakes within it, which are reported themselves, is none.
+        inner = {detail["loc"][:depth] for detail in details for depth in range(1, len(detail["loc"]))}
+        details = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in inner]
+        # The search for the nearest key takes minutes for a hundred thousand; those that are not shown are counted alone.
+        rest = [str(detail["loc"]) for detail in details[_MOST_SHOWN:]]
+        return None, [*(_sentence(settings, detail, swept) for detail in details[:_MOST_SHOWN]), *rest]
 
 
 def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:

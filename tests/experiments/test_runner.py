@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import signal
@@ -313,10 +314,17 @@ def test_without_opengl_there_is_a_sentence_in_place_of_the_video(tmp_path, monk
     assert found == (None, "install libosmesa6")
 
 
+def test_a_choice_of_opengl_that_mujoco_does_not_know_is_a_sentence(tmp_path):
+    """MuJoCo cannot even be imported under it."""
+    command = [sys.executable, "-m", "experiments", "run", "ramp", "--output", str(tmp_path)]
+    environment = {**os.environ, "MUJOCO_GL": "bogus"}
+    result = subprocess.run(command, env=environment, cwd=runner.ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert result.stderr.endswith('MUJOCO_GL: bogus; unset it, or take "egl", "osmesa" or "glfw"\n')
+
+
 @pytest.mark.slow
 def test_the_main_job_completes_without_opengl_and_says_which_package_brings_it(tmp_path):
-    import os
-
     small = ["num_samples=8", "reference_samples=100", "stiffness=[1e2,1e4]", "angles=[0.65]"]
     command = [sys.executable, "-m", "experiments", "run", "ball_wall", *small, "--output", str(tmp_path)]
     result = subprocess.run(
