@@ -270,6 +270,10 @@ def _take_sweep(table: dict[str, Any]) -> tuple[dict[str, list[Any]], list[str]]
     flat = flatten(sweep)
     for key in [key for key, values in flat.items() if not isinstance(values, list) or not values]:
         problems.append(f"sweep.{key}: must be an array of at least one value, got {flat.pop(key)!r}")
+    for key, values in flat.items():
+        # The second would be the first one's folder, and an answer more.
+        if len({json.dumps(value, default=str) for value in values}) < len(values):
+            problems.append(f"sweep.{key}: must differ, got a value more than once")
     return flat, problems
 
 

@@ -86,6 +86,7 @@ def test_an_array_that_is_too_short_for_its_own_mistakes_alone_is_not_called_so(
         ("num_samples=1", "num_samples: must be greater than or equal to 2, got 1"),
         ("stddev=nan", "stddev: must be a finite number, got NaN"),
         ("angles=[0.1, true]", "angles[1]: must be number, got true"),
+        ("sweep.seed=[0, 1, 0]", "sweep.seed: must differ, got a value more than once"),
         ("stddev.x=1", "stddev.x: stddev is a value, not a table"),
         ("seed=2026-01-01", "seed: must be integer"),
         ("seed=[1", "seed=[1: [1 is not a TOML value"),
@@ -110,6 +111,12 @@ def test_bare_words_in_a_list_are_strings():
     assert run.settings.scenes == ("hopper", "reacher")
     (found,) = mistakes("ablation", "scenes=[hoper]")
     assert found == 'scenes[0]: there is no "hoper"; did you mean "hopper"?'
+    assert mistakes("ablation", "scenes=[hopper,hopper]") == ("scenes: must differ, got hopper more than once",)
+
+
+def test_a_point_may_have_a_coordinate_twice():
+    (run,) = load_runs("planar_push", ["finger=[0.2, 0.2]"])
+    assert run.settings.finger == (0.2, 0.2)
 
 
 def test_a_size_is_one_of_the_tables_of_its_file_and_single_values_win_over_it():
