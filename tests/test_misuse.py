@@ -40,6 +40,10 @@ def task(cost):
     return mg.SceneTask(scene, state, cost, 2).run(jnp.zeros((2, 1)))
 
 
+def elite(count):
+    return mg.baselines.cross_entropy(noisy, params, key, num_samples=8, num_elite=count, num_steps=2)
+
+
 def answer(call):
     try:
         eval(call)
@@ -59,6 +63,10 @@ FOUND = {
     "first(cost=lambda x: x)": "function must return a scalar of shape (), got shape (2,)",
     "first(count='8')": "num_samples must be a whole number, got '8'",
     "estimators.least_squares(noisy, params, key, num_samples='8')": "num_samples must be a whole number, got '8'",
+    "mg.baselines.predictive_sampling(noisy, params, key, num_samples=2.5, num_steps=2)": "num_samples must be a whole number",
+    "elite(2.5)": "num_elite must be a whole number, got 2.5",
+    "mg.diagnostics.bias_variance(lambda k: noisy, params[None], key, softness=params, num_samples=4, num_reference='9')":
+        "num_reference must be a whole number, got '9'",
     "first(count=None)": "num_samples must be a whole number, got None",
     "first(count=2.5)": "num_samples must be a whole number, got 2.5",
     "first(count=8.0)": "num_samples must be a whole number, got 8.0",
