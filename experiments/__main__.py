@@ -32,10 +32,16 @@ def main(arguments: list[str] | None = None) -> int:
         print(str(error) or type(error).__name__, file=sys.stderr)
         return 2
     except RuntimeError as error:
-        # JAX's word for what NumPy says by a MemoryError.
-        if options.debug or not str(error).startswith("RESOURCE_EXHAUSTED"):
+        first = str(error).partition("\n")[0]
+        # JAX's word for what NumPy says by a MemoryError, and MuJoCo's when it refuses to be imported.
+        told = {
+            "RESOURCE_EXHAUSTED": f"not enough memory; take fewer samples ({first})",
+            "invalid value for environment variable MUJOCO_GL": f'{first}; unset it, or take "egl", "osmesa" or "glfw"',
+        }
+        known = next((said for word, said in told.items() if first.startswith(word)), None)
+        if options.debug or known is None:
             raise
-        print(f"not enough memory; take fewer samples ({str(error).splitlines()[0]})", file=sys.stderr)
+        print(known, file=sys.stderr)
         return 2
     return 0
 
@@ -51,7 +57,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     run.add_argument("--debug", action="store_true", help="show tracebacks")
     commands.add_parser("list", help="list the configurations there are").set_defaults(debug=False)
     gallery = commands.add_parser("gallery", help="write one page over all results, index.html")
-    gallery.add_argument("--output", type=Path, default=Path("runs"), help="folder of results (default: runs)")
+    gallery.add_argument("--output", type=_folder, default=Path("runs"), help="folder of results (default: runs)")
     gallery.set_defaults(debug=False)
     options, rest = parser.parse_known_args(arguments)
     # argparse takes overrides on one side of an option only; those on its other side are left over.

@@ -71,7 +71,9 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     except UnicodeDecodeError as error:
         raise ConfigurationError(path.name, [f"not UTF-8, at byte {error.start}; save it as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(path.name, [f"not TOML: {error}"]) from None
+        # tomllib's own words for a key that is there twice.
+        told = str(error).replace("Cannot overwrite a value", "a key is given twice")
+        raise ConfigurationError(path.name, [f"not TOML: {told}"]) from None
     except RecursionError:
         raise ConfigurationError(path.name, ["arrays or tables are nested too deeply"]) from None
 
@@ -171,14 +173,13 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
         # Through JSON, where a strict model takes an array for a tuple; TOML's dates become strings and are refused.
         return settings.model_validate_json(json.dumps(table, default=str), strict=True), []
     except ValidationError as error:
-        return None, [_sentence(settings, detail, swept) for detail in error.errors() if not _follows(detail, error)]
-
-
-def _follows(detail: ErrorDetails, error: ValidationError) -> bool:
-    """Tell whether an array is only too short for the mistakes within it, which are reported themselves."""
-    place = detail["loc"]
-    inner = (other["loc"][: len(place)] for other in error.errors() if len(other["loc"]) > len(place))
-    return detail["type"] == "too_short" and place in inner
+        details = error.errors()
+        # An array that is only too short for the mistakes within it, which are reported themselves, is none.
+        inner = {detail["loc"][:depth] for detail in details for depth in range(1, len(detail["loc"]))}
+        details = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in inner]
+        # The search for the nearest key takes minutes for a hundred thousand; those that are not shown are counted alone.
+        rest = [str(detail["loc"]) for detail in details[_MOST_SHOWN:]]
+        return None, [*(_sentence(settings, detail, swept) for detail in details[:_MOST_SHOWN]), *rest]
 
 
 def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
@@ -269,6 +270,10 @@ def _take_sweep(table: dict[str, Any]) -> tuple[dict[str, list[Any]], list[str]]
     flat = flatten(sweep)
     for key in [key for key, values in flat.items() if not isinstance(values, list) or not values]:
         problems.append(f"sweep.{key}: must be an array of at least one value, got {flat.pop(key)!r}")
+    for key, values in flat.items():
+        # The second would be the first one's folder, and an answer more.
+        if len({json.dumps(value, default=str) for value in values}) < len(values):
+            problems.append(f"sweep.{key}: must differ, got a value more than once")
     return flat, problems
 
 

@@ -51,8 +51,6 @@ class Settings(RunSettings):
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
-        if len(set(self.kernels)) < len(self.kernels):
-            raise ValueError(f"kernels must differ, got {', '.join(self.kernels)}")
         if self.timestep > 0.25 * self.time_constant:
             raise ValueError(f"timestep must be at most a quarter of time_constant, got {self.timestep:g}")
         return self

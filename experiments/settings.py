@@ -1,5 +1,6 @@
 """What every kind of experiment can be told, and what its settings are made of; imports nothing heavy."""
 
+from collections import Counter
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
@@ -16,10 +17,15 @@ class SettingsTable(BaseModel):
     @field_validator("*")
     @classmethod
     def _fits(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse counts beyond the integers that index arrays; a seed has a bound of its own."""
+        """Refuse counts beyond the integers that index arrays, where a seed has a bound of its own, and lists with one twice."""
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, int) and abs(one) >= 2**31 and info.field_name != "seed":
                 raise ValueError(f"must be below 2^31, got {one:.3g}")
+        # Twice the same would count as two in tests and answers over all of them; a point may have a coordinate twice.
+        if value and isinstance(value, tuple) and "..." in str(cls.model_fields[str(info.field_name)].annotation):
+            one, count = Counter(value).most_common(1)[0]
+            if count > 1 and not isinstance(one, BaseModel):
+                raise ValueError(f"must differ, got {f'{one:g}' if isinstance(one, float) else one} more than once")
         return value
 
 

@@ -3,6 +3,7 @@
 import operator
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +47,11 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
     if least is not None and number < least:
         raise ValueError(f"{name} must be at least {least}, got {number}")
     return number
+
+
+def form(value: Any) -> str:
+    """Return the shape of numbers, or the type of what is none, as messages print it."""
+    return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__
 
 
 def one_key(key: Any) -> None:

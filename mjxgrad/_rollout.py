@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import known, whole
+from mjxgrad._arrays import form, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
@@ -306,9 +306,11 @@ def _check_scene(scene: Any) -> None:
 
 def _one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
     """Refuse what a policy chose unless it is one control per actuator: others would be added up, or shared out, in silence."""
-    if chosen is None or jnp.shape(chosen) != (num_controls,):
-        given = "None" if chosen is None else f"shape {jnp.shape(chosen)}"
-        raise ValueError(f"the policy must return one control per actuator, shape ({num_controls},), got {given}")
+    chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
+    if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (num_controls,):
+        raise ValueError(
+            f"the policy must return one control per actuator, shape ({num_controls},), got {form(chosen)}"
+        )
     return jnp.asarray(chosen)
 
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import whole
 from mjxgrad.objective import ActionNoise, Objective
 from mjxgrad.objective.base import as_objective
 from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
@@ -109,7 +110,7 @@ def cross_entropy(
         2005, section 5 (continuous optimisation, with smoothing of the fit).
     """
     width = search_stddev(objective, params, stddev, num_samples)
-    if not 2 <= num_elite <= num_samples:
+    if not 2 <= whole("num_elite", num_elite, None) <= num_samples:
         raise ValueError(f"num_elite must be at least 2 and at most num_samples = {num_samples}, got {num_elite}")
     if not 0 <= keep < 1:
         raise ValueError(f"keep must be at least 0 and below 1, got {keep}")
@@ -214,8 +215,7 @@ def search_stddev(
 ) -> Float[Array, " dim"]:
     """Return the width of the search for each parameter, refusing what makes no sense."""
     as_objective(objective)
-    if num_samples < 2:
-        raise ValueError(f"num_samples must be at least 2, got {num_samples}")
+    whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
     if stddev is None:
         stddev = parameter_stddev(objective, dim)

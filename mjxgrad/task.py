@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import form
 from mjxgrad._rollout import Engine, Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
@@ -199,12 +200,13 @@ class SceneTask(Task, InEngine):
             qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
             time = start.time + self.scene.model.opt.timestep * jnp.arange(self.horizon)
             states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-        charged = finite_cost(jnp.asarray(self.cost(trajectory)), trajectory)
-        if charged.shape not in ((), (self.horizon + 1,)):
+        cost = self.cost(trajectory)
+        if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (self.horizon + 1,)):
             raise ValueError(
                 "the task's cost must return a scalar of shape () or one number per state, "
-                f"shape ({self.horizon + 1},), got shape {charged.shape}"
+                f"shape ({self.horizon + 1},), got {form(cost)}"
             )
+        charged = finite_cost(jnp.asarray(cost), trajectory)
         return Outcome(charged.sum(), states, charged if charged.ndim else None)
 
 

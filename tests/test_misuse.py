@@ -36,6 +36,14 @@ def optimise(**how):
     return mg.optimise(noisy, how.pop("at", params), how.pop("key", key), **given | how)
 
 
+def task(cost):
+    return mg.SceneTask(scene, state, cost, 2).run(jnp.zeros((2, 1)))
+
+
+def elite(count):
+    return mg.baselines.cross_entropy(noisy, params, key, num_samples=8, num_elite=count, num_steps=2)
+
+
 def answer(call):
     try:
         eval(call)
@@ -48,10 +56,17 @@ print(json.dumps({call: answer(call) for call in json.loads(sys.argv[1])}))
 """
 FOUND = {
     "first(objective=lambda x: x @ x)": "objective must be an Objective, got function; wrap a function by mg.parameter_noise",
+    "estimators.zeroth_order(lambda x: x @ x, params, key, num_samples=8)": "objective must be an Objective, got function",
+    "estimators.first_and_zeroth_order(abs, params, key, num_samples=8)": "objective must be an Objective, got builtin",
     "first(cost=lambda x: {'cost': x @ x})": "function must return one number, got dict",
     "first(cost=lambda x: None)": "function must return one number, got NoneType",
     "first(cost=lambda x: x)": "function must return a scalar of shape (), got shape (2,)",
     "first(count='8')": "num_samples must be a whole number, got '8'",
+    "estimators.least_squares(noisy, params, key, num_samples='8')": "num_samples must be a whole number, got '8'",
+    "mg.baselines.predictive_sampling(noisy, params, key, num_samples=2.5, num_steps=2)": "num_samples must be a whole number",
+    "elite(2.5)": "num_elite must be a whole number, got 2.5",
+    "mg.diagnostics.bias_variance(lambda k: noisy, params[None], key, softness=params, num_samples=4, num_reference='9')":
+        "num_reference must be a whole number, got '9'",
     "first(count=None)": "num_samples must be a whole number, got None",
     "first(count=2.5)": "num_samples must be a whole number, got 2.5",
     "first(count=8.0)": "num_samples must be a whole number, got 8.0",
@@ -65,6 +80,7 @@ FOUND = {
     "optimise(optimiser='adam')": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got 'adam'",
     "optimise(optimiser=optax.adam)": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got <function",
     "optimise(num_steps=2.5)": "num_steps must be a whole number, got 2.5",
+    "optimise(key=0)": "key must come from jax.random.key, with at most one leading axis, got int32 of shape ()",
     "optimise(at=jnp.zeros(0))": "params must have at least one number, got none",
     "jax.jit(lambda x: optimise(at=x))(params)": "optimise must be called outside of jax.jit and jax.vmap",
     "optimise(checkpoint=archive)": "checkpoint must be a file that a run has saved, got ",
@@ -74,12 +90,17 @@ FOUND = {
     "mg.rollout(scene, state, horizon=2.5)": "horizon must be a whole number, got 2.5",
     "jax.jit(lambda n: mg.rollout(scene, state, horizon=n))(2)": "horizon must be known before anything is compiled",
     "mg.rollout(scene, state, lambda p, s: None, horizon=2)": "the policy must return one control per actuator, shape (1,)",
+    "mg.rollout(scene, state, lambda p, s: (jnp.zeros(1), s), horizon=2)": "one control per actuator, shape (1,), got tuple",
+    "task(lambda trajectory: {'cost': 1.0})": "one number per state, shape (3,), got dict",
+    "task(lambda trajectory: None)": "one number per state, shape (3,), got NoneType",
+    "mg.rollout(scene.with_model(geom_friction=jnp.full((1, 3), jnp.nan)), state, horizon=2)": "geom_friction must hold numbers",
     "mg.Softness(stiffness=jnp.inf)": "stiffness must be positive and finite, got inf",
     "jax.jit(lambda s: 1, static_argnums=0)(scene)": "make it an ordinary argument of jax.jit",
     "mg.load_scene('')": "got ''",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",
+    "mg.rollout(scene, state, lambda p, s: [jnp.sin(s.time)], horizon=2)": "no error",
     "first(count=np.int64(8), key=jax.random.PRNGKey(0))": "no error",
     "jax.vmap(lambda k: first(key=k))(jax.random.split(key, 3))": "no error",
     "jax.jit(lambda a: jax.vmap(estimators.rules.FixedAlpha)(a))(jnp.zeros(2))": "no error",

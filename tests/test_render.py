@@ -131,18 +131,11 @@ def test_a_video_is_complete_or_absent(tmp_path):
         write_video(tmp_path / "absent" / "video.mp4", video, fps=10)
 
 
-@pytest.mark.parametrize(
-    ("chosen", "sentence"),
-    [
-        ("bogus", '"egl", "osmesa", "glfw" or not set, got "bogus"; unset it$'),
-        ("egl", "libosmesa6 .* MUJOCO_GL=egl was tried alone: unset it"),
-    ],
-)
-def test_a_choice_of_opengl_that_fails_is_named(model, monkeypatch, chosen, sentence):
+def test_a_choice_of_opengl_that_fails_is_named(model, monkeypatch):
     def fail(*_):
         raise AttributeError("module has no attribute 'GLContext'")
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
-    monkeypatch.setenv("MUJOCO_GL", chosen)
-    with pytest.raises(RenderingUnavailableError, match=sentence):
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    with pytest.raises(RenderingUnavailableError, match=r"libosmesa6 .* MUJOCO_GL=egl was tried alone: unset it"):
         frames(model, np.zeros((1, model.nq)))

@@ -68,11 +68,11 @@ class Ramp(eqx.Module):
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Estimate at every stiffness and angle; an `ExperimentError` if somewhere hardly any rollout was finite."""
-    task = ball_wall() if settings.task == "ball_wall" else None
+    task, knob_name = (None, "slope") if settings.task == "ramp" else (ball_wall(), "stiffness")
     stiffness, knob, objective = _ramp(settings) if task is None else _wall(task, settings)
     if task is not None:
         workspace.check(task.scene)
-    with workspace.stage("gradients", "stiffnesses", len(stiffness)) as advance_to:
+    with workspace.stage("gradients", f"values of {knob_name}", len(stiffness)) as advance_to:
         measured = workspace.once(
             "gradients",
             lambda: bias_variance(
@@ -87,21 +87,18 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             ),
         )
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
-        name, remedy = "slope", "take smaller angles, less noise or a smaller slope"
+        remedy = "take smaller angles, less noise or a smaller slope"
         if task is not None:
-            name, remedy = (
-                "stiffness",
-                "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)",
-            )
+            remedy = "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
         raise ExperimentError(
-            f"{name} {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
+            f"{knob_name} {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
             f"derivatives, are finite; {remedy}"
         )
     table = _table(measured, stiffness, settings)
     for i in np.flatnonzero((table.finite_share < 1).any("angle")):
         lost = 1 - float(table.finite_share[i].min())
         workspace.warnings.append(
-            f"At stiffness {power(stiffness[i])}, {percent(lost)} of the rollouts at one angle were not finite and left out, "
+            f"At {knob_name} {power(stiffness[i])}, {percent(lost)} of the rollouts at one place were not finite and left out, "
             "so its means are over the others."
         )
     return Outcome(settings, table, _landscape(measured, settings.stddev), task)

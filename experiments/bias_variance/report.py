@@ -124,8 +124,8 @@ def tables(outcome: Outcome) -> list[Table]:
 
 def _with_half_width(one: xr.Dataset, name: str) -> str:
     value, half = float(one[name]), float(one[f"{name}_high"] - one[f"{name}_low"]) / 2
-    # Beyond three digits nobody reads on; the rest is in metrics.csv.
-    return quantity(value) if half < 1e-3 * abs(value) else quantity(value, half)
+    # Half a per cent is what three digits round by, and beyond them nobody reads on; the rest is in metrics.csv.
+    return quantity(value) if half < 5e-3 * abs(value) else quantity(value, half)
 
 
 def _choice(swept: xr.Dataset, words: Words) -> str:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from experiments.settings import Finite, Positive, RunSettings, VideoSettings
 
@@ -40,11 +40,3 @@ class Settings(RunSettings):
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
     video: ThrowsSettings | None = None
-
-    @field_validator("angles", "stiffness")
-    @classmethod
-    def _differ(cls, values: tuple[float, ...]) -> tuple[float, ...]:
-        # Twice the same would count as two in the tests over all of them.
-        if twice := {value for value in values if values.count(value) > 1}:
-            raise ValueError(f"must differ, got {min(twice):g} more than once")
-        return values

@@ -62,8 +62,6 @@ class Settings(RunSettings):
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
-        if len(set(self.models)) < len(self.models):
-            raise ValueError("models must differ from each other")
         if self.last_length > self.length:
             raise ValueError("last_length must be at most length: smoothing decreases")
         return self

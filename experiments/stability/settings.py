@@ -45,6 +45,4 @@ class Settings(RunSettings):
             raise ValueError(
                 f"precisions must begin with float64, whose finite differences judge all, got {', '.join(self.precisions)}"
             )
-        if len(set(self.precisions)) < len(self.precisions):
-            raise ValueError(f"precisions must differ, got {', '.join(self.precisions)}")
         return self

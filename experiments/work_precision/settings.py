@@ -64,6 +64,4 @@ class Settings(RunSettings):
     def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
-        if self.scenes is not None and len(set(self.scenes)) < len(self.scenes):
-            raise ValueError(f"scenes must not repeat, got {list(self.scenes)}")
         return self

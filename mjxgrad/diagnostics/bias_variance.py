@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import whole
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
@@ -176,8 +177,7 @@ def bias_variance(
     """
     check_baseline(baseline)
     params, restore = _points(params)
-    if num_reference < 4:
-        raise ValueError(f"num_reference must be at least 4, got {num_reference}")
+    whole("num_reference", num_reference, 4)
     stacked, count = _stacked(softness)
     has_zero_noise = baseline == "zero_noise"
     plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)

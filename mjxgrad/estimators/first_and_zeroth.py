@@ -84,8 +84,8 @@ def zeroth_order(
         arXiv:2202.00817, definition 2.3 (there with the zero-noise baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE
         samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
-    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline)
     objective, vector, restore = as_vector(objective, params)
+    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline)
     return zeroth_order_result(stream(objective, vector, key, plan, zeroth_order_summary), plan, baseline, restore)
 
 
@@ -110,8 +110,8 @@ def first_and_zeroth_order(
         The first-order and the zeroth-order estimate. A sample with a finite cost whose
         derivative is not finite counts in the second only.
     """
-    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
     objective, vector, restore = as_vector(objective, params)
+    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
     return both_results(stream(objective, vector, key, plan, both_summary), plan, baseline, restore)
 
 

@@ -47,12 +47,12 @@ def least_squares(
             f"{type(objective).__name__}{' with random starts' if objective.has_circumstances else ''}; "
             "use zeroth_order or control_variate"
         )
+    plan = Plan(num_samples, chunk_size, with_score=True)
     if num_samples <= vector.size + 1:
         raise ValueError(
             f"num_samples must be more than dim + 1 = {vector.size + 1}, got {num_samples}; "
             "zeroth_order needs no more than 2"
         )
-    plan = Plan(num_samples, chunk_size, with_score=True)
     num_chunks, size = plan.chunks()
     units = jnp.arange(num_chunks * size).reshape(num_chunks, size)
     samples = jax.lax.map(lambda some: sample(objective, vector, key, plan, some), units)

@@ -1,9 +1,12 @@
 """From a file, a string or a C model to a scene."""
 
+import contextlib
 import copy
 import math
 import os
+import threading
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
@@ -24,6 +27,7 @@ from mjxgrad.scene.scene import Scene, SceneWarning, numbers_of
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
 """Pairs of geoms beyond which loading takes minutes and a scene is refused."""
+_LISTENING = threading.Lock()  # there is one handler of warnings for all threads
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -77,7 +81,8 @@ def load_scene(
         raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
-    mj_model, name = _compile(source)
+    with _listening() as told:
+        mj_model, name = _compile(source)
     try:
         mj_model.names.decode()
     except UnicodeDecodeError as error:
@@ -107,13 +112,27 @@ def load_scene(
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
-    messages = [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
+    messages = [f"MuJoCo says: {text}" for text in told]
+    messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
         messages += softness_warnings(softness, scene.model, mj_model)
     for message in messages + scene.warnings():
         warnings.warn(f"{name}: {message}", SceneWarning, stacklevel=2)
     return scene
+
+
+@contextlib.contextmanager
+def _listening() -> Iterator[list[str]]:
+    """Take what MuJoCo warns of, which it would write to the terminal and to a file in the current folder."""
+    told: list[str] = []
+    with _LISTENING:
+        former = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(told.append)
+        try:
+            yield told
+        finally:
+            mujoco.set_mju_user_warning(former)
 
 
 def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
@@ -93,7 +94,8 @@ class Scene(eqx.Module):
             The scene with these values.
 
         Raises:
-            ValueError: if there is no such field, it is not an array of numbers, or the shape is another.
+            ValueError: if there is no such field, it is not an array of numbers, the shape is another, or a value is NaN
+                (where values are known; inside `jax.jit` a rollout is flagged as diverged).
         """
         present = {field.name: getattr(self.model, field.name) for field in self.model.fields()}
         arrays = {
@@ -107,6 +109,9 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
+        for name, value in changed.items():
+            if is_known(value) and np.isnan(value).any():
+                raise ValueError(f"{name} must hold numbers, got NaN")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")

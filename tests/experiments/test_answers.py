@@ -162,7 +162,7 @@ def stable(ours, theirs, derivative, silent=0):
     cells["silent"] = [[False] * 3, list(np.arange(3) < silent)]
     found = xr.Dataset({name: (("simulator", "point"), value) for name, value in cells.items()})
     found = found.assign_coords(simulator=["C MuJoCo", "float64"])
-    return SimpleNamespace(found=found, settings=SimpleNamespace(precisions=("float64",)))
+    return SimpleNamespace(found=found, scenes=[], settings=SimpleNamespace(precisions=("float64",)))
 
 
 def taught(stiffness=(1.0,), environment="hopper", late=(), **returns):
@@ -403,6 +403,16 @@ CASES = [
 def test_the_answer_is_what_the_numbers_say_in_a_line(kind, outcome, expected):
     assert say(kind, outcome) == expected
     assert len(expected.split()) <= MOST_WORDS
+
+
+def test_the_verdict_on_stability_says_first_what_is_flagged_then_how_it_compares():
+    assert part("stability", "report").verdict(stable([0, 2, 4], [0, 4, 4], [0, 2, 5])) == (
+        "Every rollout with a number that is not finite is flagged. `soundness` tells every gradient that explodes or is not "
+        "finite. In float64 2 of 3 motions are as good as C MuJoCo's, none worse and 1 better."
+    )
+    silent = part("stability", "report").verdict(stable([0, 2, 4], [0, 0, 0], [0, 2, 5], silent=2))
+    assert silent.startswith("2 rollouts have a number that is not finite, and no flag.")
+    assert silent.endswith("1 worse and none better.")
 
 
 def test_every_kind_answers():

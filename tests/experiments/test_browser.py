@@ -34,6 +34,9 @@ addEventListener("load", () => {
   const loaded = [...document.images].every(one => one.naturalWidth > 0);
   const found = {width: innerWidth, beyond: document.documentElement.scrollWidth - innerWidth, loaded};
   if (zoom) {
+    found.before = wide();
+    found.hint = getComputedStyle(zoom.parentElement, "::before").content;
+    found.shade = getComputedStyle(document.querySelector(".scroll:has(> table)")).backgroundImage;
     zoom.click();
     found.full = wide();
     zoom.click();
@@ -96,6 +99,14 @@ def test_a_report_fits_a_telephone_runs_nothing_and_fetches_nothing(report, tmp_
     assert found["width"] == WIDTH
     assert found["beyond"] <= 0, "pixels that the body is too wide"
     assert found["loaded"]
+
+
+def test_on_a_telephone_pictures_can_be_read_and_what_goes_on_sideways_has_a_sign(report, tmp_path):
+    found, _ = opened(report, tmp_path)
+    # The smallest letters of a picture, 8 points of its 11 inches, are 6 pixels high; at the width of the page they were 3.
+    assert found["before"] >= 640
+    assert "sideways" in found["hint"]
+    assert "gradient" in found["shade"]
 
 
 def test_a_click_shows_a_figure_at_full_size_and_another_brings_it_back(report, tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import types
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -225,6 +226,16 @@ def test_published_results_stand_beside_the_methods_that_they_are_of():
     assert means == [1.0, None, 2.0, None, 3.0, 40.0]
     assert findings(found)[0].startswith("3 of 4 published results are met")
     assert "α-order (concavity) (1.5, published 40)" in findings(found)[0]
+
+
+def test_searches_have_a_panel_of_their_own_and_bands_are_of_alpha_order_and_the_lowest_alone():
+    ends = {"first_order": 500.0, "zeroth_order": 400.0, "alpha_order": 300.0, "mppi": 100.0}
+    found = outcome(*(made_up(name, [end, end + 10]) for name, end in ends.items()))
+    picture, *_ = drawings(found)["curves"](found)
+    shown = [[line.get_label() for line in axis.lines] for axis in picture.axes[::2]]
+    assert shown == [["first order", "zeroth order", "α-order"], ["α-order", "MPPI"]]
+    assert [len(axis.collections) for axis in picture.axes] == [1, 1, 2, 2]
+    plt.close(picture)
 
 
 def test_figures_are_drawn_where_every_run_of_a_method_is_lost(tmp_path):

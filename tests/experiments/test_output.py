@@ -24,6 +24,15 @@ def test_a_folder_appears_whole_and_replaces_the_former(tmp_path):
     assert listing(tmp_path / "run") == ["new"]
 
 
+def test_files_are_on_the_disk_before_their_folder_gets_its_name(tmp_path, monkeypatch):
+    synced, run = [], tmp_path / "run"
+    monkeypatch.setattr("os.fsync", lambda file: synced.append((os.fstat(file).st_ino, run.exists())))
+    with building(run) as folder:
+        (folder / "inner").mkdir()
+        (folder / "inner" / "a").write_text("a")
+    assert synced == [((run / "inner" / "a").stat().st_ino, False)]
+
+
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
 def test_a_failure_leaves_the_former_result_and_nothing_else(tmp_path, failure):
     with building(tmp_path / "run") as folder:

@@ -102,7 +102,7 @@ def test_every_method_gets_its_figures(tmp_path, settings, is_tree, files):
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ('models=["analytic", "analytic"]', "models must differ"),
+        ('models=["analytic", "analytic"]', "models: must differ, got analytic more than once"),
         ("last_length=0.1", "last_length must be at most length"),
         ("num_samples=5", "num_samples"),
         ('method="guess"', "method"),

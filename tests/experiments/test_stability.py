@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import xarray as xr
 from experiments.config import load_runs
 from experiments.stability.classes import Derivative, Motion, MotionRecord, classify_derivative, classify_motion
 from experiments.stability.measure import C_MUJOCO, Outcome, SceneOutcome
-from experiments.stability.report import UNEXPLAINED, findings, load, reasons
+from experiments.stability.report import UNEXPLAINED, drawings, findings, load, reasons
 from experiments.stability.scenes import DEFAULTS, FIELDS, PLANES, Points, catalogue, configure, points
 from experiments.stability.simulators import Steps, errors_of_solves, simulate, unbalanced
 
@@ -164,6 +165,22 @@ def test_balls_that_part_from_one_point_and_motions_that_explode_are_told_apart(
     assert "explodes" in found[0]
 
 
+def test_a_square_is_pale_where_the_motion_is_as_in_c_mujoco_and_an_axis_has_three_numbers():
+    """Of the first plane the first point differs, in the lower left corner."""
+    grid = points(SCENES["ball"], 8, 4, 0)
+    theirs = [Motion.MOVES] * len(grid)
+    one = _outcome("ball", grid, [Motion.TUNNELS, *theirs[1:]], theirs, np.zeros(len(grid)))
+    found = Outcome(load_runs("stability", ['precisions=["float64"]'])[0].settings, [one])
+    picture, *_ = drawings(found)["ball"](found)
+    in_c, in_mjxgrad, slope = (axis.images[0].get_array()[..., 3] for axis in picture.axes[:3])
+    assert (in_c == 1).all()
+    assert (slope == 1).all()
+    assert in_mjxgrad[0, 0] == 1
+    assert (in_mjxgrad.ravel()[1:] < 0.5).all()
+    assert {len(ticks) for axis in picture.axes for ticks in (axis.get_xticks(), axis.get_yticks())} == {3}
+    plt.close(picture)
+
+
 def test_a_workspace_notes_what_a_scene_s_time_step_does_not_follow(tmp_path):
     import mjxgrad as mg
     from experiments.workspace import Workspace
@@ -177,6 +194,9 @@ def test_a_workspace_notes_what_a_scene_s_time_step_does_not_follow(tmp_path):
         loaded = mg.load_scene(scene)
     workspace.check(loaded)
     assert any("refsafe replaces it by 0.1 s" in text for text in workspace.warnings)
+    assert all(text.startswith("ball: ") for text in workspace.warnings), (
+        "a reader of several scenes' has to know which"
+    )
 
 
 def _record(**changes):

@@ -209,7 +209,7 @@ def test_every_time_step_divides_every_motion(size):
     ("override", "sentence"),
     [
         ('precision="float32"', "precision must be float64"),
-        ('scenes=["bounce", "bounce"]', "scenes must not repeat"),
+        ('scenes=["bounce", "bounce"]', "scenes: must differ, got bounce more than once"),
         ("scenes=[]", "scenes: must"),
         ('size="huge"', "size"),
         ("targets=[2.0]", "targets"),

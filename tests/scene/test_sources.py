@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.scene import SceneError, load_scene
+from mjxgrad.scene import SceneError, SceneWarning, load_scene
 
 FALLING = """
 <mujoco>
@@ -147,6 +147,16 @@ def test_what_is_no_number_is_named():
         load_scene(
             "<mujoco><worldbody><body><freejoint/><geom size='.1' friction='nan 0 0'/></body></worldbody></mujoco>"
         )
+
+
+def test_what_mujoco_warns_of_is_a_warning_and_no_file(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    noted = FALLING.replace("<worldbody>", "<custom><numeric name='note' data='nan'/></custom><worldbody>")
+    with pytest.warns(SceneWarning, match="the MJCF: MuJoCo says: XML contains a 'NaN'"):
+        load_scene(noted)
+    assert capfd.readouterr().err == ""
+    assert list(tmp_path.iterdir()) == []
+    assert mujoco.get_mju_user_warning() is None
 
 
 def test_names_in_another_encoding_are_refused(tmp_path):
