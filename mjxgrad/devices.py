@@ -45,6 +45,12 @@ def over_devices(
         mesh = jax.sharding.Mesh(np.array(own), ("batch",))
         whole, part = jax.sharding.PartitionSpec(), jax.sharding.PartitionSpec("batch")
         specs = tuple(whole if i < num_shared else part for i in range(len(args)))
-        return jax.shard_map(batched, mesh=mesh, in_specs=specs, out_specs=part, check_vma=False)(*args)
+
+        # XLA's partitioner crashes on inputs that are not used in the end (jax 0.11.2): compiled as one, what the function closes
+        # over is none, and the barrier uses all others.
+        def of_part(*args: Any) -> Any:
+            return jax.jit(batched)(*jax.lax.optimization_barrier(args))
+
+        return jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=part, check_vma=False)(*args)
 
     return wrapped

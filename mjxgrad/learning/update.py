@@ -72,14 +72,17 @@ def _windows(
     shape = (settings.num_environments, settings.window, environment.num_actions)
     noise = jax.random.normal(key, shape, environments.obs.dtype)
 
+    arrays, structure = eqx.partition(environment, eqx.is_array)
+
     def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
-        policy, critic, stddev = shared
+        arrays, policy, critic, stddev = shared
+        own = eqx.combine(arrays, structure)
         return window_gradients(
-            environment, state, model_key, noise, policy.actor, critic, policy.normaliser, stddev, settings.discount
+            own, state, model_key, noise, policy.actor, critic, policy.normaliser, stddev, settings.discount
         )
 
-    # The environment is not among them: what is known of its numbers while the program is traced makes it shorter.
-    shared = (learner.policy, learner.target, stddev)
+    # The environment is one of them: closed over, arrays of all devices are refused where each has its part (jax 0.11).
+    shared = (arrays, learner.policy, learner.target, stddev)
     return over_devices(one, num_shared=1)(shared, environments, learner.model_keys, noise)
 
 
