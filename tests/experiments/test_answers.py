@@ -122,7 +122,7 @@ def tossed(side, place, turn):
     """A side in m, and the mean errors of two tosses by it."""
     fits = {"rounded corners": SimpleNamespace(values={"side": side})}
     return SimpleNamespace(
-        fits=fits, judged={"rounded corners": np.array([[place - 0.01, turn], [place + 0.01, turn]])}
+        fits=fits, judged={"rounded corners": np.array([[place - 0.01, turn, 0, 0], [place + 0.01, turn, 0, 0]])}
     )
 
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import mjxgrad as mg
 from experiments.config import FOLDER, ExperimentError, load_runs
 from experiments.real_tosses import (
     HALF_SIDE,
     NOMINAL,
     RATE,
     SIDE,
+    Settings,
     _fit,
     cube,
     errors,
@@ -141,6 +141,7 @@ def test_the_numbers_of_simulated_tosses_come_back(tmp_path):
     """Three tosses of C MuJoCo, recorded as ContactNets records, with 0.05 mm of noise, from a start 20 % off."""
     truth = {"side": 0.1, "radius": 3e-3, "friction": 0.22, "stiffness": 2e4, "damping_ratio": 0.6}
     (run,) = load_runs(str(FOLDER / "real_tosses.toml"), ["num_windows=4", "max_steps=25"])
+    assert isinstance(run.settings, Settings)
     model, rng, windows = cube(4, **truth).mj_model, np.random.default_rng(0), []
     for number in range(3):
         data = mujoco.MjData(model)
@@ -156,6 +157,5 @@ def test_the_numbers_of_simulated_tosses_come_back(tmp_path):
         save(tmp_path / f"{number}.pt", rows_of(course[:, :3] + 5e-5 * rng.normal(size=(90, 3)), turns))
         windows += recordings(read_toss(tmp_path / f"{number}.pt"), run.settings)
     found = _fit(run.settings, tuple(truth), windows, has_onset=True)
-    assert isinstance(windows[0], mg.identification.Recording)
     for name, share in {"side": 0.01, "friction": 0.05, "damping_ratio": 0.1, "stiffness": 0.3}.items():
         np.testing.assert_allclose(found.values[name], truth[name], rtol=share, err_msg=name)
