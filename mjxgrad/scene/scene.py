@@ -188,13 +188,35 @@ def numbers_of(model: mjx.Model) -> dict[str, Array]:
     return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
 
 
+_PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
+
+
 def with_numbers(mj_model: mujoco.MjModel, numbers: dict[str, Array] | dict[str, np.ndarray]) -> mujoco.MjModel:
     """Return a copy of a C model with the numbers of one of MJX's, where it has them."""
     target = copy.deepcopy(mj_model)
     for name, value in numbers.items():
         is_option = name.startswith("opt.")
         _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
+    if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
+        _enclose(target)
     return target
+
+
+def _enclose(target: mujoco.MjModel) -> None:
+    """Let the boxes by which C MuJoCo leaves out pairs hold geoms that have moved or grown: cubes around their bounding balls."""
+    turn = np.zeros(9)
+    for body, (first, count) in enumerate(zip(target.body_bvhadr, target.body_bvhnum, strict=True)):
+        mujoco.mju_quat2Mat(turn, target.body_iquat[body])
+        for node in reversed(range(first, first + count)):  # parents come before their children
+            geom, children = target.bvh_nodeid[node], first + target.bvh_child[node]
+            if geom < 0:
+                centres, halves = np.split(target.bvh_aabb[children], 2, axis=1)
+                low, high = (centres - halves).min(axis=0), (centres + halves).max(axis=0)
+                target.bvh_aabb[node] = np.concatenate([(low + high) / 2, (high - low) / 2])
+            elif (radius := target.geom_rbound[geom]) > 0:  # a plane has none
+                centre = turn.reshape(3, 3).T @ (target.geom_pos[geom] - target.body_ipos[body])
+                target.bvh_aabb[node] = np.concatenate([centre, np.full(3, radius)])
+                target.geom_aabb[geom] = np.repeat([0.0, radius], 3)
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:

@@ -112,3 +112,22 @@ def test_sensors_and_sites_are_read_by_name_as_in_c():
     ):
         with pytest.raises(ValueError, match=message):
             read(scene.model, scene.data, "nose")
+
+
+def test_c_mujoco_finds_contacts_of_geoms_that_have_moved_and_grown():
+    """Balls moved out through the floor, on a body whose inertia is turned, touch as if compiled there."""
+
+    def mjcf(reach, radius):
+        balls = "".join(f'<geom pos="{x * reach} {y * reach} {z * reach}" size="{radius}"/>' for x, y, z in places)
+        floor = '<geom type="plane" size="1 1 1"/>'
+        return f"<mujoco><worldbody>{floor}<body pos='0 0 .5'><freejoint/>{balls}</body></worldbody></mujoco>"
+
+    places = np.array([[1, 0, -1], [0, 1, -1], [-1, -1, -1], [0.5, 0, 1], [1, 1, 1]])
+    near, far = mg.load_scene(mjcf(0.2, 0.05)), mujoco.MjModel.from_xml_string(mjcf(0.49, 0.08))
+    moved = near.with_model(geom_pos=far.geom_pos, geom_size=far.geom_size).to_mujoco()
+    counts = []
+    for model in (moved, far):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        counts.append(data.ncon)
+    assert counts == [3, 3]
