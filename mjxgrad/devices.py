@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -43,14 +44,24 @@ def over_devices(
         if size % len(own):
             raise ValueError(f"the batch must be a multiple of the {len(own)} devices, got {size}")
         mesh = jax.sharding.Mesh(np.array(own), ("batch",))
-        whole, part = jax.sharding.PartitionSpec(), jax.sharding.PartitionSpec("batch")
-        specs = tuple(whole if i < num_shared else part for i in range(len(args)))
+        leaves, structure = jax.tree.flatten(args)
+        num_whole = len(jax.tree.leaves(args[:num_shared]))
+        specs = [jax.sharding.PartitionSpec(*() if i < num_whole else ("batch",)) for i in range(len(leaves))]
+        # XLA's partitioner crashes on inputs without a number that are used (jax 0.11.2): each device makes its own. Compiled as
+        # one, what the function closes over is no input.
+        empty = {
+            i: x.shape if i < num_whole else (size // len(own), *x.shape[1:])
+            for i, x in enumerate(leaves)
+            if not np.size(x)
+        }
 
-        # XLA's partitioner crashes on inputs that are not used in the end (jax 0.11.2): compiled as one, what the function closes
-        # over is none, and the barrier uses all others.
-        def of_part(*args: Any) -> Any:
-            return jax.jit(batched)(*jax.lax.optimization_barrier(args))
+        def of_part(given: list[Any]) -> Any:
+            numbers = iter(given)
+            parts = [jnp.zeros(empty[i], x.dtype) if i in empty else next(numbers) for i, x in enumerate(leaves)]
+            return jax.jit(batched)(*jax.tree.unflatten(structure, parts))
 
-        return jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=part, check_vma=False)(*args)
+        given, specs = ([x for i, x in enumerate(xs) if i not in empty] for xs in (leaves, specs))
+        part = jax.sharding.PartitionSpec("batch")
+        return jax.shard_map(of_part, mesh=mesh, in_specs=(specs,), out_specs=part, check_vma=False)(given)
 
     return wrapped

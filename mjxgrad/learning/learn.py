@@ -172,7 +172,14 @@ def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Any]]:
         # Meet before compiling: by how much that differs in time can exceed the deadline for connecting.
         sync_global_devices("learn")
     whole = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec())
-    return functools.partial(jax.device_put, device=whole), functools.partial(jax.jit, out_shardings=whole)
+
+    def put(x: Array) -> Array:
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(x)), impl=jax.random.key_impl(x))
+        # From the host: what one process has on a device others cannot always be sent.
+        return jax.device_put(np.asarray(x), whole)
+
+    return functools.partial(jax.tree.map, put), functools.partial(jax.jit, out_shardings=whole)
 
 
 def _mean(values: np.ndarray) -> float:
