@@ -45,6 +45,7 @@ _LOADERS: dict[str, Callable[..., Environment]] = {
 }
 _OWN_STEPS = ("cartpole", "quadruped", "trot")  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
+_FINER = 8  # times, by which time steps are shorter where a policy is judged a second time
 
 
 class Sizes(SettingsTable):
@@ -109,6 +110,7 @@ class Course:
     stiffness: float
     history: History
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
+    finer: Float[np.ndarray, "seeds episodes"]  # the same, in time steps that are eight times shorter
     terms: dict[str, Float[np.ndarray, "seeds episodes"]]  # of the reward, means per step there
     qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
     num_states: int  # of it
@@ -270,16 +272,22 @@ def _judged_course(
     """Judge what was learned, with an axis for seeds, in C MuJoCo."""
     num_episodes = settings.sizes.num_episodes
 
-    def judge(learned: Any, key):
-        return learning.evaluate(environment, lambda obs: act(learned, obs), key, num_episodes=num_episodes)
+    def judge(times: int) -> learning.Evaluation:
+        judged, key = environment.refined(times), jax.random.key(settings.seed + 1)
 
-    found = jax.tree.map(np.asarray, jax.vmap(judge, in_axes=(0, None))(learned, jax.random.key(settings.seed + 1)))
+        def one(learned: Any) -> learning.Evaluation:
+            return learning.evaluate(judged, lambda obs: act(learned, obs), key, num_episodes=num_episodes)
+
+        return jax.tree.map(np.asarray, jax.vmap(one)(learned))
+
+    found = judge(1)
     best = int(found.returns.mean(axis=1).argmax())
     return Course(
         method=method,
         stiffness=stiffness,
         history=history,
         returns=found.returns,
+        finer=judge(_FINER).returns,
         terms=found.terms,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
@@ -411,13 +419,15 @@ def tables(outcome: Outcome) -> list[Table]:
         [
             _label(course, outcome),
             _judged(course),
+            quantity(float(course.finer.mean()), _spread(course.finer.mean(axis=1))),
             quantity(float(course.reward[-1].mean()), _spread(course.reward[-1])),
             *_of_gradients(course),
             quantity(course.seconds * outcome.settings.sizes.num_updates),
         ]
         for course in outcome.courses
     ]
-    heads = ("gradient", "return in C MuJoCo", "reward per step", "α", "variance, zeroth over first", "seconds")
+    finer = f"in {_FINER} times shorter steps"
+    heads = ("gradient", "return in C MuJoCo", finer, "reward per step", "α", "variance, zeroth over first", "seconds")
     caption = (
         "Mean over seeds with their standard deviation. Reward per step: while learning, of the last updates. α: weight of the "
         "first order. Seconds: of all seeds together, without compilation"
@@ -474,19 +484,25 @@ def course_of_learning(outcome: Outcome):
 
 
 def by_stiffness(outcome: Outcome):
-    """Return in C MuJoCo against stiffness, a line per method."""
-    figure, axes = subplots(1, 1, height=3.8)
+    """Return in C MuJoCo against stiffness, a line per method: in the time steps that were learned in, and in shorter ones."""
+    figure, axes = subplots(1, 2, height=3.8, sharey=True)
     for method in outcome.settings.methods:
         courses = [course for course in outcome.courses if course.method == method]
         factors = [course.stiffness for course in courses]
-        means = [course.judged.mean() for course in courses]
-        spread = [_spread(course.judged) or 0 for course in courses]
-        axes[0, 0].errorbar(factors, means, spread, color=_COLOURS[method], marker="o", capsize=3, label=NAMES[method])
-    axes[0, 0].set(xscale="log", xlabel="stiffness of contact, over the scene's", ylabel="return in C MuJoCo")
-    plain(axes[0, 0].xaxis)
+        for axis, name in zip(axes[0], ("returns", "finer"), strict=True):
+            judged = [getattr(course, name).mean(axis=1) for course in courses]
+            means, spread = [x.mean() for x in judged], [_spread(x) or 0 for x in judged]
+            axis.errorbar(factors, means, spread, color=_COLOURS[method], marker="o", capsize=3, label=NAMES[method])
+    for axis, title in zip(
+        axes[0], ("In the time steps it learned in", f"In {_FINER} times shorter ones"), strict=True
+    ):
+        axis.set(title=title, xscale="log", xlabel="stiffness of contact, over the scene's")
+        plain(axis.xaxis)
+    axes[0, 0].set_ylabel("return in C MuJoCo")
     plain(axes[0, 0].yaxis)
     legend_below(figure, axes[0, 0], 3)
-    return figure, "Return against stiffness", "Mean over seeds, bars are their standard deviation."
+    caption = "Mean over seeds, bars are their standard deviation. Where contact lasts few steps, the left measures those, too."
+    return figure, "Return against stiffness", caption
 
 
 def quality(outcome: Outcome):

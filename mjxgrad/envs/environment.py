@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import whole
 from mjxgrad._rollout import State, Trajectory, initial_state, rollout
 from mjxgrad.envs.bundle import Bundle
 from mjxgrad.scene import Scene
@@ -219,6 +220,19 @@ class Environment(InEngine):
         if self.randomisation is None:
             return self
         return dataclasses.replace(self, scene=self.randomisation(key, self.scene))
+
+    def refined(self, times: int) -> "Environment":
+        """Return the same with so many times shorter time steps; an action takes as long.
+
+        Where contact lasts few time steps, what a policy is worth is a property of the step as well as of the scene. Judged
+        in shorter ones, it is that of the scene.
+
+        Raises:
+            ValueError: if `times` is no whole number, or below 1.
+        """
+        times = whole("times", times)
+        scene = eqx.tree_at(lambda s: s.model.opt.timestep, self.scene, self.scene.model.opt.timestep / times)
+        return dataclasses.replace(self, scene=scene, frame_skip=times * self.frame_skip)
 
     def changes(self, key: PRNGKeyArray) -> PyTree:
         """Draw what sets one copy apart, see `randomised`; in a batch of them the copies share all else.

@@ -75,7 +75,7 @@ class TaskEnvironment(Environment):
         return {"cost": jnp.where(ends, -jnp.sum(self.task.cost(trajectory)), 0.0)}
 
     def is_over(self, state: State) -> Bool[Array, ""]:
-        return state.time > (self.episode_length - 0.5) * self.scene.model.opt.timestep
+        return state.time > (self.episode_length - 0.5) * self.interval
 
 
 def from_task(task: SceneTask) -> TaskEnvironment:

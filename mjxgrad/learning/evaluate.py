@@ -40,7 +40,8 @@ def evaluate(
     """Run a policy for whole episodes.
 
     Args:
-        environment: its model as it is, without randomisation.
+        environment: its model as it is, without randomisation; `environment.refined(8)` for shorter time steps, where contact
+            lasts few of its own.
         policy: from what is seen to an action.
         key: for the starts; consumed here.
         num_episodes: at least 1.

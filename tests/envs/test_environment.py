@@ -4,8 +4,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mjxgrad._rollout import rollout
 from mjxgrad.envs.diffrl import CartPole
@@ -107,6 +109,20 @@ def test_an_end_for_good_terminates_and_is_not_truncated_even_in_the_last_step(s
         stepped = step(placed(state, qpos=[RAIL + 0.1, 3.0], num_steps=num_steps), ACTIONS[0])
         assert stepped.terminated
         assert not stepped.truncated
+
+
+def test_refined_an_action_takes_as_long_in_shorter_steps(cart, state):
+    """Against C MuJoCo in steps of a quarter, eight of them for two, from the same state."""
+    found = jax.jit(lambda state: cart.refined(4).with_engine("mujoco").step(state, ACTIONS[0]))(state)
+    model = cart.scene.to_mujoco()
+    model.opt.timestep /= 4
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
+    data.ctrl[:] = cart.control(ACTIONS[0])
+    mujoco.mj_step(model, data, 8)
+    assert_allclose(found.physics.qpos, data.qpos, rtol=1e-12)
+    with pytest.raises(ValueError, match="times must be at least 1, got 0"):
+        cart.refined(0)
 
 
 def test_a_state_that_diverges_ends_the_episode_and_says_so(state, step):

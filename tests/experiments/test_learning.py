@@ -29,7 +29,8 @@ def course(method, returns, **history):
     names = ("reward", "alpha", "first_variance", "zeroth_variance", "not_finite", "skipped", "diverged", "shortened")
     values = {name: np.ones((4, 2)) if "variance" in name else np.zeros((4, 2)) for name in names}
     values |= {name: np.asarray(value, float) for name, value in history.items()}
-    return Course(method, 1.0, values, np.asarray(returns, float), {}, np.zeros((3, 2)), 3)
+    returns = np.asarray(returns, float)
+    return Course(method, 1.0, values, returns, returns, {}, np.zeros((3, 2)), 3)
 
 
 def test_the_verdict_names_the_best_in_mujoco():
