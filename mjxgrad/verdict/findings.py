@@ -181,9 +181,13 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         stiffness = felt[0].stiffness
         lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
-        values = " and ".join(dict.fromkeys(format_number(float(f"{one.advantage:.1g}")) for one in felt))
+        values = " and ".join(dict.fromkeys(_times(one.advantage) for one in felt))
         text = f"{lead} first-order sample is worth {values} of zeroth order, under noise of {noises}. {ends}."
         yield Finding("order", text)
+
+
+def _times(advantage: float) -> str:
+    return "over a million" if advantage > 1e6 else format_number(float(f"{advantage:.1g}"))
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
@@ -196,7 +200,7 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
             if comparison is None or kind not in comparison.gradients:
                 continue
             at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
-            is_clear = (size > 0) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
+            is_clear = (size > comparison.resolution) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
             is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
             size = np.maximum(size, comparison.resolution)
             # A derivative that scatters little is not worse for being seen to be a percent off.

@@ -38,6 +38,7 @@ _NUM_BATCHES = 24.0  # that are moved in all, about
 _LINE_BATCHES, _NOISE_BATCHES = 6, 1
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
 _AT_REST = 1e-3  # of the largest variation at any time
+_UNFELT = 1e-6  # of the largest spread of all outcomes, or of 10⁻⁶: what varies by less is rounding
 _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
 
 
@@ -90,7 +91,7 @@ class Noise:
     def advantage(self) -> float:
         """How many times fewer samples first order needs at the last time, by the median over outcomes."""
         first, zeroth = (np.asarray(one.variance)[-1] for one in (self.first, self.zeroth))
-        is_felt = zeroth > 0
+        is_felt = zeroth > _UNFELT**2 * zeroth.max(initial=0.0)
         return (
             float(np.median(zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])))
             if is_felt.any()
@@ -242,12 +243,16 @@ class _Probe:
         places = phases((-1.0, 1.0), self.programs.size)
         kinds = [kind for kind in ("discrete", "event") if kind in self.programs.kinds]
         onset, *others = (along(kind, places) for kind in ("onset", *kinds))
+        spreads = np.nanstd(onset.outcomes, axis=0)
+        is_felt = spreads > _UNFELT * max(spreads.max(), _UNFELT)
+        onset, *others = (one.where(is_felt) for one in (onset, *others))
         derivatives = [one.derivatives for one in others]
         plain = compare_to_slope(places, others[0].outcomes, derivatives, kinds) if kinds else None
         continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
-        centre, spreads = np.nanmean(onset.outcomes[:, -1], axis=0), np.nanstd(onset.outcomes, axis=0)
+        centre = np.nanmean(onset.outcomes[:, -1], axis=0)
         # What has come to rest by then varies by rounding alone.
-        scale = np.where(spreads[-1] > _AT_REST * spreads.max(axis=0), spreads[-1], np.inf)
+        is_moving = is_felt[-1] & (spreads[-1] > _AT_REST * spreads.max(axis=0))
+        scale = np.where(is_moving, spreads[-1], np.inf)
         jumps = jumps_along(
             lambda x: (along("onset", x).outcomes[:, -1] - centre) / scale,
             (-1.0, 1.0),
@@ -344,5 +349,6 @@ def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: Grad
     truth = np.asarray(zeroth.value)[..., 0]
     squares = [(one - truth) ** 2 for one in (derivatives, terms)]
     weight = squares[1].mean(axis=0)
-    shares = [(square / np.where(weight > 0, weight, np.inf)).sum(axis=2) for square in squares]
+    weight = np.where(weight > _UNFELT**2 * weight.max(), weight, np.inf)
+    shares = [(square / weight).sum(axis=2) for square in squares]
     return crossover(times, *shares, num_resamples=200)

@@ -168,7 +168,8 @@ def _touches(
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         now = {tuple(map(int, contact.geom)): contact for contact in data.contact if contact.efc_address >= 0}
-        if step == 0:
+        # Put down on one another, bodies press from the first step on.
+        if step <= 1:
             always, before = always | now, set(now)
         for pair in now.keys() - before:
             onsets[motion] = step if onsets[motion] < 0 else onsets[motion]

@@ -8,7 +8,7 @@ import numpy as np
 from mjxgrad.verdict.findings import Finding
 from mjxgrad.verdict.measure import Line, Measured
 
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _PANEL, _GAP = 360.0, 330.0, 50.0, 8.0, 24.0, 126.0, 22.0
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _PANEL, _GAP = 360.0, 330.0, 68.0, 8.0, 24.0, 126.0, 22.0
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1d1d1f; --paper: #fff; --soft: #6b6b70; --line: #d9d9de;
   --plain: #c2500a; --smooth: #00795a; }

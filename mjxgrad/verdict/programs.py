@@ -6,6 +6,7 @@ shorter ones within it. Contact parameters are arguments, so that a sweep over s
 one direction compiles in half the time of reverse mode, and gives the change of every outcome at every time.
 """
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -71,6 +72,12 @@ class Moved:
     growth: Float[np.ndarray, "motions times"]
     num_crowded: int
     num_diverged: int
+
+    def where(self, is_felt: Bool[np.ndarray, "times outcomes"]) -> "Moved":
+        """Return the same with those outcomes that are not felt as constants: rounding has jumps and slopes of its own."""
+        mean = np.nansum(self.outcomes, axis=0) / np.maximum(np.isfinite(self.outcomes).sum(axis=0), 1)
+        kept = is_felt | np.isnan(self.outcomes)
+        return dataclasses.replace(self, outcomes=np.where(kept, self.outcomes, mean))
 
 
 @dataclass

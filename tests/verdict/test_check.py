@@ -182,6 +182,44 @@ def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
     assert drawn.count('class="plain"') == (65 if "discrete" in kinds else 0)  # 2 panels of 32 dots, and a legend
 
 
+class Rounding(OutOfTime):
+    """Programs of two outcomes: the velocity at the start, and one that rounding alone changes, by steps."""
+
+    def __init__(self, *kinds):
+        super().__init__(*kinds)
+        self._seconds = itertools.repeat(1e-6)
+
+    def move(self, kind, states, controls, direction, lengths, contact=None):
+        felt = super().move(kind, states, controls, direction, lengths, contact)
+        rounding = 1e-17 * np.sign(felt.outcomes)
+        outcomes, derivatives = (
+            np.concatenate(pair, axis=2)
+            for pair in ((felt.outcomes, rounding), (felt.derivatives, 0 * felt.derivatives))
+        )
+        return Moved(outcomes, derivatives, felt.growth, 0, 0)
+
+
+def test_rounding_is_no_jump_and_no_slope():
+    """One of two outcomes; along the controls neither is felt."""
+    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
+    motions, programs = random_motions(scene, rng), Rounding("onset", "discrete")
+    programs.end = time.perf_counter() + 1000
+    measured = measure(scene, motions, programs, rng, from_start=False, seconds=1, log=lambda _: None)
+    assert [len(line.jumps.places) for line in measured.lines] == [0, 0, 0]
+    num_moving = sum(line.varied != "the controls" for line in measured.lines)
+    readings = {slope.num_readings for slope in slopes(measured) if slope.kind != "event"}
+    assert readings == {num_moving * len(measured.times)}
+
+
+def test_a_body_that_is_put_down_touches_from_the_start():
+    """Its distance is zero at first, and negative from the first step on."""
+    resting, falling = (random_motions(mg.load_scene(ball(height=z)), np.random.default_rng(0)) for z in (0.05, 0.3))
+    assert (resting.touching, resting.touches) == (("floor – ball",), ())
+    assert (resting.onsets < 0).all()
+    assert falling.touching == ()
+    assert [touch.pair for touch in falling.touches] == ["floor – ball"]
+
+
 class Endless(OutOfTime):
     """Programs that begin in good time, and then meet states that take for ever."""
 
