@@ -497,6 +497,8 @@ def by_stiffness(outcome: Outcome):
         axes[0], ("In the time steps it learned in", f"In {_FINER} times shorter ones"), strict=True
     ):
         axis.set(title=title, xscale="log", xlabel="stiffness of contact, over the scene's")
+        axis.set_xticks(outcome.settings.stiffness)
+        axis.minorticks_off()
         plain(axis.xaxis)
     axes[0, 0].set_ylabel("return in C MuJoCo")
     plain(axes[0, 0].yaxis)
