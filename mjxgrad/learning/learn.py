@@ -104,16 +104,14 @@ def learn(
     own, common, structure = _apart(environments)
     arrays = place((own, common))
 
-    def of_each(function: Callable, arrays: tuple[Environment, Environment]) -> Callable:
-        def in_one(own: Environment, state: Any) -> Any:
-            one = functools.partial(
-                function, eqx.combine(own, arrays[1], structure), settings=settings, num_updates=num_updates
-            )
-            return (jax.vmap(one) if key.ndim else one)(state)
-
-        in_all = in_one if is_one else jax.vmap(in_one, axis_size=len(environments))
-        return functools.partial(in_all, arrays[0])
-
+    of_each = functools.partial(
+        _of_each,
+        structure=structure,
+        num_environments=None if is_one else len(environments),
+        has_seeds=bool(key.ndim),
+        settings=settings,
+        num_updates=num_updates,
+    )
     shape = key.shape if is_one else (len(environments), *key.shape)
     # As numbers on the host, a key is the same in all processes.
     numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
@@ -149,6 +147,25 @@ def learn(
         if log is not None and is_first:
             log(int(learner.num_updates.max()), {name: _mean(values) for name, values in found.items()})
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
+
+
+def _of_each(
+    function: Callable,
+    arrays: tuple[Environment, Environment],
+    structure: Environment,
+    num_environments: int | None,
+    has_seeds: bool,
+    **given: Any,
+) -> Callable[[Any], Any]:
+    """Return a function of all policies, environment by environment and seed by seed, from one of an environment and a policy."""
+    own, common = arrays
+
+    def in_one(own: Environment, state: Any) -> Any:
+        one = functools.partial(function, eqx.combine(own, common, structure), **given)
+        return (jax.vmap(one) if has_seeds else one)(state)
+
+    in_all = in_one if num_environments is None else jax.vmap(in_one, axis_size=num_environments)
+    return functools.partial(in_all, own)
 
 
 def _apart(environments: Sequence[Environment]) -> tuple[Environment, Environment, Environment]:

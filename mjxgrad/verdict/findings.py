@@ -200,7 +200,9 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
             if comparison is None or kind not in comparison.gradients:
                 continue
             at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
-            is_clear = (size > comparison.resolution) & (comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution))
+            is_clear = (size > comparison.resolution) & (
+                comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution)
+            )
             is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
             size = np.maximum(size, comparison.resolution)
             # A derivative that scatters little is not worse for being seen to be a percent off.
