@@ -272,7 +272,7 @@ def _judged_course(
     """Judge what was learned, with an axis for seeds, in C MuJoCo."""
     num_episodes = settings.sizes.num_episodes
 
-    def judge(times: int) -> learning.Evaluation:
+    def judge(times: int) -> Any:
         judged, key = environment.refined(times), jax.random.key(settings.seed + 1)
 
         def one(learned: Any) -> learning.Evaluation:
