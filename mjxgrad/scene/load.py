@@ -108,7 +108,8 @@ def load_scene(
         omissions += switch_off(stepped)
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped)
-    model, data = _put(stepped, name, max_contacts)
+    with jax.ensure_compile_time_eval():  # also where a function that is traced loads its own scene
+        model, data = _put(stepped, name, max_contacts)
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)

@@ -178,3 +178,8 @@ def test_numbers_beyond_single_precision_are_refused_there():
     finally:
         jax.config.update("jax_enable_x64", True)
     assert load_scene(heavy).mj_model.body_mass[1] == 1e300
+
+
+def test_a_function_that_is_traced_may_load_its_scene():
+    found = jax.jit(lambda times: times * load_scene(FALLING).model.opt.timestep)(2.0)
+    np.testing.assert_allclose(found, 2 * load_scene(FALLING).model.opt.timestep)
