@@ -23,6 +23,10 @@ MANY_PAIRS = 1000
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
+_WILD, _FARTHER = (
+    0.5,
+    4.0,
+)  # error of an onset's mean derivative at which another kind is taken, and times as near as that must be
 
 _WORDS = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
 
@@ -231,6 +235,10 @@ def recommend(
         onset.num_off + event.num_off
     )
     best = discrete if needs_none else event if is_event_better else onset
+    # Slow contacts under load may leave an onset derivatives of any size, so that their mean is that of a few.
+    nearest = min((one for one in (event, discrete) if one.num_readings), key=lambda one: one.error, default=onset)
+    if not needs_none and onset.error > max(_WILD, _FARTHER * nearest.error):
+        best = nearest
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]

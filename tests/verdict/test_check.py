@@ -309,6 +309,20 @@ def test_a_derivative_that_is_off_or_too_scattered_to_tell_is_not_the_slope():
     np.testing.assert_allclose([discrete.error, onset.error], [0.5, 0], atol=1e-12)
 
 
+def test_a_derivative_of_any_size_is_not_recommended():
+    """An onset is, where all are as good; not where its mean, of 64 numbers up to 3000 apart, is off the slope by 300."""
+    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
+    motions, stability = random_motions(scene, rng), mg.check_stability(scene, speed=1.0)
+    wild = 1 + 3000 * (np.arange(64) % 10 == 0)
+    for discrete, event, onset, expected in (
+        (0.8, 0.8, 0.8, ("discrete", True)),
+        (0.8, 0.9, wild, ("event", False)),
+        (0.9, 0.6, wild, ("discrete", False)),
+    ):
+        advice = recommend(scene, motions, stability, line_of(discrete, event, onset), None)
+        assert (advice.gradient, advice.onset) == expected
+
+
 def test_an_exploding_derivative_is_named():
     assert not [one for one in measured_findings(line_of(1.0, 1.0, 1.0, growth=900.0)) if one.kind == "explodes"]
     (found,) = [one for one in measured_findings(line_of(1.0, 1.0, 1.0, growth=1100.0)) if one.kind == "explodes"]
