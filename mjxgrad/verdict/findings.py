@@ -23,10 +23,8 @@ MANY_PAIRS = 1000
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
-_WILD, _FARTHER = (
-    0.5,
-    4.0,
-)  # error of an onset's mean derivative at which another kind is taken, and times as near as that must be
+# Of an onset's mean derivative: from which error on another kind is taken, and how many times nearer that must be.
+_WILD, _FARTHER = 0.5, 4.0
 
 _WORDS = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
 
