@@ -228,11 +228,17 @@ def replay(model: mujoco.MjModel, toss: Toss, substeps: int) -> Float[np.ndarray
     return np.array(course)
 
 
+def angle_between(
+    one: Float[np.ndarray, "rows 4"], other: Float[np.ndarray, "rows 4"] | Float[np.ndarray, " 4"]
+) -> Float[np.ndarray, " rows"]:
+    """Return the angle between orientations, in degrees."""
+    return np.degrees(2 * np.arccos(np.abs((one * other).sum(axis=1)).clip(max=1.0)))
+
+
 def errors(course: Float[np.ndarray, "rows 7"], toss: Toss) -> tuple[float, float]:
     """Return the mean error over a toss as ContactNets has it: of the position over the side, and of the turn in degrees."""
     place = np.linalg.norm(course[:, :3] - toss.qpos[:, :3], axis=1) / SIDE
-    cosine = np.abs((course[:, 3:] * toss.qpos[:, 3:]).sum(axis=1)).clip(max=1.0)
-    return float(place.mean()), float(np.degrees(2 * np.arccos(cosine)).mean())
+    return float(place.mean()), float(angle_between(course[:, 3:], toss.qpos[:, 3:]).mean())
 
 
 CONTACT = ("side", "friction", "stiffness", "damping_ratio")
@@ -268,9 +274,8 @@ class Outcome:
 
     settings: Settings
     fits: dict[str, Fit]
-    judged: dict[
-        str, Float[np.ndarray, "tosses 4"]
-    ]  # by the name of a fit or of given numbers: `errors` whole, and early
+    # By the name of a fit or of given numbers: `errors` whole, and early.
+    judged: dict[str, Float[np.ndarray, "tosses 4"]]
     shown: Toss  # of those held out, one whose error is in the middle
     courses: dict[str, Float[np.ndarray, "rows 7"]]  # of it
     fall: tuple[float, float]  # m/s², and its standard error
@@ -516,9 +521,8 @@ def one_toss(outcome: Outcome):
     courses = {"recorded": toss.qpos} | {name: outcome.courses[name] for name in _COLOURS}
     for name, course in courses.items():
         look = {"color": _COLOURS.get(name, REFERENCE), "lw": 2.2 if name == "recorded" else 1.3, "label": name}
-        cosine = np.abs((course[:, 3:] * toss.qpos[0, 3:]).sum(axis=1)).clip(max=1.0)
         axes[0, 0].plot(times, 1e3 * course[:, 2], **look)
-        axes[0, 1].plot(times, np.degrees(2 * np.arccos(cosine)), **look)
+        axes[0, 1].plot(times, angle_between(course[:, 3:], toss.qpos[0, 3:]), **look)
     axes[0, 0].set(xlabel="time, s", ylabel="height of the centre, mm")
     axes[0, 1].set(xlabel="time, s", ylabel="turn since the release, °")
     legend_below(figure, axes[0, 0], 4)

@@ -91,7 +91,7 @@ class Noise:
     def advantage(self) -> float:
         """How many times fewer samples first order needs at the last time, by the median over outcomes."""
         first, zeroth = (np.asarray(one.variance)[-1] for one in (self.first, self.zeroth))
-        is_felt = zeroth > _UNFELT**2 * zeroth.max(initial=0.0)
+        is_felt = zeroth > _UNFELT**2 * np.nanmax(zeroth, initial=0.0)
         return (
             float(np.median(zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])))
             if is_felt.any()
@@ -244,7 +244,7 @@ class _Probe:
         kinds = [kind for kind in ("discrete", "event") if kind in self.programs.kinds]
         onset, *others = (along(kind, places) for kind in ("onset", *kinds))
         spreads = np.nanstd(onset.outcomes, axis=0)
-        is_felt = spreads > _UNFELT * max(spreads.max(), _UNFELT)
+        is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)
         onset, *others = (one.where(is_felt) for one in (onset, *others))
         derivatives = [one.derivatives for one in others]
         plain = compare_to_slope(places, others[0].outcomes, derivatives, kinds) if kinds else None

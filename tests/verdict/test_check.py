@@ -185,9 +185,9 @@ def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
 class Rounding(OutOfTime):
     """Programs of two outcomes: the velocity at the start, and one that rounding alone changes, by steps."""
 
-    def __init__(self, *kinds):
+    def __init__(self, *kinds, diverges):
         super().__init__(*kinds)
-        self._seconds = itertools.repeat(1e-6)
+        self._seconds, self._diverges = itertools.repeat(1e-6), diverges
 
     def move(self, kind, states, controls, direction, lengths, contact=None):
         felt = super().move(kind, states, controls, direction, lengths, contact)
@@ -196,19 +196,23 @@ class Rounding(OutOfTime):
             np.concatenate(pair, axis=2)
             for pair in ((felt.outcomes, rounding), (felt.derivatives, 0 * felt.derivatives))
         )
+        if self._diverges and len(lengths) > 1:
+            outcomes[:, -1] = np.nan
         return Moved(outcomes, derivatives, felt.growth, 0, 0)
 
 
-def test_rounding_is_no_jump_and_no_slope():
-    """One of two outcomes; along the controls neither is felt."""
+@pytest.mark.filterwarnings("ignore:Degrees of freedom:RuntimeWarning", "ignore:Mean of empty slice:RuntimeWarning")
+@pytest.mark.parametrize("diverges", [False, True])
+def test_rounding_is_no_jump_and_no_slope(diverges):
+    """One of two outcomes; along the controls neither is felt. Where all motions end in no number, what came before counts."""
     scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions, programs = random_motions(scene, rng), Rounding("onset", "discrete")
+    motions, programs = random_motions(scene, rng), Rounding("onset", "discrete", diverges=diverges)
     programs.end = time.perf_counter() + 1000
     measured = measure(scene, motions, programs, rng, from_start=False, seconds=1, log=lambda _: None)
     assert [len(line.jumps.places) for line in measured.lines] == [0, 0, 0]
     num_moving = sum(line.varied != "the controls" for line in measured.lines)
     readings = {slope.num_readings for slope in slopes(measured) if slope.kind != "event"}
-    assert readings == {num_moving * len(measured.times)}
+    assert readings == {num_moving * (len(measured.times) - diverges)}
 
 
 def test_a_body_that_is_put_down_touches_from_the_start():
