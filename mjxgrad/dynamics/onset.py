@@ -36,6 +36,10 @@ impedance p d. It is continuous throughout, and the mean share is φ.
   they approach. The edges n ± μ t of a pyramid that slides push with B μ |v_t| as soon as they touch, often many times the
   weight; the body then rides on the ramp itself, and u grows by three times what this push gains in a step, unless the
   approach is much faster than 2 g h: an impact.
+- Motors press a light foot down with many times its weight. It is stopped and let go within a few steps, again and again, and
+  each time its tangent grows by some h Δa / u. So u has as much on top for three times |J a| - g, with a the acceleration that
+  there would be without contact; smoothly bounded, so that it adds no more than 10 of the impedance's widths to w. What only
+  falls or rolls has none of it.
 - w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a thing pushed along the floor) each
   switch multiplies the tangent by about h Δa / w, and w₀ bounds it at every time step. A larger one is a smoother motion,
   farther from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, keep the width of their own flight.
@@ -72,6 +76,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
 from mjxgrad.dynamics.jacobian import RowMap
+from mjxgrad.dynamics.kinematics import com_vel
 from mjxgrad.dynamics.newton import Variant
 from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
@@ -81,6 +86,11 @@ _PerContact = Float[Array, " contacts"]
 _LEAST_SHARE = 1e-9
 # What a pyramid's slip adds to the width. Derivatives of a box pushed along the floor at 4 ms are 10⁷ with 1, 1 to 4 with 2 or 3.
 _SLIP = 3.0
+# What motors press together adds this part to gravity, and this many times the impedance's width at most: with less of either,
+# feet of MuJoCo Playground's robots chatter; with no bound, a strong servo holds a light link off the floor.
+_PRESS, _WIDEST = 3.0, 10.0
+# In m, of impedances: wider than any contact, and what takes its place.
+_ENDLESS, _USUAL_WIDTH = 1e3, 1e-3
 # In m/s², where a scene has none: what is an impact and what chatters.
 _GRAVITY = 9.81
 
@@ -120,22 +130,44 @@ def reach(model: mjx.Model, data: mjx.Data, onset: Onset) -> Float[Array, ""]:
     Contacts are taken to be no stiffer or slower than those of the data, and geoms to stay within their bounding spheres.
     """
     contact, h = data._impl.contact, model.opt.timestep
-    turning, moving = data.cvel[:, :3], data.cvel[:, 3:]
-    lever = data.geom_xpos - data.subtree_com[model.body_rootid[model.geom_bodyid]]
-    turning, moving = turning[model.geom_bodyid], moving[model.geom_bodyid]
-    speeds = safe_norm(moving + jnp.cross(turning, lever)) + safe_norm(turning) * model.geom_rbound
-    speed = jnp.sum(jnp.sort(speeds)[-2:])
+    speed = _largest_rate(model, data, data.cvel)
+    free = _largest_rate(model, data, com_vel(model, data.replace(qvel=data.qacc_smooth)).cvel)
     stiffness, damping = stiffness_damping(model, contact.solref, contact.solimp[:, 1])
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
-    creep = _creep(gravity, h, stiffness, damping) + _SLIP * h * damping * speed
-    least = safe_sqrt((h * creep) ** 2 + (onset.width * contact.solimp[:, 2]) ** 2)
+    depth = _depth(contact.solimp)
+    creep = _creep(gravity, _PRESS * free, h, stiffness, damping, depth) + _SLIP * h * damping * speed
+    least = safe_sqrt((h * creep) ** 2 + (onset.width * depth) ** 2)
     return jnp.max(h * speed + 0.5 * jnp.maximum(h * speed, least))
 
 
-def _creep(gravity: Float[Array, ""], h: Float[Array, ""], stiffness: _PerContact, damping: _PerContact) -> _PerContact:
-    """Return the speed below which free motion, or the weight on a contact, moves bodies faster than they approach."""
+def _largest_rate(model: mjx.Model, data: mjx.Data, motion: Float[Array, "nbody 6"]) -> Float[Array, ""]:
+    """Return how fast the surfaces of two geoms approach at most, from the motion of bodies about `subtree_com`."""
+    turning, moving = motion[model.geom_bodyid, :3], motion[model.geom_bodyid, 3:]
+    lever = data.geom_xpos - data.subtree_com[model.body_rootid[model.geom_bodyid]]
+    rates = safe_norm(moving + jnp.cross(turning, lever)) + safe_norm(turning) * model.geom_rbound
+    return jnp.sum(jnp.sort(rates)[-2:])
+
+
+def _depth(solimp: Float[Array, "contacts 5"]) -> _PerContact:
+    """Return the width of the impedance; where it is the same at every depth, by 0 or an endless one, MuJoCo's default."""
+    width = solimp[:, 2]
+    return jnp.where((width > 0) & (width < _ENDLESS), width, _USUAL_WIDTH)
+
+
+def _creep(
+    gravity: Float[Array, ""],
+    press: Float[Array, "..."],
+    h: Float[Array, ""],
+    stiffness: _PerContact,
+    damping: _PerContact,
+    depth: _PerContact,
+) -> _PerContact:
+    """Return the speed below which free motion, or what presses on a contact, moves bodies faster than they approach."""
     resistance = damping + safe_sqrt(stiffness)
-    return gravity * jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
+    time = jnp.maximum(h, 1 / jnp.where(resistance > 0, 2 * resistance, jnp.inf))
+    more, most = press * time, _WIDEST * depth / h
+    both = safe_sqrt(more**2 + most**2)
+    return gravity * time + more * (most / jnp.where(both > 0, both, 1.0))
 
 
 class Shares(eqx.Module):
@@ -226,11 +258,14 @@ def _share(
     rate = _normal(block, rates)
     stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
-    creep = _creep(gravity, h, stiffness, damping)
+    press = jnp.abs(_normal(block, block.map.rates(data.qacc_smooth).reshape(-1, each))) - gravity
+    press = _PRESS * jnp.where(press > 0, press, 0.0)
+    depth = _depth(block.solimp[::each])
+    creep = _creep(gravity, press, h, stiffness, damping, depth)
     if block.is_pyramid:
         slip = jnp.max(jnp.abs(rates - rate[:, None]), axis=1)
         creep = creep + _SLIP * h * damping * slip * _is_slow(rate, 2 * h * gravity)
-    floor = onset.width.astype(rate.dtype) * block.solimp[::each, 2]
+    floor = onset.width.astype(rate.dtype) * depth
     # Six times the speed of a fall over such a length: half of it leaves derivatives of a pushed ball twice as scattered.
     chatters = _is_slow(rate, 6 * safe_sqrt(jnp.where(gravity > 0, gravity, _GRAVITY) * floor))
     travel, least = h * jnp.abs(rate), safe_sqrt((h * creep) ** 2 + chatters * floor**2)

@@ -29,6 +29,8 @@ _IMPEDANCES = (
     "eq_solimp",
 )
 _ENDLESS = 1e12  # metres or radians
+# Newton's method needs a few for most steps and up to 20 for some. It ends by itself, so a high limit costs nothing.
+_FEWEST_ITERATIONS, _ITERATIONS = 20, 100
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,10 @@ def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
+    if model.opt.iterations < _FEWEST_ITERATIONS:
+        given, model.opt.iterations = model.opt.iterations, _ITERATIONS
+        reason = "the derivative is that of a solve that has ended, C MuJoCo's ends short of it"
+        yield Conversion("iterations", str(given), str(_ITERATIONS), reason, exact=False)
     given = model.opt.solver
     if given == mujoco.mjtSolver.mjSOL_NEWTON:
         return

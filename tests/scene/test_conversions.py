@@ -154,6 +154,17 @@ def test_pgs_with_elliptic_cones_does_not_reach_the_optimum_and_is_warned_about(
     assert np.abs(_velocities(scene.mj_model) - given).max() > 1e-2
 
 
+def test_a_solve_that_would_end_short_is_let_to_its_end():
+    """As in the robots of MuJoCo Playground, whose derivative would be that of another motion."""
+    source = BOX.format(option="iterations='1'")
+    with pytest.warns(SceneWarning, match="iterations: 100 instead of 1: .*derivative"):
+        scene = load_scene(source)
+    short = _velocities(mujoco.MjModel.from_xml_string(source))
+    ended = _velocities(mujoco.MjModel.from_xml_string(source.replace("iterations='1'", "tolerance='0'")))
+    found = _velocities(scene.mj_model)
+    assert np.abs(found - ended).max() < 1e-4 * np.abs(short - ended).max()
+
+
 def test_sleep_is_warned_about():
     with pytest.warns(SceneWarning, match="flag sleep: disable instead of enable"):
         load_scene(_ball(flag="<flag sleep='enable'/>"))
