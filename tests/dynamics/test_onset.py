@@ -398,7 +398,7 @@ _FOOT = """
 
 
 def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
-    """It rocks from heel to toe. With widths by gravity alone derivatives are up to 60 times the slope, and their mean twice it."""
+    """It rocks from heel to toe. With widths by gravity alone derivatives are up to 60 times the slope, their mean twice it."""
     scene = mg.load_scene(_FOOT)
     time = 4e-3 * jnp.arange(75)
 
