@@ -101,6 +101,8 @@ def learn(
     # As arguments, the environments' numbers are no part of the program: one that is stiffer needs no other.
     is_one = isinstance(environment, Environment)
     environments = [environment] if is_one else list(environment)
+    if not environments:
+        raise ValueError("environment must be one or several, got an empty sequence")
     own, common, structure = _apart(environments)
     arrays = place((own, common))
 
