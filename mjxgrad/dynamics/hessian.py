@@ -5,6 +5,7 @@ the batch. On a GPU the matrix of many states would go to memory and back many t
 """
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad.dynamics import cholesky, linear, on_gpu
@@ -43,6 +44,7 @@ def in_one_kernel(
     interpret: bool = False,
 ) -> tuple[Float[Array, "nv batch"], Float[Array, "nv batch"]]:
     """Do what `solve` does; `interpret` runs on any device, slowly."""
-    matrix = jacobian.matrix()
-    factors, bent = jacobian.bent(matrix, layout, bend)
-    return on_gpu.solve(mass, vector, matrix, factors, bent, interpret=interpret)
+    together = jacobian.together()
+    factors, bent, diagonal = jacobian.bent(together, layout, bend)
+    mass = mass + jnp.eye(len(vector), dtype=mass.dtype)[:, :, None] * diagonal
+    return on_gpu.solve(mass, vector, together, factors, bent, interpret=interpret)

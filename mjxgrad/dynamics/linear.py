@@ -43,9 +43,11 @@ def dot(x: Float[Array, "n *batch"], y: Float[Array, "n *batch"]) -> Float[Array
     """Return the inner product."""
     if x.ndim == 1:
         return jnp.sum(x * y)
-    if len(x) > LONGEST_SUM:
-        return jnp.sum(x * y, axis=0)
-    return add(a * b for a, b in zip(x, y, strict=True))
+    rest = x * y
+    while len(rest) > LONGEST_SUM:  # XLA's CPU backend hands a reduction to a library, as in `sum_of_few`
+        half = len(rest) // 2
+        rest = jnp.concatenate([rest[:half] + rest[half : 2 * half], rest[2 * half :]])
+    return add(rest)
 
 
 def diagonal(matrix: _Matrix) -> Float[Array, "n *batch"]:

@@ -30,21 +30,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.dynamics import constraint, hessian, linear, on_gpu
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 from mjxgrad.dynamics.kinematics import Inertia
-from mjxgrad.dynamics.sparse import SparseRows
+from mjxgrad.dynamics.sparse import SparseRows, num_together
 
 _Vector = Float[Array, "nv *batch"]
-_PerRow = Float[Array, "rows *batch"]
+_OfRows = PyTree[Float[Array, "_ *batch"]]
 _Scalar = Float[Array, "*batch"]
 _Truth = Bool[Array, "*batch"]
 _Result = tuple[_Vector, Int[Array, "*batch"]]
 
-# Newton steps along the search line that all take: to ask whether they are needed takes as long as they do.
+# Newton steps along the search line that all of a batch take: to ask whether they are needed takes as long as they do.
 _LINE_STEPS = 4
 # Bound of the steps after that, and of those for elliptic cones. Halving alone gets to 1e-12 of the bracket; 25 were seen.
 _MAX_LINE_STEPS = 40
@@ -129,33 +129,37 @@ class System(eqx.Module):
     def problem(self, layout: RowLayout) -> "Entries":
         """Return the same with entries; arrays may carry the batch as trailing axes here."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return Entries(self.force, self.rows, self.inertia.matrix, jacobian, layout)
+        return Entries(self.force, self.rows, self.inertia.matrix, jacobian, layout)  # pyright: ignore[reportCallIssue]
 
 
 class Problem(eqx.Module):
-    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program."""
+    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program.
+
+    What belongs to the rows is one array, or in such a program several.
+    """
 
     force: _Vector
-    rows: Rows
+    reference: eqx.AbstractVar[_OfRows]
+    weight: eqx.AbstractVar[_OfRows]
 
     @abc.abstractmethod
     def weigh(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
 
     @abc.abstractmethod
-    def rates(self, acceleration: _Vector) -> _PerRow:
+    def rates(self, acceleration: _Vector) -> _OfRows:
         """Return J a."""
 
     @abc.abstractmethod
-    def pull(self, force: _PerRow) -> _Vector:
+    def pull(self, force: _OfRows) -> _Vector:
         """Return Jᵀ f."""
 
     @abc.abstractmethod
-    def push(self, x: _PerRow) -> _PerRow:
+    def push(self, x: _OfRows) -> _OfRows:
         """Return the forces of the rows."""
 
     @abc.abstractmethod
-    def bent(self, x: _PerRow, along: _PerRow) -> _PerRow:
+    def bent(self, x: _OfRows, along: _OfRows) -> _OfRows:
         """Return the second derivative of the cost by x, times a vector."""
 
     @abc.abstractmethod
@@ -178,7 +182,7 @@ class Problem(eqx.Module):
 
     def at(self, acceleration: _Vector) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = self.rates(acceleration) - self.rows.reference
+        x = jax.tree.map(jnp.subtract, self.rates(acceleration), self.reference)
         row_force = self.push(x)
         inertia, pull = self.weigh(acceleration), self.pull(row_force)
         return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
@@ -189,10 +193,14 @@ class Problem(eqx.Module):
         In its norm rows may be as stiff as they like: an error of their x by e adds Jᵀ D e to the gradient, which is large,
         and at most e D e to the decrement.
         """
-        size = jnp.abs(point.x) + jnp.abs(self.rows.reference)
-        weight = jnp.where(point.row_force != 0, self.rows.weight, 0.0)
-        terms = linear.dot(point.acceleration, point.inertia) + linear.dot(weight * size, size)
-        return (_ROUNDING * jnp.finfo(size.dtype).eps) ** 2 * terms
+
+        def energy(x: Array, reference: Array, force: Array, weight: Array) -> Array:
+            size = jnp.abs(x) + jnp.abs(reference)
+            return linear.dot(jnp.where(force != 0, weight, 0.0) * size, size)
+
+        rows = jax.tree.map(energy, point.x, self.reference, point.row_force, self.weight)
+        terms = linear.add([linear.dot(point.acceleration, point.inertia), *jax.tree.leaves(rows)])
+        return (_ROUNDING * jnp.finfo(terms.dtype).eps) ** 2 * terms
 
     def is_resolved(self, point: "Point") -> _Truth:
         """Return whether rounding leaves less than a thousandth of the acceleration unknown.
@@ -207,6 +215,7 @@ class Problem(eqx.Module):
 class Entries(Problem):
     """A problem whose M and J are entries."""
 
+    rows: Rows
     mass: Float[Array, "nv nv *batch"]
     jacobian: SparseRows
     layout: RowLayout = eqx.field(static=True)
@@ -231,6 +240,14 @@ class Entries(Problem):
         return hessian.solve(self.mass, self.jacobian, self.layout, bend, point.gradient)
 
     @property
+    def reference(self):
+        return self.rows.reference
+
+    @property
+    def weight(self):
+        return self.rows.weight
+
+    @property
     def diagonal(self):
         return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
@@ -242,12 +259,22 @@ class Entries(Problem):
         return jnp.all(jnp.isfinite(vector), axis=0)
 
 
-class _InRegisters(Problem):
-    """A problem whose M and J a GPU's program keeps, and whose rows stand for themselves: their force is -D x between bounds."""
+_Parts = tuple[Float[Array, " height"], *tuple[Float[Array, " width"], ...]]
 
+
+class _InRegisters(Problem):
+    """A problem whose M and J a GPU's program keeps, and whose rows stand for themselves: their force is -D x between bounds.
+
+    What belongs to the rows comes in parts: of those of J, and of limits and the like, which see one joint velocity each, by
+    that joint velocity. They would double J, which has a power of two as number of rows.
+    """
+
+    reference: _Parts
+    weight: _Parts
     mass: Float[Array, "width width"]
     jacobian: Float[Array, "height width"]
-    bounds: tuple[_PerRow, _PerRow]
+    signs: tuple[Float[Array, " width"], ...]  # of the rows that see one joint velocity
+    bounds: tuple[_Parts, _Parts]
     on_diagonal: _Vector
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
@@ -256,26 +283,39 @@ class _InRegisters(Problem):
         return (self.mass * acceleration[:, None]).sum(axis=0)  # by symmetry; along a row it takes more registers
 
     def rates(self, acceleration):
-        return (self.jacobian * acceleration[None]).sum(axis=1)
+        return (self.jacobian * acceleration[None]).sum(axis=1), *(sign * acceleration for sign in self.signs)
 
     def pull(self, force):
-        return (self.jacobian * force[:, None]).sum(axis=0)
+        first, *others = force
+        own = (sign * other for sign, other in zip(self.signs, others, strict=True))
+        return linear.add([(self.jacobian * first[:, None]).sum(axis=0), *own])
 
     def push(self, x):
-        force, (low, high) = -self.rows.weight * x, self.bounds
-        return jnp.where(force < low, low, jnp.where(force > high, high, force))
+        def push(x: Array, weight: Array, low: Array, high: Array) -> Array:
+            force = -weight * x
+            return jnp.where(force < low, low, jnp.where(force > high, high, force))
 
-    def curvature(self, x: _PerRow) -> _PerRow:
+        return jax.tree.map(push, x, self.weight, *self.bounds)
+
+    def curvature(self, x: _Parts) -> _Parts:
         """Return the second derivative of the cost by x."""
-        force, (low, high) = -self.rows.weight * x, self.bounds
-        return jnp.where((force > low) & (force < high), self.rows.weight, 0.0)
+
+        def curvature(x: Array, weight: Array, low: Array, high: Array) -> Array:
+            force = -weight * x
+            return jnp.where((force > low) & (force < high), weight, 0.0)
+
+        return jax.tree.map(curvature, x, self.weight, *self.bounds)
 
     def bent(self, x, along):
-        return self.curvature(x) * along
+        return jax.tree.map(jnp.multiply, self.curvature(x), along)
 
     def newton(self, point):
         mass, jacobian = self.refs
-        matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, self.curvature(point.x), jacobian)
+        first, *others = self.curvature(point.x)
+        matrix = on_gpu.add_rows(on_gpu.blocks(mass), jacobian, first, jacobian)
+        if others:
+            own = linear.add(sign**2 * other for sign, other in zip(self.signs, others, strict=True))
+            matrix = on_gpu.add_to_diagonal(matrix, own)
         return on_gpu.solve_blocks(matrix, point.gradient, self.size), on_gpu.diagonal(matrix)
 
     @property
@@ -294,8 +334,8 @@ class Point(eqx.Module):
     """A problem evaluated at one acceleration a: x = J a - a_ref, f(x), M a, Jᵀ f, and M a - f_smooth - Jᵀ f."""
 
     acceleration: _Vector
-    x: Float[Array, "rows *batch"]
-    row_force: Float[Array, "rows *batch"]
+    x: _OfRows
+    row_force: _OfRows
     inertia: _Vector
     pull: _Vector
     gradient: _Vector
@@ -330,7 +370,7 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     number is one more than `max_iterations` where these, or the digits of this precision, were too few.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
-    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(layout.num_rows, len(start)):
+    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(num_together(system.map), len(start)):
         # The program may yet be compiled for the CPU beside the GPU.
         ways = (functools.partial(way, layout, max_iterations) for way in (in_one_kernel, _in_turns))
         return jax.lax.platform_dependent(system, start, tolerance, cuda=next(ways), default=next(ways))
@@ -348,25 +388,27 @@ def in_one_kernel(
 ) -> _Result:
     """Do what `minimise` does for rows that stand for themselves; `interpret` runs on any device, slowly."""
     problem, size = system.problem(layout), len(start)
-    jacobian, rows = problem.jacobian.matrix(), problem.rows
+    jacobian, rows = problem.jacobian, problem.rows
+    together = jacobian.together()
+    apart = (jacobian.apart(x) for x in (rows.reference, rows.weight, *constraint.bounds(layout, rows)))
+    by_row, structure = jax.tree.flatten((tuple(apart), jacobian.signs()))
     smallest = tolerance**2 * linear.add(problem.diagonal)
 
-    def kernel(mass, jacobian, *refs):
-        *vectors, smallest, acceleration, num_iterations = refs
-        force, weight, reference, low, high, diagonal, start = (ref[...] for ref in vectors)
-        rows, bounds = Rows(reference, weight, low, ()), (low, high)
-        problem = _InRegisters(force, rows, mass[...], jacobian[...], bounds, diagonal, (mass, jacobian), size)
+    def kernel(mass, jacobian, force, diagonal, start, smallest, *refs):
+        *refs, acceleration, num_iterations = refs
+        (reference, weight, *bounds), signs = jax.tree.unflatten(structure, [ref[...] for ref in refs])
+        parts = (reference, weight, mass[...], jacobian[...], signs, tuple(bounds))
+        problem = _InRegisters(force[...], *parts, diagonal[...], (mass, jacobian), size)
         solver = _Solver(problem, smallest[...], max_iterations)
-        first = solver.measure(start, jnp.array(False), jnp.int32(0))
+        first = solver.measure(start[...], jnp.array(False), jnp.int32(0))
         acceleration[...], num_iterations[0] = solver.result(solver.run(first, 0))
 
     mass = on_gpu.filled(problem.mass)
     diagonal = jnp.maximum(linear.diagonal(mass), mujoco.mjMINVAL)
-    vectors = problem.force, rows.weight, rows.reference, *constraint.bounds(layout, rows), diagonal, start
-    width, height = on_gpu.padded(size), on_gpu.padded(layout.num_rows)
+    width, height = on_gpu.padded(size), on_gpu.padded(len(together))
     found, count = on_gpu.run(
         kernel,
-        (mass, jacobian, *vectors, smallest),
+        (mass, together, problem.force, diagonal, start, smallest, *by_row),
         ((start.dtype, width), (jnp.int32, 1)),
         width * height,
         interpret=interpret,
@@ -490,9 +532,9 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
 
     def improve(search: _Search) -> _Search:
         length = search.length
-        x = point.x + length * along
-        value = smooth_slope + length * smooth_curvature - linear.dot(problem.push(x), along)
-        curvature = smooth_curvature + linear.dot(problem.bent(x, along), along)
+        x = jax.tree.map(lambda x, rate: x + length * rate, point.x, along)
+        value = smooth_slope + length * smooth_curvature - _dot(problem.push(x), along)
+        curvature = smooth_curvature + _dot(problem.bent(x, along), along)
         low, high = jnp.where(value < 0, length, search.low), jnp.where(value < 0, search.high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
         is_flat = jnp.abs(value) <= flat
@@ -508,6 +550,10 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
     return jnp.where(search.is_flat | (search.low == 0), search.length, search.low)
 
 
+def _dot(one: PyTree, other: PyTree) -> _Scalar:
+    return linear.add(jax.tree.leaves(jax.tree.map(linear.dot, one, other)))
+
+
 def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Search:
     """Improve a few times, and on until every slope is flat, at which the next look is the minimiser.
 
@@ -515,6 +561,7 @@ def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Sea
     pressed hard may make it, four looks are all beyond the minimiser, and the last of them raises the cost.
     """
     is_done, num_looks = search.is_flat, 0
+    least = _LINE_STEPS if is_done.ndim else 0  # one state's own loop ends with its search
     if jax.default_backend() != "cpu" and is_done.ndim:
         # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA
         # writes each step out again wherever the next one uses its length.
@@ -525,7 +572,7 @@ def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Sea
     def goes_on(state):
         search, count = state
         is_left = ~(search.is_flat | is_done)
-        return (count < _LINE_STEPS) | ((jnp.any(is_left) if is_left.ndim else is_left) & (count < _MAX_LINE_STEPS))
+        return (count < least) | ((jnp.any(is_left) if is_left.ndim else is_left) & (count < _MAX_LINE_STEPS))
 
     return jax.lax.while_loop(goes_on, lambda state: (improve(state[0]), state[1] + 1), (search, num_looks))[0]
 

@@ -5,6 +5,7 @@ is compiled: those between its two bodies. Arrays may carry the batch as trailin
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -84,23 +85,59 @@ class SparseRows(eqx.Module):
             total = linear.add_to_block(total, group.dofs, square)
         return total
 
-    def matrix(self) -> Float[Array, "rows nv *batch"]:
-        """Return J, zeros and all."""
-        return dense(self.groups, self.pieces, self.tilts, self.num_dofs)
+    def together(self) -> Float[Array, "together nv *batch"]:
+        """Return J, zeros and all, without the rows that see one joint velocity each."""
+        # As the entries stand: else XLA computes them anew for every edge that they are in.
+        pieces = jax.lax.optimization_barrier(self.pieces)
+        chosen = [one for one in zip(self.groups, pieces, self.tilts, strict=True) if not one[0].is_diagonal]
+        if not chosen:
+            return jnp.zeros((0, self.num_dofs, *pieces[0].shape[3:]), pieces[0].dtype)
+        groups, entries, tilts = (list(of) for of in zip(*chosen, strict=True))
+        return dense(groups, entries, tilts, self.num_dofs)
+
+    def apart(self, x: Float[Array, "rows *batch"]) -> tuple[Array, ...]:
+        """Return of what belongs to rows the part of those of `together`, and that of each other group by joint velocity."""
+        others, single, start = [x[:0]], [], 0
+        for group in self.groups:
+            own, start = x[start : start + group.num_rows], start + group.num_rows
+            if group.is_diagonal:
+                single.append(self._by_dof(group, own))
+            else:
+                others.append(own)
+        return jnp.concatenate(others), *single
+
+    def signs(self) -> tuple[Float[Array, "nv *batch"], ...]:
+        """Return the entries of the groups whose rows see one joint velocity each, by joint velocity."""
+        pairs = zip(self.groups, self.pieces, strict=True)
+        return tuple(self._by_dof(group, entries[:, 0, 0]) for group, entries in pairs if group.is_diagonal)
+
+    def _by_dof(self, group: Group, own: Float[Array, "num *batch"]) -> Float[Array, "nv *batch"]:
+        return linear.add_at(jnp.zeros((self.num_dofs, *own.shape[1:]), own.dtype), group.dofs, own)
 
     def bent(
-        self, matrix: Float[Array, "rows nv *batch"], layout: RowLayout, bend: Bend
-    ) -> tuple[Float[Array, "rows *batch"], Float[Array, "rows nv *batch"] | None]:
-        """Return factors of the rows of J, and other rows, if need be: s'' J is the one times the other, or times J."""
+        self, together: Float[Array, "together nv *batch"], layout: RowLayout, bend: Bend
+    ) -> tuple[Float[Array, "together *batch"], Float[Array, "together nv *batch"] | None, Float[Array, "nv *batch"]]:
+        """Return Jᵀ s'' J in parts: factors of the rows of `together`; their partners, if not themselves; a diagonal."""
+        num_coupled = layout.num_rows - layout.simple_stop
+        coupled = jnp.ones((num_coupled, *bend.simple.shape[1:]), bend.simple.dtype)
+        factors, *single = self.apart(jnp.concatenate([bend.simple, coupled]))
+        diagonal = [sign**2 * own for sign, own in zip(self.signs(), single, strict=True)]
+        diagonal = linear.add([jnp.zeros_like(together, shape=(self.num_dofs, *together.shape[2:])), *diagonal])
         if not layout.cones:
-            return bend.simple, None
-        parts = [matrix[: layout.simple_stop]]
+            return factors, None, diagonal
+        first = layout.num_rows - len(together)  # cones come last
+        parts = [together[: layout.simple_stop - first]]
         for cone, square in zip(layout.cones, bend.cones, strict=True):
-            own = matrix[cone.start : cone.stop].reshape(cone.count, cone.dim, *matrix.shape[1:])
+            own = together[cone.start - first : cone.stop - first].reshape(cone.count, cone.dim, *together.shape[1:])
             both = linear.add(square[:, :, k, None] * own[:, None, k] for k in range(cone.dim))
-            parts.append(both.reshape(-1, *matrix.shape[1:]))
-        factors = [bend.simple, jnp.ones_like(matrix[layout.simple_stop :, 0])]
-        return jnp.concatenate(factors), jnp.concatenate(parts)
+            parts.append(both.reshape(-1, *together.shape[1:]))
+        return factors, jnp.concatenate(parts), diagonal
+
+
+def num_together(rows: RowMap) -> int:
+    """Return the number of rows of `SparseRows.together`."""
+    has_groups = len(rows.groups) <= _MOST_GROUPS
+    return sum(group.num_rows for group in rows.groups if not (has_groups and group.is_diagonal))
 
 
 def _gram(left: _Entries, right: _Entries) -> _Square:
