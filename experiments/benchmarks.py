@@ -65,12 +65,13 @@ _PATCHED_ITERATIONS = 10
 # Of `costs`: from how high above contact a scene starts (m), as index in qpos and height; and how many steps it takes.
 _STARTS = {"two_bodies": (2, 0.02), "hopper": (1, 0.05)}
 _NUM_STEPS = 100
-_WAYS = {
-    "": {},
-    "onset": {"onset": mg.Onset()},
-    "event": {"gradient": "event"},
-    "smoothed": {"smoothing": mg.Smoothing(1e-3)},
-    "smoothed backward": {"smoothing": mg.Smoothing(1e-3, mode="backward")},
+# Made when they are asked for: an array would begin JAX before `--per-core` is read.
+_WAYS: dict[str, Callable[[], dict[str, Any]]] = {
+    "": dict,
+    "onset": lambda: {"onset": mg.Onset()},
+    "event": lambda: {"gradient": "event"},
+    "smoothed": lambda: {"smoothing": mg.Smoothing(1e-3)},
+    "smoothed backward": lambda: {"smoothing": mg.Smoothing(1e-3, mode="backward")},
 }
 _COSTS = {
     "rollout": ("", "onset", "smoothed"),
@@ -79,7 +80,7 @@ _COSTS = {
 }
 
 # Of `throughput`.
-_STIFFNESS = np.logspace(1, 5, 10)  # no array of JAX, which would begin before `--per-core` is read
+_STIFFNESS = np.logspace(1, 5, 10)  # no array of JAX, as above
 _ANGLE = 0.65
 _ESTIMATORS = (mg.estimators.first_order, mg.estimators.zeroth_order, mg.estimators.alpha_order)
 
@@ -369,7 +370,7 @@ def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespa
         "jvp": lambda one: lambda qvel: jax.jvp(one, (qvel,), (jnp.ones_like(qvel),)),
     }
     programs = {
-        f"{what}, {way}" if way else what: jax.jit(jax.vmap(transforms[what](functools.partial(cost, **_WAYS[way]))))
+        f"{what}, {way}" if way else what: jax.jit(jax.vmap(transforms[what](functools.partial(cost, **_WAYS[way]()))))
         for what, ways in _COSTS.items()
         for way in ways
         if not way or options.only in f"{what}, {way}"
