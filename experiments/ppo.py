@@ -37,6 +37,8 @@ def learn_ppo(
         out, and `reward`, the mean per step of whole episodes then.
     """
     ppo, networks, environment_of_brax = load()
+    # Whole episodes to read a reward from: fewer where they would take longer than learning does.
+    num_readings = min(_READINGS, max(2, num_steps // (4 * num_environments * environment.episode_length)))
     readings: list[tuple[float, float, float]] = []
 
     def note(steps: int, metrics: dict[str, Any]) -> None:
@@ -64,7 +66,7 @@ def learn_ppo(
         network_factory=functools.partial(
             networks.make_ppo_networks, policy_hidden_layer_sizes=(128, 64, 32), value_hidden_layer_sizes=(256, 256)
         ),
-        num_evals=_READINGS + 1,
+        num_evals=num_readings + 1,
         num_eval_envs=64,
         deterministic_eval=True,
         progress_fn=note,
