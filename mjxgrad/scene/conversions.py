@@ -13,7 +13,7 @@ import numpy as np
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
 from mjxgrad.contact.warnings import name_pairs
-from mjxgrad.scene.refusals import element_name, has_medium, searched_pairs
+from mjxgrad.scene.refusals import element_name, has_constraints, has_medium, searched_pairs
 
 _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
@@ -76,7 +76,7 @@ def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
-    if model.opt.iterations < _FEWEST_ITERATIONS:
+    if model.opt.iterations < _FEWEST_ITERATIONS and has_constraints(model):
         given, model.opt.iterations = model.opt.iterations, _ITERATIONS
         reason = "the derivative is that of a solve that has ended, C MuJoCo's ends short of it"
         yield Conversion("iterations", str(given), str(_ITERATIONS), reason, exact=False)

@@ -165,6 +165,11 @@ def test_a_solve_that_would_end_short_is_let_to_its_end():
     assert np.abs(found - ended).max() < 1e-4 * np.abs(short - ended).max()
 
 
+def test_few_iterations_are_no_matter_where_nothing_is_solved():
+    scene = load_scene(PENDULUM.format(option="iterations='1'", flag="", joint="", rest=""))  # a warning fails the test
+    assert scene.mj_model.opt.iterations == 1
+
+
 def test_sleep_is_warned_about():
     with pytest.warns(SceneWarning, match="flag sleep: disable instead of enable"):
         load_scene(_ball(flag="<flag sleep='enable'/>"))
