@@ -162,8 +162,9 @@ def add_to_diagonal(matrix: _Blocks, vector: Float[Array, " width"]) -> _Blocks:
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def block(b: int, c: int) -> Array:
-        added = jnp.where(index[:, None] == index[None], _part(vector, b)[None], 0.0)
-        return matrix[b][c] + added if b == c else matrix[b][c]
+        if b != c:
+            return matrix[b][c]
+        return matrix[b][b] + jnp.where(index[:, None] == index[None], _part(vector, b)[None], 0.0)
 
     return _above(len(matrix), block)
 

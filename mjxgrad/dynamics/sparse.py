@@ -34,7 +34,7 @@ class SparseRows(eqx.Module):
     @classmethod
     def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
         """Return the entries of a map; rows that are not active are zero."""
-        if len(rows.groups) > _MOST_GROUPS:
+        if not _keeps_groups(rows):
             rows = DenseRows(
                 rows.matrix(num_dofs), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
             )
@@ -136,8 +136,12 @@ class SparseRows(eqx.Module):
 
 def num_together(rows: RowMap) -> int:
     """Return the number of rows of `SparseRows.together`."""
-    has_groups = len(rows.groups) <= _MOST_GROUPS
-    return sum(group.num_rows for group in rows.groups if not (has_groups and group.is_diagonal))
+    keeps_groups = _keeps_groups(rows)
+    return sum(group.num_rows for group in rows.groups if not (keeps_groups and group.is_diagonal))
+
+
+def _keeps_groups(rows: RowMap) -> bool:
+    return len(rows.groups) <= _MOST_GROUPS
 
 
 def _gram(left: _Entries, right: _Entries) -> _Square:
