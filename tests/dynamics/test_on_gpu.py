@@ -80,9 +80,7 @@ def _both(size, iterations=100, bad=None, expected=newton.minimise):
     layout, system = _problem(size, bad)
     start, tolerance = jnp.zeros((size, _BATCH)), jnp.full(_BATCH, 1e-10)
     kernel = functools.partial(newton.in_one_kernel, interpret=_INTERPRET)
-    return [
-        jax.jit(functools.partial(way, layout, iterations))(system, start, tolerance) for way in (expected, kernel)
-    ]
+    return [jax.jit(functools.partial(way, layout, iterations))(system, start, tolerance) for way in (expected, kernel)]
 
 
 @pytest.mark.parametrize("size", [7, 20])
