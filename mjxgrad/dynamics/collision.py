@@ -1,4 +1,6 @@
-"""Contacts between geoms: MJX's pairs, slots and functions, but for four kinds of pair whose points MJX finds in another way.
+"""Contacts between geoms: MJX's pairs and slots, and in part its functions.
+
+Those of planes, balls and capsules are in `capsules`. Of four more kinds of pair MJX finds the points in another way.
 
 A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
 and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
@@ -24,7 +26,8 @@ from jaxtyping import Array, Float, Int
 
 from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
-from mjxgrad.dynamics.spatial import contract, dot, pick
+from mjxgrad.dynamics import capsules
+from mjxgrad.dynamics.maps import contract, dot, pick
 
 _PerPair = Float[Array, " pairs"]
 _Frames = Float[Array, "pairs 3 3"]
@@ -42,9 +45,6 @@ _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
 # How much sooner a ball outside an edge is too far from it to be pushed by both faces.
 _ROUND_EDGES = 4.0
 
-_Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
-"""Distances, positions and frames."""
-
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs.
@@ -54,19 +54,22 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if not data._impl.ncon:
         return data
     most_pairs = custom_number(model, "max_geom_pairs")
-    by_dim: dict[int, list] = {}
-    members = geom_groups(model)
-    for key, contact in contact_groups(model, data).items():
-        geoms = np.array(members[key])[:, :2]
+    contacts, members = contact_groups(model, data), geom_groups(model)
+    pairs: dict[Any, Array | np.ndarray] = {}
+    for key, contact in contacts.items():
+        pairs[key] = geoms = np.array(members[key])[:, :2]
         if len(geoms) > most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types):
             first, second = data.geom_xpos[geoms.T]
             gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
-            contact = _greatest(contact, -gaps, most_pairs)
-            geoms = contact.geom
+            contacts[key] = nearest = _greatest(contact, -gaps, most_pairs)
+            pairs[key] = nearest.geom
+    found = capsules.find(model, data, {key: geoms for key, geoms in pairs.items() if capsules.has_formula(key, geoms)})
+    by_dim: dict[int, list] = {}
+    for key, geoms in pairs.items():
         find = _FUNCTIONS.get(key.types) or COLLISION_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
-        dist, pos, frame = find(model, data, key, geoms)
+        dist, pos, frame = found[key] if key in found else find(model, data, key, geoms)
         count = len(dist) // len(geoms)
-        contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), contact)
+        contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), contacts[key])
         by_dim.setdefault(int(key.condim), []).append(contact.replace(dist=dist, pos=pos, frame=frame))
     ordered = []
     for dim in sorted(by_dim):
@@ -162,7 +165,7 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
     return jax.tree.map(lambda x: x[index], contact)
 
 
-def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
+def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
     plane, box = geoms.T
     normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
@@ -178,7 +181,7 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
-def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> _Found:
+def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> capsules.Found:
     """Return MJX's contacts with the derivative of the distance that it drops."""
     dist, pos, frame = COLLISION_FUNCTIONS[key.types](model, data, key, geoms)
     on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
@@ -187,14 +190,14 @@ def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> _Fo
     return jax.lax.stop_gradient(dist - height) + height, pos, frame
 
 
-def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
+def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
     distance, outward, *_ = _from_box(model, data, geoms)
     pos, frame = _towards(model, data, geoms, distance, outward)
     return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
 
 
-def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> _Found:
+def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     """Return the point of the cylinder that is nearest to the ball's centre; from within, that of the nearer of side and end."""
     sphere, cylinder = geoms.T
     away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import cholesky, kinematics, spatial, tree
-from mjxgrad.dynamics.spatial import contract, pick
+from mjxgrad.dynamics import cholesky, kinematics, maps, spatial, tree
+from mjxgrad.dynamics.maps import contract, pick
 
 _Disable = mujoco.mjtDisableBit
 _Joint = mujoco.mjtJoint
@@ -37,7 +37,7 @@ def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     gear, joint = model.actuator_gear[:, 0], model.actuator_trnid[:, 0]
     drives = (model.jnt_dofadr[joint][:, None] == np.arange(model.nv)).astype(float)
     length = gear * pick(model.jnt_qposadr[joint], data.qpos)
-    moment = spatial.scale(gear, jnp.asarray(drives, gear.dtype))
+    moment = maps.scale(gear, jnp.asarray(drives, gear.dtype))
     return data.tree_replace({"actuator_length": length, "_impl.actuator_moment": moment})  # pyright: ignore[reportReturnType]
 
 

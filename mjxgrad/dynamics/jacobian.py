@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import linear, spatial
-from mjxgrad.dynamics.spatial import combine, contract
+from mjxgrad.dynamics import linear, maps, spatial
+from mjxgrad.dynamics.maps import combine, contract
 
 _PerRow = Float[Array, " rows"]
 _Vector = Float[Array, " nv"]
@@ -145,7 +145,7 @@ class AxisRows(RowMap):
         return (Group(self.dofs, len(self.dofs), is_diagonal=True),)
 
     def rates(self, velocity):
-        return self.sign * spatial.pick(np.array(self.dofs), velocity)
+        return self.sign * maps.pick(np.array(self.dofs), velocity)
 
     def pull(self, force):
         return combine(_selection(self.dofs, self.num_dofs).T, self.sign * force)
@@ -224,7 +224,7 @@ class ContactRows(RowMap):
         return self._moves(slice(None), tuple(range(self.axes.shape[0]))).reshape(-1, self.axes.shape[0])
 
     def rates(self, velocity):
-        motion = combine(self._all_moves(), spatial.scale(velocity, self.axes))
+        motion = combine(self._all_moves(), maps.scale(velocity, self.axes))
         turning, moving = motion[:, :3], motion[:, 3:]
         relative = self._sum(moving + spatial.cross(turning, self.lever.reshape(-1, 3)))
         along = contract("ckx,cx->ck", self.frame[:, : min(self.dim, 3)], relative)
@@ -246,7 +246,7 @@ class ContactRows(RowMap):
             twist = contract("ckx,ck->cx", self.frame[:, : self.dim - 3], force[:, 3:])
             torque += jnp.repeat(twist, num_sides, axis=0)
         wrench = jnp.concatenate([torque, push], axis=1)
-        return spatial.dot(self.axes, combine(self._all_moves().T, wrench))
+        return maps.dot(self.axes, combine(self._all_moves().T, wrench))
 
     def directions(self):
         return [self._entries(slice(start, stop), dofs) for start, stop, dofs in self._runs()]

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics import maps, spatial, tree
+from mjxgrad.dynamics.maps import combine, contract, pick
 from mjxgrad.dynamics.orientation import orientation
-from mjxgrad.dynamics.spatial import combine, contract, pick
 
 _Position = Float[Array, " nq"]
 _Vector = Float[Array, " nv"]
@@ -54,7 +54,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.nmocap:
         is_mocap = (model.body_mocapid >= 0)[:, None]
         from_parent = jnp.where(is_mocap, pick(model.body_mocapid, data.mocap_pos), from_parent)
-    moved = origin + spatial.scale(way, axis)
+    moved = origin + maps.scale(way, axis)
     moved -= turned.rotate(frames.after_joint, model.jnt_pos * (frames.after_joint >= 0)[:, None])
     of_bodies, of_anchors = tree.displacements(model)
     steps = jnp.concatenate([from_parent, to_anchor, moved])
@@ -95,7 +95,7 @@ def _joint_motion(
         elif run.kind == _Joint.mjJNT_HINGE:
             half = 0.5 * (q - model.qpos0[run.qpos])
             axes = model.jnt_axis[run.joints]
-            turn = jnp.concatenate([jnp.cos(half)[:, None], spatial.scale(jnp.sin(half), axes)], axis=1)
+            turn = jnp.concatenate([jnp.cos(half)[:, None], maps.scale(jnp.sin(half), axes)], axis=1)
         else:
             q = q.reshape(count, run.width)
             turn = spatial.normalise(q[:, -4:])
@@ -114,7 +114,7 @@ def _joint_motion(
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find `subtree_com`, `cinert` and `cdof` of posed bodies, with mass or without; a drop-in for `mjx.com_pos`."""
     mass = model.body_mass
-    moments = jnp.concatenate([spatial.scale(mass, data.xipos), mass[:, None]], axis=1)
+    moments = jnp.concatenate([maps.scale(mass, data.xipos), mass[:, None]], axis=1)
     sums = combine(tree.descendants(model), moments)
     is_massless = sums[:, 3:] < mujoco.mjMINVAL
     centre = sums[:, :3] / jnp.where(is_massless, 1.0, sums[:, 3:])
@@ -154,7 +154,7 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find velocities of bodies `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
-    motion = spatial.scale(data.qvel, data.cdof)
+    motion = maps.scale(data.qvel, data.cdof)
     sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
     velocity, before = sums[: model.nbody], sums[model.nbody :]
     return data.replace(cvel=velocity, cdof_dot=spatial.cross_motion(before, data.cdof))
@@ -183,7 +183,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find gravity, Coriolis and centrifugal forces, `qfrc_bias`, which keep the acceleration at zero; as `mjx.rne`."""
-    acceleration = combine(tree.moving_dofs(model), spatial.scale(data.qvel, data.cdof_dot))
+    acceleration = combine(tree.moving_dofs(model), maps.scale(data.qvel, data.cdof_dot))
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
         acceleration += jnp.concatenate([jnp.zeros_like(upwards), upwards])
@@ -196,7 +196,7 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> _Vector:
     """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
-    return spatial.dot(data.cdof, carried)
+    return maps.dot(data.cdof, carried)
 
 
 class Bodies(eqx.Module):
@@ -217,9 +217,9 @@ class Bodies(eqx.Module):
         moves = np.zeros((len(self.moves), len(self.axes)))
         for row, dofs in zip(moves, self.moves, strict=True):
             row[list(dofs)] = 1
-        motion = combine(moves, spatial.scale(acceleration, self.axes))
+        motion = combine(moves, maps.scale(acceleration, self.axes))
         force = spatial.momentum(self.inertia, motion)
-        return spatial.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
+        return maps.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
 
 
 class Inertia(eqx.Module):

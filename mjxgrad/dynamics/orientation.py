@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import spatial, tree
-from mjxgrad.dynamics.spatial import contract, pick
+from mjxgrad.dynamics import linear, maps, spatial, tree
+from mjxgrad.dynamics.maps import contract, pick
 
 _Vectors = Float[Array, "n 3"]
 _Matrices = Float[Array, "n 3 3"]
@@ -67,7 +67,7 @@ class Angles(eqx.Module):
         half = pick(index, 0.5 * self.angle)
         fixed = np.where((index >= 0)[:, None], self.chain.quaternion[index], _IDENTITY)
         turned = np.where((index >= 0)[:, None], self.chain.turned_quaternion[index], 0.0)
-        return spatial.scale(jnp.cos(half), jnp.asarray(fixed, half.dtype)) + spatial.scale(
+        return maps.scale(jnp.cos(half), jnp.asarray(fixed, half.dtype)) + maps.scale(
             jnp.sin(half), jnp.asarray(turned, half.dtype)
         )
 
@@ -90,7 +90,7 @@ class Angles(eqx.Module):
 
     def _sum(self, index: np.ndarray, even: Array, odd: Array, constant: Array) -> Array:
         cosine, sine = (pick(index, function(self.angle)) for function in (jnp.cos, jnp.sin))
-        return spatial.scale(cosine, even) + spatial.scale(sine, odd) + constant
+        return maps.scale(cosine, even) + maps.scale(sine, odd) + constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,8 @@ def orientation(
         return _products(model, data, frames, turn)
     hinges = np.flatnonzero(model.jnt_type == _Joint.mjJNT_HINGE)
     places = model.jnt_qposadr[hinges]
-    angles = data.qpos[places] - model.qpos0[places]
-    return Angles(spatial.combine(found.sums[:, hinges], angles), found)
+    angles = linear.take(data.qpos, tuple(places)) - model.qpos0[places]
+    return Angles(maps.combine(found.sums[:, hinges], angles), found)
 
 
 def _products(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]) -> Products:

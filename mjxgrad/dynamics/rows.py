@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.dynamics import linear, spatial, tree
+from mjxgrad.dynamics import linear, maps, spatial, tree
 from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, SlotRows, fold
 
@@ -83,7 +83,7 @@ def weight_of(block: Block, impedance: _PerRow) -> _PerRow:
 
 def per_row(x: Array, each: int) -> Array:
     """Return for each row what is given for each contact, limit or constraint."""
-    return jnp.repeat(x, each, axis=0, total_repeat_length=each * len(x))
+    return jnp.repeat(x, each, axis=0)
 
 
 def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
@@ -187,7 +187,7 @@ def contact_rows(
         for slot, of_slot in enumerate(order)
     )
     roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
-    centre = spatial.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)
+    centre = maps.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)
     return ContactRows(contact.pos[:, None] - centre, contact.frame, data.cdof, friction, sides, dim)
 
 
@@ -319,7 +319,7 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
         blocks[0] = one_sided(*_ball_limit(model, data, balls), model.dof_invweight0[dofs], balls, *of_joints)
     if joints.size:
         dofs = model.jnt_dofadr[joints]
-        distance, sign = _nearer_end(data.qpos[model.jnt_qposadr[joints]], model.jnt_range[joints])
+        distance, sign = _nearer_end(linear.take(data.qpos, tuple(model.jnt_qposadr[joints])), model.jnt_range[joints])
         blocks[1] = one_sided(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
     if tendons.size:
         distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])

@@ -1,0 +1,84 @@
+"""Linear and bilinear maps, as a CPU and as a GPU evaluates them, against sums over all entries, with their derivatives."""
+
+import jax
+import numpy as np
+import pytest
+
+from mjxgrad.dynamics import maps, spatial
+
+BILINEAR = {
+    "cross": spatial.cross,
+    "motion": spatial.cross_motion,
+    "force": spatial.cross_force,
+    "momentum": spatial.momentum,
+    "products": maps.Bilinear(np.arange(24.0).reshape(2, 3, 4) % 5 - 2),
+    "an entry of none": maps.Bilinear(np.array([[[1.0, 0.0]], [[0.0, 0.0]]])),
+    "nothing": maps.Bilinear(np.zeros((2, 3, 1))),
+}
+LINEAR = {
+    "sums": np.tril(np.ones((5, 5))),
+    "a choice": np.eye(4)[[2, 2, 0]],
+    "signs": np.array([[1.0, 0, -1], [0, 0, 0], [0, 2.5, 0]]),
+    "many terms": np.ones((2, maps._MOST_GATHERED + 1)),
+    "nothing": np.zeros((0, 3)),
+    "of nothing": np.zeros((2, 0)),
+}
+
+
+def _table(bilinear, of_first, of_second):
+    table = np.zeros((bilinear._size, of_first, of_second))
+    for k, i, j, coefficient in bilinear._terms:
+        table[k, i, j] = coefficient
+    return table
+
+
+def _sizes(bilinear):
+    """Return how many entries the factors need."""
+    _, i, j, _ = (
+        (np.array(x, int) for x in zip(*bilinear._terms, strict=True)) if bilinear._terms else ([], [0], [0], [])
+    )
+    return int(max(i)) + 1, int(max(j)) + 1
+
+
+@pytest.mark.parametrize("evaluate", [maps._evaluate, maps._evaluate_by_gathers])
+@pytest.mark.parametrize("name", BILINEAR)
+def test_a_bilinear_map_is_its_sum(name, evaluate):
+    bilinear = BILINEAR[name]
+    sizes = _sizes(bilinear)
+    a, b = (jax.random.normal(jax.random.key(seed), (3, 2, size)) for seed, size in enumerate(sizes))
+    found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size)
+    np.testing.assert_allclose(found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", BILINEAR)
+def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
+    bilinear = BILINEAR[name]
+    sizes = _sizes(bilinear)
+    table = _table(bilinear, *sizes)
+    a, b, cotangent = (jax.random.normal(jax.random.key(size), (4, size)) for size in (*sizes, bilinear._size))
+    by_a, by_b = jax.vjp(jax.vmap(bilinear), a, b)[1](cotangent)
+    np.testing.assert_allclose(by_a, np.einsum("kij,nk,nj->ni", table, cotangent, b), atol=1e-13)
+    np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), atol=1e-13)
+
+
+@pytest.mark.parametrize("evaluate", [maps._combine, maps._combine_by_gathers])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("name", LINEAR)
+def test_a_linear_map_is_its_sum(name, axis, evaluate):
+    matrix = LINEAR[name]
+    x = jax.random.normal(jax.random.key(0), np.insert([3, 2], axis, matrix.shape[1]))
+    found = evaluate(x, matrix=maps._Matrix(matrix), axis=axis)
+    np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), atol=1e-13)
+
+
+@pytest.mark.parametrize("batch", [0, 1])
+@pytest.mark.parametrize("name", LINEAR)
+def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
+    matrix = LINEAR[name]
+    shapes = [np.insert([size, 2], batch, 3) for size in matrix.shape[::-1]]
+    x, cotangent = (jax.random.normal(jax.random.key(seed), shape) for seed, shape in enumerate(shapes))
+    mapped = jax.vmap(lambda x: maps.combine(matrix, x), batch, batch)
+    (found,) = jax.vjp(mapped, x)[1](cotangent)
+    contracted = 1 - batch
+    expected = np.moveaxis(np.tensordot(matrix.T, cotangent, (1, contracted)), 0, contracted)
+    np.testing.assert_allclose(found, expected, atol=1e-13)
