@@ -123,7 +123,7 @@ def orientation(
         return _products(model, data, frames, turn)
     hinges = np.flatnonzero(model.jnt_type == _Joint.mjJNT_HINGE)
     places = model.jnt_qposadr[hinges]
-    angles = linear.take(data.qpos, tuple(places)) - model.qpos0[places]
+    angles = linear.take(data.qpos, tuple(places.tolist())) - model.qpos0[places]
     return Angles(maps.combine(found.sums[:, hinges], angles), found)
 
 
