@@ -15,8 +15,8 @@ from mjxgrad._arrays import form, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
+from mjxgrad.dynamics.cholesky import KEPT
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
-from mjxgrad.dynamics.implicit import CHECKPOINT_NAME
 from mjxgrad.dynamics.onset import reach
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
@@ -262,7 +262,7 @@ def rollout(
         return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
 
     if checkpoint:
-        keep = jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
+        keep = jax.checkpoint_policies.save_only_these_names(KEPT)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     policy_looks = policy is not None and policy_sees == "observations"

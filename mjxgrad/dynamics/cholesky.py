@@ -5,11 +5,12 @@ operation along the batch. On a GPU starting these operations would take longer 
 kernel.
 """
 
-from collections.abc import Callable
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from mjxgrad.dynamics import on_gpu
@@ -19,6 +20,8 @@ _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
 # Larger factorisations are left to LAPACK or cuSOLVER: written out they would take longer to compile than they save.
 _LARGEST = 16
+KEPT = "solution"
+"""Name for `jax.checkpoint` of solutions: a rollout that recomputes its steps keeps them and spares itself the solves."""
 
 
 def cholesky_solve(matrix: _Matrix, vector: _Vector) -> _Vector:
@@ -41,21 +44,33 @@ def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n bat
     return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
 
 
-def solve_positive_definite(
-    matrix: Float[Array, "n n"],
-    vector: Float[Array, " n"],
-    apply: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None,
-) -> Float[Array, " n"]:
+class Operator(Protocol):
+    """A symmetric matrix, by its entries and as a map."""
+
+    @property
+    def matrix(self) -> Float[Array, "n n"]: ...
+
+    def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]: ...
+
+
+@jax.custom_jvp
+def solve_positive_definite(operator: Operator, vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
-    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through `apply`, the matrix
-    as a map, in place of its entries.
+    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through the map, in place of
+    the entries. The solution is kept for reverse mode where `KEPT` is.
     """
+    return batch_last(cholesky_solve)(operator.matrix, vector)
 
-    def solve(_, b):
-        return batch_last(cholesky_solve)(matrix, b)
 
-    return jax.lax.custom_linear_solve(apply or (lambda x: matrix @ x), vector, solve, symmetric=True)
+@solve_positive_definite.defjvp
+def _solve_jvp(primals, tangents):
+    operator, vector = primals
+    solution = checkpoint_name(solve_positive_definite(operator, vector), KEPT)
+    _, change = jax.jvp(lambda operator, vector: vector - operator.apply(solution), primals, tangents)
+    return solution, jax.lax.custom_linear_solve(
+        operator.apply, change, lambda _, b: batch_last(cholesky_solve)(operator.matrix, b), symmetric=True
+    )
 
 
 def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
-from mjxgrad.dynamics import capsules
+from mjxgrad.dynamics import capsules, maps
 from mjxgrad.dynamics.maps import contract, dot, pick
 
 _PerPair = Float[Array, " pairs"]
@@ -129,7 +129,8 @@ def other_sides(
     where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
     boxes change sides only where the geoms are constants.
     """
-    towards = data.geom_xpos[geoms[:, 1]] - data.geom_xpos[geoms[:, 0]]
+    first, second = (_of_geoms(geoms[:, side], data.geom_xpos) for side in (0, 1))
+    towards = second - first
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
     if isinstance(geoms, np.ndarray):
         kinds = np.asarray(model.geom_type)[geoms]
@@ -162,7 +163,14 @@ def _joined(contacts: list):
 
 def _greatest(contact, score: Float[Array, " contacts"], count: int):
     index = jax.lax.top_k(score, k=count)[1]
-    return jax.tree.map(lambda x: x[index], contact)
+    places = jnp.concatenate([contact.dist[:, None], contact.pos, contact.frame.reshape(-1, 9)], axis=1)
+    dist, pos, frame = jnp.split(maps.choose(index, places), (1, 4), axis=1)
+    others = jax.tree.map(lambda x: x[index], contact)
+    return others.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
+
+
+def _of_geoms(geoms: Array | np.ndarray, x: Float[Array, "ngeom *item"]) -> Float[Array, "n *item"]:
+    return pick(geoms, x) if isinstance(geoms, np.ndarray) else maps.choose(geoms, x)
 
 
 def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:

@@ -160,5 +160,5 @@ def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     wrench = jnp.concatenate([torque + spatial.cross(lever, push), push], axis=1)
     applied = data.qfrc_applied + kinematics.generalised_force(model, data, wrench)
     total = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + applied
-    unconstrained = cholesky.solve_positive_definite(mjx.full_m(model, data), total)
+    unconstrained = cholesky.solve_positive_definite(kinematics.inertia_of(model, data), total)
     return data.replace(qfrc_smooth=total, qacc_smooth=unconstrained)

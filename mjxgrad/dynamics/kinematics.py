@@ -14,11 +14,14 @@ References:
     MuJoCo documentation, "Computation", "General framework".
 """
 
+import dataclasses
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics import maps, spatial, tree
@@ -234,6 +237,13 @@ class Inertia(eqx.Module):
             return contract("ij,j->i", self.matrix, acceleration)
         return self.bodies.apply(acceleration)
 
+    def plus(self, diagonal: _Vector) -> "Inertia":
+        """Return M plus a diagonal matrix."""
+        bodies = None
+        if self.bodies is not None:
+            bodies = dataclasses.replace(self.bodies, armature=self.bodies.armature + diagonal)
+        return Inertia(self.matrix + jnp.diag(diagonal), bodies)
+
 
 def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     """Return M of data with its mass matrix filled in."""
@@ -250,14 +260,13 @@ def integrate_position(
     model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
 ) -> _Position:
     """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
-    turning, first, dofs = _addresses(model)
-    if not turning.size:
+    places = _places(model)
+    if not places.quaternions.size:
         return qpos + duration * qvel
-    moved = qpos.at[first].add(duration * qvel[dofs])
-    quaternions = qpos[turning[:, :1] + np.arange(4)]
-    turned = spatial.multiply(quaternions, spatial.exponential(duration * qvel[turning[:, 1:] + np.arange(3)]))
-    turned = turned / jnp.sqrt(jnp.sum(turned * turned, axis=-1, keepdims=True))
-    return moved.at[turning[:, :1] + np.arange(4)].set(turned)
+    moved = qpos + duration * pick(places.dof, qvel)
+    turn = spatial.exponential(duration * pick(places.turns, qvel).reshape(-1, 3))
+    turned = spatial.normalise(spatial.multiply(pick(places.quaternions, qpos).reshape(-1, 4), turn))
+    return jnp.where(places.entry < 0, moved, pick(places.entry, turned.reshape(-1)))
 
 
 def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
@@ -265,26 +274,44 @@ def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vect
 
     The inverse of `integrate_position`.
     """
-    turning, first, dofs = _addresses(model)
-    if not turning.size:
+    places = _places(model)
+    if not places.quaternions.size:
         return end - start
-    quaternions = turning[:, :1] + np.arange(4)
-    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(start[quaternions]), end[quaternions]))
-    change = jnp.zeros(model.nv, start.dtype).at[dofs].set((end - start)[first])
-    return change.at[turning[:, 1:] + np.arange(3)].set(turned)
+    before, after = (pick(places.quaternions, x).reshape(-1, 4) for x in (start, end))
+    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(before), after)).reshape(-1)
+    return pick(_inverse(places.dof, model.nv), end - start) + pick(_inverse(places.turns, model.nv), turned)
 
 
-def _addresses(model: mjx.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (qpos, dof) addresses of quaternions, and those of the coordinates that simply add."""
-    turning, first, dofs = [], [], []
-    for kind, address, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
-        if kind == _Joint.mjJNT_FREE:
-            first += range(address, address + 3)
-            dofs += range(dof, dof + 3)
-            turning.append((address + 3, dof + 3))
-        elif kind == _Joint.mjJNT_BALL:
-            turning.append((address, dof))
+class _Places(NamedTuple):
+    """Of each coordinate the joint velocity that adds to it and its entry among those of quaternions, -1 for none.
+
+    And of the entries of quaternions and of turning joints the places among coordinates and among joint velocities.
+    """
+
+    dof: Int[np.ndarray, " nq"]
+    entry: Int[np.ndarray, " nq"]
+    quaternions: Int[np.ndarray, " entries"]
+    turns: Int[np.ndarray, " dofs"]
+
+
+def _places(model: mjx.Model) -> _Places:
+    dof, quaternions, turns = np.full(model.nq, -1), [], []
+    for kind, address, first in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        is_free = kind == _Joint.mjJNT_FREE
+        if is_free:
+            dof[address : address + 3] = np.arange(first, first + 3)
+            address, first = address + 3, first + 3
+        if is_free or kind == _Joint.mjJNT_BALL:
+            quaternions += range(address, address + 4)
+            turns += range(first, first + 3)
         else:
-            first.append(address)
-            dofs.append(dof)
-    return np.array(turning, int).reshape(-1, 2), np.array(first, int), np.array(dofs, int)
+            dof[address] = first
+    quaternions, turns = np.array(quaternions, int), np.array(turns, int)
+    return _Places(dof, _inverse(quaternions, model.nq), quaternions, turns)
+
+
+def _inverse(index: Int[np.ndarray, " n"], size: int) -> Int[np.ndarray, " size"]:
+    """Return where in an index each place is, -1 where it is not."""
+    inverse = np.full(size, -1)
+    inverse[index[index >= 0]] = np.flatnonzero(index >= 0)
+    return inverse

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 # (entry of the result, entry of the first factor, entry of the second, coefficient)
 _Term = tuple[int, int, int, float]
 # Terms of a sum up to which a GPU gathers them; more are a product of matrices.
-_MOST_GATHERED = 8
+_MOST_GATHERED = 32
 
 
 class Bilinear:
@@ -52,6 +52,21 @@ def pick(index: np.ndarray, x: Float[Array, "n *item"], default: np.ndarray | fl
         return selected
     missing = (index < 0).reshape((-1,) + (1,) * (x.ndim - 1))
     return selected + jnp.asarray(missing * default, x.dtype)
+
+
+@jax.custom_jvp
+def choose(index: Int[Array, "*m"], x: Float[Array, "n *item"]) -> Float[Array, "..."]:
+    """Return the items of an index that only the running program knows."""
+    return x[index]
+
+
+@choose.defjvp
+def _choose_jvp(primals, tangents):
+    (index, x), (_, change) = primals, tangents
+    # A sum over all items, for its transpose is no scatter.
+    return choose(index, x), jnp.tensordot(
+        (index[..., None] == jnp.arange(len(x))).astype(x.dtype), change, axes=1, precision="highest"
+    )
 
 
 def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:

@@ -204,24 +204,16 @@ def contact_jacobian(
     The second body counts positive, the first negative.
     """
     moves = jnp.asarray(tree.moving_dofs(model), position.dtype)[bodies]  # contacts, 2, nv
-    centre = data.subtree_com[jnp.asarray(model.body_rootid)[bodies]]
-    num_axes = min(dim, 3)
-    force = frame[:, :num_axes]
-    signs = (-moves[:, 0], moves[:, 1])
-    rows = jnp.zeros((len(position), num_axes, model.nv), position.dtype)
-    for side in (0, 1):
-        torque = jnp.cross((position - centre[:, side])[:, None], force)
-        wrench = jnp.concatenate([torque, force], axis=-1)
-        rows += signs[side][:, None] * _dot_axes(wrench, data.cdof)
+    centre = maps.choose(jnp.asarray(model.body_rootid)[bodies], data.subtree_com)
+    push = jnp.broadcast_to(frame[:, None, : min(dim, 3)], (len(position), 2, min(dim, 3), 3))
+    lever = jnp.broadcast_to((position[:, None] - centre)[:, :, None], push.shape)
+    wrench = jnp.concatenate([spatial.cross(lever, push), push], axis=3)
+    signs = moves * jnp.array([-1.0, 1.0], position.dtype)[:, None]
+    rows = linear.add(signs[:, i, None] * maps.contract("cka,va->ckv", wrench[:, i], data.cdof) for i in (0, 1))
     if dim > 3:
-        turning = (signs[0] + signs[1])[:, None] * _dot_axes(frame[:, : dim - 3], data.cdof[:, :3])
-        rows = jnp.concatenate([rows, turning], axis=1)
+        turning = maps.contract("cka,va->ckv", frame[:, : dim - 3], data.cdof[:, :3])
+        rows = jnp.concatenate([rows, linear.add(signs[:, i, None] for i in (0, 1)) * turning], axis=1)
     return rows
-
-
-def _dot_axes(wrench: Float[Array, "contacts k n"], axes: Float[Array, "nv n"]) -> Float[Array, "contacts k nv"]:
-    # Written out: XLA's CPU backend crashed on the derivative of the reduction under two jax.vmap (jax 0.10.2).
-    return linear.add(wrench[:, :, None, i] * axes[:, i] for i in range(axes.shape[1]))
 
 
 def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> Float[Array, "3"]:

@@ -294,11 +294,8 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
         0.0, model.dof_damping
     ):
         return data.qacc
-    damping, inertia = model.opt.timestep * model.dof_damping, inertia_of(model, data)
-    slowed = cholesky.solve_positive_definite(
-        inertia.matrix + jnp.diag(damping), damping * data.qacc, lambda x: inertia.apply(x) + damping * x
-    )
-    return data.qacc - slowed
+    damping = model.opt.timestep * model.dof_damping
+    return data.qacc - cholesky.solve_positive_definite(inertia_of(model, data).plus(damping), damping * data.qacc)
 
 
 def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
@@ -307,7 +304,7 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     if derivative is None:
         return data.qacc
     mass = mjx.full_m(model, data) - model.opt.timestep * derivative
-    return cholesky.solve_positive_definite(mass, data.qfrc_smooth + data.qfrc_constraint)
+    return cholesky.solve_positive_definite(Inertia(mass), data.qfrc_smooth + data.qfrc_constraint)
 
 
 def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: _Vector | None) -> mjx.Data:
