@@ -5,7 +5,7 @@ operation along the batch. On a GPU starting these operations would take longer 
 kernel.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n bat
     return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
 
 
+@runtime_checkable
 class Operator(Protocol):
     """A symmetric matrix, by its entries and as a map."""
 

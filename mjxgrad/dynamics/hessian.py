@@ -4,6 +4,8 @@ Arrays may carry the batch as trailing axis, see `linear`. A CPU assembles the m
 the batch. On a GPU the matrix of many states would go to memory and back many times; there one kernel does it all.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,6 +18,10 @@ _Vector = Float[Array, "nv *batch"]
 _Matrix = Float[Array, "nv nv *batch"]
 
 
+# Of the diagonal of a matrix: what is added where rounding has made it indefinite stays below.
+_MOST_MENDED = 0.01
+
+
 def solve(
     mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: Bend, vector: _Vector
 ) -> tuple[_Vector, _Vector]:
@@ -25,12 +31,44 @@ def solve(
         hessian = jacobian.gram(mass, layout, bend)
         return cholesky.cholesky_solve(hessian, vector), linear.diagonal(hessian)
 
-    def at_once(mass, jacobian, bend, vector):
-        return in_one_kernel(mass, jacobian, layout, bend, vector)
+    return _on_device(in_one_kernel, step_by_step, mass, jacobian, layout, bend, vector)
 
+
+def solve_mended(mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: Bend, vector: _Vector) -> _Vector:
+    """Return (M + Jᵀ s'' J)⁻¹ vector, also where rounding has made that indefinite.
+
+    In single precision s'' may exceed M so far (impedance near 1) that M is lost. Then the least share of its diagonal that mends
+    it, by powers of four from rounding on, is added: there less moves.
+    """
+    unit = jnp.eye(len(vector), dtype=vector.dtype).reshape(len(vector), -1, *(1,) * (vector.ndim - 1))
+
+    def step_by_step(mass, jacobian, bend, vector):
+        def attempt(state):
+            known, is_known, diagonal, share = state
+            hessian = jacobian.gram(mass + unit * (share * diagonal), layout, bend)
+            found, diagonal = cholesky.cholesky_solve(hessian, vector), linear.diagonal(hessian)
+            is_lost = ~jnp.isfinite(found).all(axis=0) & jnp.isfinite(jnp.stack([diagonal, vector])).all(axis=(0, 1))
+            return jnp.where(is_known, known, found), is_known | ~is_lost, diagonal, on_gpu.next_share(share)
+
+        zero = jnp.zeros_like(vector)
+        first = zero, jnp.zeros(vector.shape[1:], bool), zero, jnp.zeros((), vector.dtype)
+        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[3] < _MOST_MENDED), attempt, first)[0]
+
+    def at_once(*args):
+        return in_one_kernel(*args, most_mended=_MOST_MENDED)[0]
+
+    return _on_device(at_once, step_by_step, mass, jacobian, layout, bend, vector)
+
+
+def _on_device(at_once: Callable, step_by_step: Callable, mass, jacobian, layout: RowLayout, bend, vector):
+    """Solve by one kernel where there are some, else by operations."""
     if vector.ndim == 2 and on_gpu.solves(layout.num_rows, len(vector)):
         # The program may yet be compiled for the CPU beside the GPU.
-        return jax.lax.platform_dependent(mass, jacobian, bend, vector, cuda=at_once, default=step_by_step)
+        return jax.lax.platform_dependent(
+            *(mass, jacobian, bend, vector),
+            cuda=lambda mass, jacobian, bend, vector: at_once(mass, jacobian, layout, bend, vector),
+            default=step_by_step,
+        )
     return step_by_step(mass, jacobian, bend, vector)
 
 
@@ -41,10 +79,11 @@ def in_one_kernel(
     bend: Bend,
     vector: Float[Array, "nv batch"],
     *,
+    most_mended: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "nv batch"], Float[Array, "nv batch"]]:
-    """Do what `solve` does; `interpret` runs on any device, slowly."""
+    """Do what `solve` does, or `solve_mended` with at most so much; `interpret` runs on any device, slowly."""
     together = jacobian.together()
     factors, bent, diagonal = jacobian.bent(together, layout, bend)
     mass = mass + jnp.eye(len(vector), dtype=mass.dtype)[:, :, None] * diagonal
-    return on_gpu.solve(mass, vector, together, factors, bent, interpret=interpret)
+    return on_gpu.solve(mass, vector, together, factors, bent, most_mended=most_mended, interpret=interpret)

@@ -33,8 +33,6 @@ from mjxgrad.dynamics.newton import System, Variant
 _Truth = Bool[Array, ""]
 _Scalar = Float[Array, ""]
 _Vector = Float[Array, " nv"]
-# Of the diagonal of H: what is added where rounding has made it indefinite stays below.
-_MOST = 0.01
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -119,9 +117,6 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
     """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force.
 
     Where it is not needed it is zero.
-
-    In single precision S may exceed M so far (impedance near 1) that rounding leaves the sum not positive definite. Then the
-    least share of its diagonal that mends it, by powers of four from rounding on, is added: where M is lost, less moves.
     """
 
     def apply(x: _Vector) -> _Vector:
@@ -129,23 +124,7 @@ def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_ne
 
     def run(system, bend, force):
         problem = system.problem(layout)
-        unit = jnp.eye(len(force), dtype=force.dtype).reshape(len(force), -1, *(1,) * (force.ndim - 1))
-
-        def attempt(state):
-            known, is_known, diagonal, share = state
-            mass = problem.mass + unit * (share * diagonal)
-            found, diagonal = hessian.solve(mass, problem.jacobian, layout, bend, force)
-            is_lost = ~jnp.isfinite(found).all(axis=0) & jnp.isfinite(jnp.stack([diagonal, force])).all(axis=(0, 1))
-            return jnp.where(is_known, known, found), is_known | ~is_lost, diagonal, jnp.maximum(4 * share, rounding)
-
-        rounding = float(jnp.finfo(force.dtype).eps)
-        first = (
-            jnp.zeros_like(force),
-            jnp.zeros(force.shape[1:], bool),
-            jnp.zeros_like(force),
-            jnp.zeros((), force.dtype),
-        )
-        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[3] < _MOST), attempt, first)[0]
+        return hessian.solve_mended(problem.mass, problem.jacobian, layout, bend, force)
 
     def run_where(system, bend, force, is_needed):
         return linear.on_few(run, is_needed, jnp.zeros_like(force), system, bend, force)

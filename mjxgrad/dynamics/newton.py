@@ -327,7 +327,7 @@ class _InRegisters(Problem):
         return True
 
     def is_finite(self, vector):
-        return (~(jnp.abs(vector) < jnp.inf)).astype(jnp.int32).sum() == 0
+        return on_gpu.is_finite(vector)
 
 
 class Point(eqx.Module):

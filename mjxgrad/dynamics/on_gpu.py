@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import linear
 
@@ -63,12 +63,13 @@ def solve(
     scale: Float[Array, "rows batch"] | None = None,
     right: Float[Array, "rows n batch"] | None = None,
     *,
+    most_mended: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "n batch"], Float[Array, "n batch"]]:
     """Return (mass + Σ scale left rightᵀ)⁻¹ vector, the sum over rows, and the diagonal of that matrix.
 
-    The solution is not finite where the matrix, which must be symmetric, is not positive definite. The right rows are by default
-    the left ones; a row whose scale is zero costs little.
+    The solution is not finite where the matrix, which must be symmetric, is not positive definite, and a share of its diagonal
+    below `most_mended` does not mend that. The right rows are by default the left ones; a row whose scale is zero costs little.
     """
 
     def kernel(mass, vector, *refs):
@@ -77,7 +78,7 @@ def solve(
         if left is not None:
             matrix = add_rows(matrix, refs[0], refs[1][...], refs[2 if right is not None else 0])
         on_diagonal[...] = diagonal(matrix)
-        solution[...] = solve_blocks(matrix, vector[...], size)
+        solution[...] = mended(matrix, vector[...], size, most_mended)
 
     size, inputs = len(vector), [x for x in (filled(mass), vector, left, scale, right) if x is not None]
     found = run(kernel, inputs, [(vector.dtype, padded(size))] * 2, interpret=interpret)
@@ -177,6 +178,34 @@ def diagonal(matrix: _Blocks) -> Float[Array, " width"]:
 def solve_blocks(matrix: _Blocks, vector: Float[Array, " width"], size: int) -> Float[Array, " width"]:
     """Return matrix⁻¹ vector, not finite where the matrix is not positive definite."""
     return join(_solve(matrix, [_part(vector, b) for b in range(len(matrix))], size))
+
+
+def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mended: float) -> Float[Array, " width"]:
+    """Return matrix⁻¹ vector, with the least share of its diagonal added that makes it positive definite."""
+    found, own = solve_blocks(matrix, vector, size), diagonal(matrix)
+    if not most_mended:
+        return found
+    can_be = is_finite(own) & is_finite(vector)
+
+    def attempt(carry):
+        share = next_share(carry[0])
+        return share, solve_blocks(add_to_diagonal(matrix, share * own), vector, size)
+
+    def goes_on(carry):
+        share, found = carry
+        return can_be & ~is_finite(found) & (next_share(share) < most_mended)
+
+    return jax.lax.while_loop(goes_on, attempt, (jnp.zeros((), vector.dtype), found))[1]
+
+
+def next_share(share: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the share of a diagonal to add next: none, then rounding, then four times as much each time."""
+    return jnp.maximum(4 * share, float(jnp.finfo(share.dtype).eps))
+
+
+def is_finite(vector: Float[Array, " width"]) -> Bool[Array, ""]:
+    """Return whether all entries are numbers."""
+    return (~(jnp.abs(vector) < jnp.inf)).astype(jnp.int32).sum() == 0
 
 
 def join(parts: list[_Part]) -> Float[Array, " width"]:

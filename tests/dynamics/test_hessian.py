@@ -51,6 +51,26 @@ def test_one_kernel_does_what_the_operations_do(groups):
     np.testing.assert_allclose(diagonal, matrix[np.arange(_NV), np.arange(_NV)], rtol=1e-13)
 
 
+def test_one_kernel_mends_what_the_operations_mend():
+    """Where the rows outweigh a mass of a rank less, in single precision."""
+    layout, problem = _problem(_SIMPLE)
+    mass, jacobian, bend, vector = jax.tree.map(lambda x: x.astype(jnp.float32), problem)
+    mass = mass.at[:2, :2, 0].set(jnp.array([[1, 1.0001], [1.0001, 1]], jnp.float32))
+    bend = jax.tree.map(lambda x: x.at[:, 0].set(0.0), bend)
+    kernel = functools.partial(
+        hessian.in_one_kernel, most_mended=hessian._MOST_MENDED, interpret=jax.default_backend() != "gpu"
+    )
+    found, _ = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(mass, jacobian, bend, vector)
+    expected = jax.jit(lambda *args: hessian.solve_mended(args[0], args[1], layout, args[2], args[3]))(
+        mass, jacobian, bend, vector
+    )
+    unmended, _ = hessian.solve(mass, jacobian, layout, bend, vector)
+    assert not np.isfinite(unmended[:, 0]).all()
+    assert np.isfinite(expected).all()
+    # A condition of 1e4 in single precision.
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3)
+
+
 def test_the_matrix_is_that_of_all_rows():
     """J formed row by row, edges of pyramids included."""
     layout, (mass, jacobian, bend, _) = _problem(_SIMPLE + _PYRAMIDS)

@@ -48,6 +48,23 @@ def test_an_indefinite_member_is_not_finite_and_its_neighbour_is_right(bad):
     np.testing.assert_allclose(found[:, 1], 1 / np.arange(1.0, 21.0), rtol=1e-14)
 
 
+@pytest.mark.parametrize("place", [2, 15, 18])  # in the first block, across both, and in the second
+def test_what_rounding_made_indefinite_is_mended_by_the_least_share_of_its_diagonal(place):
+    mass = np.stack([np.diag(np.arange(1.0, 21.0))] * 3)
+    least = 1e-9
+    mass[0, place : place + 2, place : place + 2] = 7 * np.array([[1, 1 + least], [1 + least, 1]])
+    mass[2, place, place] = -1.0
+    solve = functools.partial(on_gpu.solve, most_mended=0.01, interpret=_INTERPRET)
+    found, _ = jax.jit(solve)(_last(mass), jnp.tile(jnp.arange(1.0, 21.0)[:, None], 3))
+    share = np.finfo(float).eps
+    while share <= least:
+        share *= 4
+    expected = np.linalg.solve(mass[0] + share * np.diag(np.diag(mass[0])), np.arange(1.0, 21.0))
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6)  # a condition of 1e9 times rounding
+    np.testing.assert_allclose(found[:, 1], np.ones(20), rtol=1e-14)
+    assert not np.isfinite(found[:, 2]).any()
+
+
 def _problem(size, bad=None):
     """Return a random problem of each kind of row that stands for itself, the force of one member not finite.
 
