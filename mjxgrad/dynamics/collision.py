@@ -163,10 +163,12 @@ def _joined(contacts: list):
 
 def _greatest(contact, score: Float[Array, " contacts"], count: int):
     index = jax.lax.top_k(score, k=count)[1]
+    chosen = jax.tree.map(lambda x: x[index], contact)
+    if contact.dist is None:  # before they are found
+        return chosen
     places = jnp.concatenate([contact.dist[:, None], contact.pos, contact.frame.reshape(-1, 9)], axis=1)
     dist, pos, frame = jnp.split(maps.choose(index, places), (1, 4), axis=1)
-    others = jax.tree.map(lambda x: x[index], contact)
-    return others.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
+    return chosen.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
 
 
 def _of_geoms(geoms: Array | np.ndarray, x: Float[Array, "ngeom *item"]) -> Float[Array, "n *item"]:

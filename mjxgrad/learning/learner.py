@@ -198,7 +198,8 @@ def optimisers(
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
         clip = optax.clip_by_global_norm(settings.largest_norm)
-        return optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95))
+        # Of one vector it is a few operations, of each layer's arrays as many each.
+        return optax.flatten(optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95)))
 
     per_update = settings.critic_iterations * settings.critic_batches
     actor_rate = optax.linear_schedule(settings.actor_rate, 0.0, num_updates)
