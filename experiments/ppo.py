@@ -72,9 +72,11 @@ def learn_ppo(
         progress_fn=note,
         seed=seed,
     )
-    steps, seconds, reward = np.array(readings).T
-    # Brax counts compilation in with the first part.
-    seconds = np.concatenate([[0.0], np.diff(seconds)[1:].mean(keepdims=True), np.diff(seconds)[1:]]).cumsum()
+    steps, walls, reward = np.array(readings).T
+    # Brax counts compilation in with the first part, and often with the second.
+    parts = np.diff(walls)
+    parts[:2] = np.median(parts[min(2, len(parts) - 1) :])
+    seconds = np.concatenate([[0.0], parts.cumsum()])
 
     def act(params: Any, obs: Float[Array, " obs"]) -> Float[Array, " nu"]:
         return make_policy(params, deterministic=True)(obs, jax.random.key(0))[0]

@@ -23,6 +23,8 @@ from jaxtyping import Array, Float, Int
 _Term = tuple[int, int, int, float]
 # Terms of a sum up to which a GPU gathers them; more are a product of matrices.
 _MOST_GATHERED = 32
+# Entries that are put together at once.
+_MOST_JOINED = 8
 
 
 class Bilinear:
@@ -113,7 +115,19 @@ def _evaluate(a: Array, b: Array, *, terms: tuple[_Term, ...], size: int) -> Arr
         else:
             entries[k] = product if so_far is None else so_far + product
     none = jnp.zeros((*a.shape[:last], 1), a.dtype)
-    return jnp.concatenate([none if x is None else x for x in entries], axis=last)
+    return _joined([none if x is None else x for x in entries], last)
+
+
+def _joined(entries: list[Array], axis: int) -> Array:
+    """Return entries as one array; more at a time XLA's CPU back end would compute by an operation each."""
+    total = None
+    for start in range(0, len(entries), _MOST_JOINED):
+        part = jnp.concatenate(entries[start : start + _MOST_JOINED], axis=axis)
+        after = len(entries) - start - part.shape[axis]
+        if start or after:
+            part = jax.lax.pad(part, jnp.zeros((), part.dtype), [(0, 0, 0)] * axis + [(start, after, 0)])
+        total = part if total is None else total + part
+    return total  # pyright: ignore[reportReturnType]
 
 
 def _evaluate_by_gathers(a: Array, b: Array, *, terms: tuple[_Term, ...], size: int) -> Array:
