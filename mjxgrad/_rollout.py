@@ -15,7 +15,7 @@ from mjxgrad._arrays import form, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
-from mjxgrad.dynamics.cholesky import KEPT
+from mjxgrad.dynamics.cholesky import SOLUTION
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.onset import reach
 from mjxgrad.scene import Scene, SceneWarning
@@ -169,8 +169,8 @@ def rollout(
         policy_sees: "state", or "observations": the policy is then called with what `observe` returns in place of the state.
             It looks before it chooses: forces and accelerations are those under the control before, in the first step under the
             scene's resting one. This takes a second solve per step where they are observed.
-        checkpoint: recompute each step in reverse mode and keep only its state and acceleration, so that memory grows by
-            a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
+        checkpoint: recompute each step in reverse mode and keep only its state and the solutions of its solves, so that memory
+            grows by a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
         gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same. The default is what
             finite differences of it give.
         onset: lets contacts and limits begin within the step, see `step`; `mg.Onset()` for costs of motions that hit something,
@@ -262,7 +262,7 @@ def rollout(
         return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
 
     if checkpoint:
-        keep = jax.checkpoint_policies.save_only_these_names(KEPT)
+        keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
         # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     policy_looks = policy is not None and policy_sees == "observations"

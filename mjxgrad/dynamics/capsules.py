@@ -33,8 +33,6 @@ _Group = Int[np.ndarray, "_ 2"]
 Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
 """Distances, positions and frames."""
 _PLANE, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE"))
-# Square of the sine below which axes count as parallel. Then many points are nearest, and the middle of the first is taken.
-_PARALLEL = 1e-6
 # Square of the cosine beyond which the axis of a capsule is too steep to give contacts on a plane their tangent.
 _STEEP = 0.75
 
@@ -46,11 +44,16 @@ def has_formula(key: Any, pairs: Array | np.ndarray) -> bool:
     return isinstance(pairs, np.ndarray) and second in types and first in (_PLANE, *types)
 
 
+def parallel_below(dtype: Any) -> float:
+    """Return the square of the sine from which on axes count as parallel, so that the middle of the first one is nearest."""
+    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
+
+
 def find(model: mjx.Model, data: mjx.Data, groups: Mapping[Any, _Group]) -> dict[Any, Found]:
     """Return the contacts of groups of pairs; the pairs of a group are of the same two types."""
     found: dict[Any, Found] = {}
     for has_plane, contacts in ((True, _on_planes), (False, _between)):
-        chosen = [key for key, pairs in groups.items() if (model.geom_type[pairs[0, 0]] == _PLANE) == has_plane]
+        chosen = [key for key in groups if (key.types[0] == _PLANE) == has_plane]
         if chosen:
             every, counts = contacts(model, data, [groups[key] for key in chosen])
             parts = zip(*(jnp.split(x, np.cumsum(counts)[:-1]) for x in every), strict=True)
@@ -82,18 +85,24 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
     cosine, ahead, behind = _products(
         jnp.concatenate([axis, other_axis], axis=1), jnp.concatenate([other_axis, apart], axis=1)
     ).T
-    sine2 = 1 - cosine * cosine
-    # 1 / sin², and where that is very large less.
-    sharpness = (sine2 + 2 * _PARALLEL) / (sine2 + _PARALLEL) ** 2
+    across, parallel = cross(axis, other_axis), parallel_below(axis.dtype)
+    sine2 = dot(across, across)
+    # 1 / sin² to the fourth power of a ratio, that of what counts as parallel to it; less than 4 over that.
+    ratio = parallel / (sine2 + parallel)
+    sharpness = (1 + ratio) * (1 + ratio**2) / (sine2 + parallel)
     first = _kept(sharpness * (cosine * behind - ahead), half)
     second = _kept(behind + cosine * first, other_half)
     first = _kept(cosine * second - ahead, half)
     point = centre + scale(first, axis)
     towards = other + scale(second, other_axis) - point
-    square = dot(towards, towards)
-    is_same = square == 0  # then any normal will do
+    square, rounding = dot(towards, towards), 16 * float(jnp.finfo(axis.dtype).eps)
+    is_same = square <= (rounding * (radius + half + other_radius + other_half)) ** 2
     length = jnp.sqrt(jnp.where(is_same, 1.0, square))
-    normal = jnp.where(is_same[:, None], jnp.array([1.0, 0.0, 0.0], length.dtype), scale(1 / length, towards))
+    # Where axes cross, as those of planar robots can, it is the normal of both; where they are one, any will do.
+    is_crossing = sine2 > parallel
+    x = jnp.array([1.0, 0.0, 0.0], axis.dtype)
+    crossing = jnp.where(is_crossing[:, None], scale(jax.lax.rsqrt(jnp.where(is_crossing, sine2, 1.0)), across), x)
+    normal = jnp.where(is_same[:, None], crossing, scale(1 / length, towards))
     dist = jnp.where(is_same, 0.0, length) - (radius + other_radius)
     pos = point + scale(radius + 0.5 * dist, normal)
     return (dist, pos, _frames(normal, _sideways(normal))), [len(pairs) for pairs in groups]

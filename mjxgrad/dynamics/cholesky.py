@@ -20,7 +20,7 @@ _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
 # Larger factorisations are left to LAPACK or cuSOLVER: written out they would take longer to compile than they save.
 _LARGEST = 16
-KEPT = "solution"
+SOLUTION = "solution"
 """Name for `jax.checkpoint` of solutions: a rollout that recomputes its steps keeps them and spares itself the solves."""
 
 
@@ -59,7 +59,7 @@ def solve_positive_definite(operator: Operator, vector: Float[Array, " n"]) -> F
     """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
 
     Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through the map, in place of
-    the entries. The solution is kept for reverse mode where `KEPT` is.
+    the entries. The solution has a name, `SOLUTION`, by which reverse mode can keep it.
     """
     return batch_last(cholesky_solve)(operator.matrix, vector)
 
@@ -67,7 +67,7 @@ def solve_positive_definite(operator: Operator, vector: Float[Array, " n"]) -> F
 @solve_positive_definite.defjvp
 def _solve_jvp(primals, tangents):
     operator, vector = primals
-    solution = checkpoint_name(solve_positive_definite(operator, vector), KEPT)
+    solution = checkpoint_name(solve_positive_definite(operator, vector), SOLUTION)
     _, change = jax.jvp(lambda operator, vector: vector - operator.apply(solution), primals, tangents)
     return solution, jax.lax.custom_linear_solve(
         operator.apply, change, lambda _, b: batch_last(cholesky_solve)(operator.matrix, b), symmetric=True

@@ -32,7 +32,7 @@ from mjxgrad.dynamics.maps import contract, dot, pick
 _PerPair = Float[Array, " pairs"]
 _Frames = Float[Array, "pairs 3 3"]
 _Points = Float[Array, "pairs 3"]
-_Pairs = Int[np.ndarray, "pairs 2"]
+_Pairs = Int[Array | np.ndarray, "pairs 2"]
 # Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
@@ -129,8 +129,7 @@ def other_sides(
     where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
     boxes change sides only where the geoms are constants.
     """
-    first, second = (_of_geoms(geoms[:, side], data.geom_xpos) for side in (0, 1))
-    towards = second - first
+    towards = pick(geoms[:, 1], data.geom_xpos) - pick(geoms[:, 0], data.geom_xpos)
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
     if isinstance(geoms, np.ndarray):
         kinds = np.asarray(model.geom_type)[geoms]
@@ -169,10 +168,6 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
     places = jnp.concatenate([contact.dist[:, None], contact.pos, contact.frame.reshape(-1, 9)], axis=1)
     dist, pos, frame = jnp.split(maps.choose(index, places), (1, 4), axis=1)
     return chosen.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
-
-
-def _of_geoms(geoms: Array | np.ndarray, x: Float[Array, "ngeom *item"]) -> Float[Array, "n *item"]:
-    return pick(geoms, x) if isinstance(geoms, np.ndarray) else maps.choose(geoms, x)
 
 
 def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:

@@ -153,7 +153,7 @@ def _clamp(x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "
 def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Add up all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
 
-    `xfrc_applied` acts at the bodies' centres of mass (N, N m).
+    `xfrc_applied` acts at the bodies' centres of mass (N, N m). Derivatives go through the bodies, not through the entries of M.
     """
     push, torque = data.xfrc_applied[:, :3], data.xfrc_applied[:, 3:]
     lever = data.xipos - pick(model.body_rootid, data.subtree_com)

@@ -43,16 +43,18 @@ def solve_mended(mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: B
     unit = jnp.eye(len(vector), dtype=vector.dtype).reshape(len(vector), -1, *(1,) * (vector.ndim - 1))
 
     def step_by_step(mass, jacobian, bend, vector):
-        def attempt(state):
-            known, is_known, diagonal, share = state
-            hessian = jacobian.gram(mass + unit * (share * diagonal), layout, bend)
-            found, diagonal = cholesky.cholesky_solve(hessian, vector), linear.diagonal(hessian)
-            is_lost = ~jnp.isfinite(found).all(axis=0) & jnp.isfinite(jnp.stack([diagonal, vector])).all(axis=(0, 1))
-            return jnp.where(is_known, known, found), is_known | ~is_lost, diagonal, on_gpu.next_share(share)
+        hessian = jacobian.gram(mass, layout, bend)
+        diagonal = linear.diagonal(hessian)
+        can_be = jnp.isfinite(jnp.stack([diagonal, vector])).all(axis=(0, 1))
 
-        zero = jnp.zeros_like(vector)
-        first = zero, jnp.zeros(vector.shape[1:], bool), zero, jnp.zeros((), vector.dtype)
-        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[3] < _MOST_MENDED), attempt, first)[0]
+        def attempt(state):
+            known, is_known, share = state
+            found = cholesky.cholesky_solve(hessian + unit * (share * diagonal), vector)
+            is_lost = can_be & ~jnp.isfinite(found).all(axis=0)
+            return jnp.where(is_known, known, found), is_known | ~is_lost, on_gpu.next_share(share)
+
+        first = jnp.zeros_like(vector), jnp.zeros(vector.shape[1:], bool), jnp.zeros((), vector.dtype)
+        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[2] < _MOST_MENDED), attempt, first)[0]
 
     def at_once(*args):
         return in_one_kernel(*args, most_mended=_MOST_MENDED)[0]

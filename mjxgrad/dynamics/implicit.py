@@ -13,7 +13,7 @@ The residual g is evaluated without M and J: M a is the force that accelerates t
 against another. So reverse mode passes through some vectors per body and contact, where the derivative of a Jacobian would be a
 Jacobian. Only the solve and the factor of H need entries, and both are formed with the batch as trailing axis.
 
-The acceleration is named for `jax.checkpoint`, see `cholesky.KEPT`: a rollout that recomputes its steps keeps this vector and
+The acceleration is named for `jax.checkpoint`, see `cholesky.SOLUTION`: a rollout that recomputes its steps keeps this vector and
 spares itself the iterations.
 """
 
@@ -26,7 +26,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.dynamics import constraint, hessian, linear, newton
-from mjxgrad.dynamics.cholesky import KEPT
+from mjxgrad.dynamics.cholesky import SOLUTION
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.newton import System, Variant
 
@@ -48,7 +48,7 @@ def _solve_jvp(layout, max_iterations, primals, tangents):
     system, start, tolerance = primals
     # Named here, where reverse mode reads it: a name inside the call is not seen from outside.
     acceleration, num_iterations = solve(layout, max_iterations, system, start, tolerance)
-    acceleration = checkpoint_name(acceleration, KEPT)
+    acceleration = checkpoint_name(acceleration, SOLUTION)
     _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
     bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
     no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)  # what JAX takes for the tangent of an integer
@@ -88,7 +88,7 @@ def solve_both(
 def _solve_both_jvp(layout, max_iterations, primals, tangents):
     system, variants, differ, start, tolerance = primals
     both, count = solve_both(layout, max_iterations, system, variants, differ, start, tolerance)
-    both = checkpoint_name(both, KEPT)
+    both = checkpoint_name(both, SOLUTION)
 
     def residual(system: System, variants: Variant) -> Array:
         return jax.vmap(lambda variant, a: system.varied(variant).gradient(layout, a))(variants, both)

@@ -47,8 +47,12 @@ def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *
     return _linear.bind(x, matrix=_Matrix(np.asarray(matrix, float)), axis=0)
 
 
-def pick(index: np.ndarray, x: Float[Array, "n *item"], default: np.ndarray | float = 0.0) -> Float[Array, "m *item"]:
-    """Return the items of a constant index, and a default where it is negative."""
+def pick(
+    index: Int[Array | np.ndarray, " m"], x: Float[Array, "n *item"], default: np.ndarray | float = 0.0
+) -> Float[Array, "m *item"]:
+    """Return the items of an index, and of a constant one a default where it is negative."""
+    if not isinstance(index, np.ndarray):
+        return choose(index, x)
     selected = combine(index[:, None] == np.arange(len(x)), x)
     if (index >= 0).all() or not np.any(default):
         return selected
@@ -65,10 +69,11 @@ def choose(index: Int[Array, "*m"], x: Float[Array, "n *item"]) -> Float[Array, 
 @choose.defjvp
 def _choose_jvp(primals, tangents):
     (index, x), (_, change) = primals, tangents
-    # A sum over all items, for its transpose is no scatter.
-    return choose(index, x), jnp.tensordot(
-        (index[..., None] == jnp.arange(len(x))).astype(x.dtype), change, axes=1, precision="highest"
-    )
+    # A sum over all items, for its transpose is no scatter; what is not chosen may have no finite derivative.
+    is_chosen = index[..., None] == jnp.arange(len(x))
+    of_any = is_chosen.any(axis=tuple(range(index.ndim))).reshape(-1, *(1,) * (x.ndim - 1))
+    change = jnp.where(of_any, change, 0.0)
+    return choose(index, x), jnp.tensordot(is_chosen.astype(x.dtype), change, axes=1, precision="highest")
 
 
 def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
@@ -135,11 +140,23 @@ def _evaluate_by_gathers(a: Array, b: Array, *, terms: tuple[_Term, ...], size: 
     by_entry = [[term for term in terms if term[0] == k] for k in range(size)]
     layers = []
     for layer in range(max(map(len, by_entry), default=0)):
-        chosen = [of_one[layer] if layer < len(of_one) else (k, 0, 0, 0.0) for k, of_one in enumerate(by_entry)]
+        # Filled up by what an entry has anyway: nothing else may spoil it.
+        chosen = [
+            of_one[layer] if layer < len(of_one) else (*(of_one or [(k, 0, 0)])[0][:3], 0.0)
+            for k, of_one in enumerate(by_entry)
+        ]
         _, i, j, coefficients = map(np.array, zip(*chosen, strict=True))
         product = _entries(a, i, a.ndim - 1) * _entries(b, j, b.ndim - 1)
         layers.append(product if (coefficients == 1).all() else product * jnp.asarray(coefficients, a.dtype))
-    return sum(layers[1:], start=layers[0]) if layers else jnp.zeros((*a.shape[:-1], size), a.dtype)
+    if not layers:
+        return jnp.zeros((*a.shape[:-1], size), a.dtype)
+    return _sum(layers, np.array([bool(of_one) for of_one in by_entry]))
+
+
+def _sum(layers: list[Array], has_terms: np.ndarray) -> Array:
+    """Return the sum of first, second, ... terms; zero where there are none."""
+    total = sum(layers[1:], start=layers[0])
+    return total if has_terms.all() else jnp.where(has_terms, total, 0.0)
 
 
 def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
@@ -207,12 +224,13 @@ def _combine_by_gathers(x: Array, *, matrix: _Matrix, axis: int) -> Array:
         return _combine(x, matrix=matrix, axis=axis)
     order = np.argsort(~is_term, axis=1, kind="stable")[:, :count]
     weights = np.take_along_axis(matrix.entries, order, axis=1)
+    order = np.where(weights != 0, order, order[:, :1])
     layers = []
     for index, weight in zip(order.T, weights.T, strict=True):
         part = _entries(x, index, axis)
         column = weight.reshape(-1, *(1,) * (x.ndim - axis - 1))
         layers.append(part if (weight == 1).all() else part * jnp.asarray(column, x.dtype))
-    return sum(layers[1:], start=layers[0])
+    return _sum(layers, is_term.any(axis=1).reshape(-1, *(1,) * (x.ndim - axis - 1)))
 
 
 def _transpose_linear(cotangent, x, *, matrix, axis):

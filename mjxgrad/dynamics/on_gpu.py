@@ -199,12 +199,12 @@ def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mend
 
 
 def next_share(share: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the share of a diagonal to add next: none, then rounding, then four times as much each time."""
+    """Return the share of a diagonal to add next: rounding, then four times as much each time."""
     return jnp.maximum(4 * share, float(jnp.finfo(share.dtype).eps))
 
 
 def is_finite(vector: Float[Array, " width"]) -> Bool[Array, ""]:
-    """Return whether all entries are numbers."""
+    """Return whether all entries are finite."""
     return (~(jnp.abs(vector) < jnp.inf)).astype(jnp.int32).sum() == 0
 
 

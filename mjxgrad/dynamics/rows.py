@@ -272,11 +272,11 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     if not dofs.size + tendons.size:
         return None
     count, dtype = dofs.size + tendons.size, data.qvel.dtype
-    maps: list[RowMap] = []
+    parts: list[RowMap] = []
     if dofs.size:
-        maps.append(_axis_rows(jnp.ones(dofs.size, dtype), dofs, model))
+        parts.append(_axis_rows(jnp.ones(dofs.size, dtype), dofs, model))
     if tendons.size:
-        maps.append(DenseRows(data._impl.ten_J[tendons]))
+        parts.append(DenseRows(data._impl.ten_J[tendons]))
     zero = jnp.zeros(count, dtype)
 
     def join(of_dofs: Any, of_tendons: Any) -> Array:
@@ -284,7 +284,7 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
 
     solimp = join(model.dof_solimp, model.tendon_solimp_fri)
     return Block(
-        map=maps[0] if len(maps) == 1 else JoinedRows(tuple(maps)),
+        map=parts[0] if len(parts) == 1 else JoinedRows(tuple(parts)),
         residual=zero,
         impedance=impedance(solimp, zero),
         solimp=solimp,

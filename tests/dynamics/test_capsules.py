@@ -1,5 +1,6 @@
 """Contacts of planes, balls and capsules against C MuJoCo's, MJX's, and difference quotients."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics.capsules import _PARALLEL
+from mjxgrad.dynamics.capsules import parallel_below
 from mjxgrad.dynamics.collision import collide, slot_geoms
 from mjxgrad.dynamics.kinematics import kinematics
 from tests.dynamics.scenes import central_difference
@@ -49,7 +50,7 @@ def _poses(seed):
 
 
 def test_they_touch_where_they_do_in_c():
-    """Contacts with planes to rounding; those of capsules to the square of what counts as parallel."""
+    """Contacts with planes to rounding, those of capsules to the fourth power of a ratio of a hundredth."""
     mj_model, geoms, find = _finder(TILTED)
     mj_data, num_clear = mujoco.MjData(mj_model), 0
     for seed in range(40):
@@ -66,9 +67,9 @@ def test_they_touch_where_they_do_in_c():
         np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
         np.testing.assert_allclose(ours[first == 0], theirs[first == 0], atol=1e-14)
         axes = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
-        is_clear = 1 - np.sum(axes[first] * axes[second], axis=1) ** 2 > 1e4 * _PARALLEL
+        is_clear = 1 - np.sum(axes[first] * axes[second], axis=1) ** 2 > 100 * parallel_below(float)
         num_clear += np.sum(is_clear & (first > 0))
-        # 1e-8 of half a metre, over a distance of at least 0.1 m between axes for the normals.
+        # Of half a metre, over a distance of at least 0.1 m between axes for the normals.
         np.testing.assert_allclose(ours[is_clear], theirs[is_clear], atol=5e-8)
         np.testing.assert_allclose(ours[:, 2], theirs[:, 2], atol=1e-8)
     assert num_clear > 380
@@ -125,3 +126,51 @@ def test_parallel_capsules_and_balls_in_one_place_have_derivatives():
     pair = np.flatnonzero((geoms == (3, 4)).all(axis=1))[0]
     np.testing.assert_allclose(slope[pair, 14:17], [-1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(slope[pair, 21:24], [1, 0, 0], atol=1e-12)
+
+
+PLANAR = """
+<mujoco><worldbody>
+  <body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+    <geom type="capsule" size=".05 .3"/></body>
+  <body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+    <geom type="capsule" size=".04 .3"/></body>
+</worldbody></mujoco>
+"""
+
+
+def _outcome(mj_model, dtype):
+    """Return the first contact's distance, normal and position at positions of a precision."""
+    model, start = jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (mjx.put_model(mj_model), mjx.make_data(mj_model))
+    )
+
+    def outcome(qpos):
+        contact = collide(model, kinematics(model, start.replace(qpos=qpos)))._impl.contact
+        return jnp.concatenate([contact.dist[:1], contact.frame[0, 0], contact.pos[0]])
+
+    return jax.jit(outcome)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_capsules_whose_axes_cross_touch_along_the_normal_of_both(dtype):
+    """As in C; and nothing within their plane turns that normal."""
+    mj_model = mujoco.MjModel.from_xml_string(PLANAR)
+    mj_data, outcome = mujoco.MjData(mj_model), _outcome(mj_model, dtype)
+    mj_data.qpos[:] = 0.05, 0.1, 0.3, 0.0, 0.0, -1.0
+    mujoco.mj_forward(mj_model, mj_data)
+    qpos, contact = jnp.asarray(mj_data.qpos, dtype), mj_data.contact
+    expected = np.concatenate([contact.dist, contact.frame[0, :3], contact.pos[0]])
+    np.testing.assert_allclose(outcome(qpos), expected, atol=1e3 * np.finfo(dtype).eps)
+    assert np.abs(jax.jacrev(outcome)(qpos)[:4]).max() < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_parallel_capsules_touch_at_the_middle_of_the_first(dtype):
+    """In any direction; to rounding of half a metre over the angle that counts as parallel."""
+    mj_model = mujoco.MjModel.from_xml_string(PLANAR)
+    outcome = _outcome(mj_model, dtype)
+    for angle in np.linspace(0, 6, 25):
+        across = 0.2 * np.array([np.cos(angle), -np.sin(angle)])
+        pos = outcome(jnp.asarray([0.1, 0.2, angle, *(across + np.array([0.1, 0.2])), angle], dtype))[4:]
+        along = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        assert abs(np.dot(pos - np.array([0.1, 0.0, 0.2]), along)) < np.finfo(dtype).eps / parallel_below(dtype)

@@ -146,3 +146,19 @@ def test_slots_are_given_as_in_mjx(limits):
     assert (slot_geoms(model, data) is None) == bool(limits)
     if not limits:
         np.testing.assert_array_equal(slot_geoms(model, data), theirs.geom)
+
+
+@pytest.mark.parametrize("kind", ['type="box" size=".1 .1 .1"', 'type="cylinder" size=".1 .1"'])
+def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
+    """Where it is decided at run time which pairs are looked at: those of all pairs whose distance is least."""
+    balls = "".join(f'<body pos="{x} .05 .17"><freejoint/><geom size=".1"/></body>' for x in (0, 0.05, 0.5, 0.9))
+    xml = "<mujoco><custom>{}</custom><worldbody><body><freejoint/><geom {}/></body>{}</worldbody></mujoco>"
+    found = []
+    for numbers in ('<numeric name="max_geom_pairs" data="2"/>', ""):
+        model = mjx.put_model(mujoco.MjModel.from_xml_string(xml.format(numbers, kind, balls)))
+        contact = _finder(model)(mjx.make_data(model))
+        is_with_it = np.asarray(contact.geom == 0).any(axis=1)
+        found.append(np.column_stack([contact.dist, contact.pos, contact.frame[:, 0]])[is_with_it])
+    few, every = found
+    assert len(few) == 2
+    np.testing.assert_allclose(np.sort(few, axis=0), np.sort(every[np.argsort(every[:, 0])[:2]], axis=0), atol=1e-14)

@@ -1,6 +1,7 @@
 """Linear and bilinear maps, as a CPU and as a GPU evaluates them, against sums over all entries, with their derivatives."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,6 +25,8 @@ LINEAR = {
     "of nothing": np.zeros((2, 0)),
 }
 
+_WAYS = (maps._evaluate, maps._evaluate_by_gathers)
+
 
 def _table(bilinear, of_first, of_second):
     table = np.zeros((bilinear._size, of_first, of_second))
@@ -40,7 +43,7 @@ def _sizes(bilinear):
     return int(max(i)) + 1, int(max(j)) + 1
 
 
-@pytest.mark.parametrize("evaluate", [maps._evaluate, maps._evaluate_by_gathers])
+@pytest.mark.parametrize("evaluate", _WAYS)
 @pytest.mark.parametrize("name", BILINEAR)
 def test_a_bilinear_map_is_its_sum(name, evaluate):
     bilinear = BILINEAR[name]
@@ -48,6 +51,38 @@ def test_a_bilinear_map_is_its_sum(name, evaluate):
     a, b = (jax.random.normal(jax.random.key(seed), (3, 2, size)) for seed, size in enumerate(sizes))
     found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size)
     np.testing.assert_allclose(found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", BILINEAR)
+def test_an_entry_that_is_no_number_spoils_only_what_is_made_of_it(name):
+    bilinear = BILINEAR[name]
+    sizes = _sizes(bilinear)
+    a, b = (jnp.ones(size) for size in sizes)
+    for entry in range(sizes[0]):
+        spoilt = a.at[entry].set(jnp.nan)
+        found = (evaluate(spoilt, b, terms=bilinear._terms, size=bilinear._size) for evaluate in _WAYS)
+        np.testing.assert_array_equal(*map(np.isnan, found))
+
+
+@pytest.mark.parametrize("name", ["sums", "a choice", "signs"])
+def test_an_item_that_is_no_number_spoils_only_gathered_sums_of_it(name):
+    matrix = LINEAR[name]
+    for item in range(matrix.shape[1]):
+        x = jnp.ones(matrix.shape[1]).at[item].set(jnp.nan)
+        found = maps._combine_by_gathers(x, matrix=maps._Matrix(matrix), axis=0)
+        np.testing.assert_array_equal(np.isnan(found), matrix[:, item] != 0)
+
+
+def test_chosen_items_have_the_derivative_of_an_index():
+    """In both modes, whatever the derivatives of those that are not chosen."""
+    index, x = jnp.array([[2, 0], [2, 2]]), jax.random.normal(jax.random.key(0), (4, 3))
+    change = jax.random.normal(jax.random.key(1), x.shape).at[1].set(jnp.nan)
+    found, moved = jax.jvp(lambda x: maps.choose(index, x), (x,), (change,))
+    np.testing.assert_array_equal(found, x[index])
+    np.testing.assert_allclose(moved, change[index], rtol=1e-14)
+    cotangent = jax.random.normal(jax.random.key(2), found.shape)
+    (pulled,) = jax.vjp(lambda x: maps.choose(index, x), x)[1](cotangent)
+    np.testing.assert_allclose(pulled, jnp.zeros_like(x).at[index].add(cotangent), rtol=1e-14)
 
 
 @pytest.mark.parametrize("name", BILINEAR)
