@@ -166,11 +166,11 @@ def test_capsules_whose_axes_cross_touch_along_the_normal_of_both(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parallel_capsules_touch_at_the_middle_of_the_first(dtype):
-    """In any direction; to rounding of half a metre over the angle that counts as parallel."""
+    """In any direction; rounding of some 3e-8 m in single precision, over 3e-4, moves it by a tenth of a millimetre."""
     mj_model = mujoco.MjModel.from_xml_string(PLANAR)
     outcome = _outcome(mj_model, dtype)
     for angle in np.linspace(0, 6, 25):
         across = 0.2 * np.array([np.cos(angle), -np.sin(angle)])
         pos = outcome(jnp.asarray([0.1, 0.2, angle, *(across + np.array([0.1, 0.2])), angle], dtype))[4:]
         along = np.array([np.sin(angle), 0.0, np.cos(angle)])
-        assert abs(np.dot(pos - np.array([0.1, 0.0, 0.2]), along)) < np.finfo(dtype).eps / parallel_below(dtype)
+        assert abs(np.dot(pos - np.array([0.1, 0.0, 0.2]), along)) < 5e-4
