@@ -166,15 +166,21 @@ def test_capsules_whose_axes_cross_touch_along_the_normal_of_both(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parallel_capsules_touch_at_the_middle_of_the_first(dtype):
-    """Whichever way they lie; rounding of some 1e-7 m in single precision, over 3e-4, moves it by less than a millimetre."""
+    """Whichever way they lie; rounding of some 1e-7 m in single precision, over 3e-4, moves it by less than a millimetre.
+
+    The second is turned about its axis, so that the two axes are the same but for rounding.
+    """
     free = '<body><freejoint/><geom type="capsule" size=".05 .3"/></body>'
     mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{free}{free}</worldbody></mujoco>")
-    outcome, random, along = _outcome(mj_model, dtype), np.random.default_rng(0), np.zeros(3)
+    outcome, random = _outcome(mj_model, dtype), np.random.default_rng(0)
+    along, spun = np.zeros(3), np.zeros(4)
     for _ in range(20):
         turn = random.normal(size=4)
         turn /= np.linalg.norm(turn)
         mujoco.mju_rotVecQuat(along, np.array([0.0, 0.0, 1.0]), turn)
         across = np.cross(along, random.normal(size=3))
         first = random.normal(size=3)
-        qpos = np.concatenate([first, turn, first + 0.2 * across / np.linalg.norm(across), turn])
+        spin = random.uniform(0, np.pi)
+        mujoco.mju_mulQuat(spun, turn, np.array([np.cos(spin), 0.0, 0.0, np.sin(spin)]))
+        qpos = np.concatenate([first, turn, first + 0.2 * across / np.linalg.norm(across), spun])
         assert abs(np.dot(outcome(jnp.asarray(qpos, dtype))[4:] - first, along)) < 1e-3
