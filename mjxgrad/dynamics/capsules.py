@@ -37,11 +37,10 @@ _PLANE, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for 
 _STEEP = 0.75
 
 
-def has_formula(key: Any, pairs: Array | np.ndarray) -> bool:
-    """Return whether the contacts of a group of pairs are found here: those of some types, if it is known which they are."""
+def has_formula(key: Any) -> bool:
+    """Return whether the contacts of pairs of two types are found here."""
     first, second = key.types
-    types = (_SPHERE, _CAPSULE)
-    return isinstance(pairs, np.ndarray) and second in types and first in (_PLANE, *types)
+    return second in (_SPHERE, _CAPSULE) and first in (_PLANE, _SPHERE, _CAPSULE)
 
 
 def parallel_below(dtype: Any) -> float:

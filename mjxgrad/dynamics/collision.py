@@ -63,7 +63,9 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
             contacts[key] = nearest = _greatest(contact, -gaps, most_pairs)
             pairs[key] = nearest.geom
-    found = capsules.find(model, data, {key: geoms for key, geoms in pairs.items() if capsules.has_formula(key, geoms)})
+    # Of pairs that only the running program knows MJX finds the contacts.
+    known = {key: geoms for key, geoms in pairs.items() if isinstance(geoms, np.ndarray) and capsules.has_formula(key)}
+    found = capsules.find(model, data, known)
     by_dim: dict[int, list] = {}
     for key, geoms in pairs.items():
         find = _FUNCTIONS.get(key.types) or COLLISION_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
