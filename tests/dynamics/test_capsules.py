@@ -65,13 +65,13 @@ def test_they_touch_where_they_do_in_c():
         ours, theirs = (x[np.lexsort((x[:, 2].round(9), x[:, 1], x[:, 0]))] for x in found)
         first, second = ours[:, :2].astype(int).T
         np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
-        np.testing.assert_allclose(ours[first == 0], theirs[first == 0], atol=1e-14)
+        np.testing.assert_allclose(ours[first == 0], theirs[first == 0], rtol=0, atol=1e-14)
         axes = mj_data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
         is_clear = 1 - np.sum(axes[first] * axes[second], axis=1) ** 2 > 100 * parallel_below(float)
         num_clear += np.sum(is_clear & (first > 0))
         # Of half a metre, over a distance of at least 0.1 m between axes for the normals.
-        np.testing.assert_allclose(ours[is_clear], theirs[is_clear], atol=5e-8)
-        np.testing.assert_allclose(ours[:, 2], theirs[:, 2], atol=1e-8)
+        np.testing.assert_allclose(ours[is_clear], theirs[is_clear], rtol=0, atol=5e-8)
+        np.testing.assert_allclose(ours[:, 2], theirs[:, 2], rtol=0, atol=1e-8)
     assert num_clear > 380
 
 
@@ -83,13 +83,15 @@ def test_contacts_with_a_level_plane_are_those_of_mjx_and_on_a_tilted_one_tangen
         for seed in range(20):
             contact = find(jnp.asarray(_poses(seed)))
             frames = contact.frame
-            np.testing.assert_allclose(frames @ np.swapaxes(frames, 1, 2), np.tile(np.eye(3), (18, 1, 1)), atol=1e-14)
-            np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-14)
+            np.testing.assert_allclose(
+                frames @ np.swapaxes(frames, 1, 2), np.tile(np.eye(3), (18, 1, 1)), rtol=0, atol=1e-14
+            )
+            np.testing.assert_allclose(np.linalg.det(frames), 1, rtol=0, atol=1e-14)
             if xml is LEVEL:
                 theirs, on_plane = of_mjx(jnp.asarray(_poses(seed)))._impl.contact, geoms[:, 0] == 0
                 for name in ("dist", "pos", "frame"):
                     ours, own = (getattr(x, name)[on_plane] for x in (contact, theirs))
-                    np.testing.assert_allclose(ours, own, atol=1e-13)
+                    np.testing.assert_allclose(ours, own, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -101,7 +103,7 @@ def test_their_derivative_is_that_of_the_points(seed):
         return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame.ravel()])
 
     qpos = jnp.asarray(_poses(seed))
-    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), rtol=0, atol=1e-6)
 
 
 def test_a_ball_that_turns_changes_nothing():
@@ -124,8 +126,8 @@ def test_parallel_capsules_and_balls_in_one_place_have_derivatives():
     slope = jax.jacrev(lambda q: find(q).dist)(jnp.asarray(qpos))
     assert np.isfinite(slope).all()
     pair = np.flatnonzero((geoms == (3, 4)).all(axis=1))[0]
-    np.testing.assert_allclose(slope[pair, 14:17], [-1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(slope[pair, 21:24], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(slope[pair, 14:17], [-1, 0, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(slope[pair, 21:24], [1, 0, 0], rtol=0, atol=1e-12)
 
 
 PLANAR = """
@@ -160,7 +162,7 @@ def test_capsules_whose_axes_cross_touch_along_the_normal_of_both(dtype):
     mujoco.mj_forward(mj_model, mj_data)
     qpos, contact = jnp.asarray(mj_data.qpos, dtype), mj_data.contact
     expected = np.concatenate([contact.dist, contact.frame[0, :3], contact.pos[0]])
-    np.testing.assert_allclose(outcome(qpos), expected, atol=1e3 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(outcome(qpos), expected, rtol=0, atol=1e3 * np.finfo(dtype).eps)
     assert np.abs(jax.jacrev(outcome)(qpos)[:4]).max() < 1e-6
 
 

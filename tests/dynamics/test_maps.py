@@ -50,7 +50,9 @@ def test_a_bilinear_map_is_its_sum(name, evaluate):
     sizes = _sizes(bilinear)
     a, b = (jax.random.normal(jax.random.key(seed), (3, 2, size)) for seed, size in enumerate(sizes))
     found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size)
-    np.testing.assert_allclose(found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), atol=1e-13)
+    np.testing.assert_allclose(
+        found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), rtol=0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("name", BILINEAR)
@@ -92,8 +94,8 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
     table = _table(bilinear, *sizes)
     a, b, cotangent = (jax.random.normal(jax.random.key(size), (4, size)) for size in (*sizes, bilinear._size))
     by_a, by_b = jax.vjp(jax.vmap(bilinear), a, b)[1](cotangent)
-    np.testing.assert_allclose(by_a, np.einsum("kij,nk,nj->ni", table, cotangent, b), atol=1e-13)
-    np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), atol=1e-13)
+    np.testing.assert_allclose(by_a, np.einsum("kij,nk,nj->ni", table, cotangent, b), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("evaluate", [maps._combine, maps._combine_by_gathers])
@@ -103,7 +105,7 @@ def test_a_linear_map_is_its_sum(name, axis, evaluate):
     matrix = LINEAR[name]
     x = jax.random.normal(jax.random.key(0), np.insert([3, 2], axis, matrix.shape[1]))
     found = evaluate(x, matrix=maps._Matrix(matrix), axis=axis)
-    np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), atol=1e-13)
+    np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("batch", [0, 1])
@@ -116,4 +118,4 @@ def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
     (found,) = jax.vjp(mapped, x)[1](cotangent)
     contracted = 1 - batch
     expected = np.moveaxis(np.tensordot(matrix.T, cotangent, (1, contracted)), 0, contracted)
-    np.testing.assert_allclose(found, expected, atol=1e-13)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
