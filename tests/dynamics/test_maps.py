@@ -1,11 +1,17 @@
-"""Linear and bilinear maps, as a CPU and as a GPU evaluates them, against sums over all entries, with their derivatives."""
+"""Linear, bilinear and Einstein sums, as a CPU and as a GPU evaluates them, against NumPy's, with their derivatives."""
+
+import functools
+import os
+import re
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import maps, spatial
+from mjxgrad.dynamics import maps, primitives, spatial
 
 BILINEAR = {
     "cross": spatial.cross,
@@ -20,12 +26,12 @@ LINEAR = {
     "sums": np.tril(np.ones((5, 5))),
     "a choice": np.eye(4)[[2, 2, 0]],
     "signs": np.array([[1.0, 0, -1], [0, 0, 0], [0, 2.5, 0]]),
-    "many terms": np.ones((2, maps._MOST_GATHERED + 1)),
+    "many terms": np.ones((2, primitives._MOST_WRITTEN + 1)),
     "nothing": np.zeros((0, 3)),
     "of nothing": np.zeros((2, 0)),
 }
 
-_WAYS = (maps._evaluate, maps._evaluate_by_gathers)
+_WAYS = (primitives._bilinear_by_slices, primitives._bilinear_by_gathers)
 
 
 def _table(bilinear, of_first, of_second):
@@ -49,7 +55,7 @@ def test_a_bilinear_map_is_its_sum(name, evaluate):
     bilinear = BILINEAR[name]
     sizes = _sizes(bilinear)
     a, b = (jax.random.normal(jax.random.key(seed), (3, 2, size)) for seed, size in enumerate(sizes))
-    found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size)
+    found = evaluate(a, b, terms=primitives._ordered(bilinear._terms), size=bilinear._size, batch=0)
     np.testing.assert_allclose(
         found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), rtol=0, atol=1e-13
     )
@@ -62,7 +68,10 @@ def test_an_entry_that_is_no_number_spoils_only_what_is_made_of_it(name):
     a, b = (jnp.ones(size) for size in sizes)
     for entry in range(sizes[0]):
         spoilt = a.at[entry].set(jnp.nan)
-        found = (evaluate(spoilt, b, terms=bilinear._terms, size=bilinear._size) for evaluate in _WAYS)
+        found = (
+            evaluate(spoilt, b, terms=primitives._ordered(bilinear._terms), size=bilinear._size, batch=0)
+            for evaluate in _WAYS
+        )
         np.testing.assert_array_equal(*map(np.isnan, found))
 
 
@@ -71,7 +80,7 @@ def test_an_item_that_is_no_number_spoils_only_gathered_sums_of_it(name):
     matrix = LINEAR[name]
     for item in range(matrix.shape[1]):
         x = jnp.ones(matrix.shape[1]).at[item].set(jnp.nan)
-        found = maps._combine_by_gathers(x, matrix=maps._Matrix(matrix), axis=0)
+        found = primitives._linear_by_gathers(x, matrix=primitives._Matrix(matrix), batch=0)
         np.testing.assert_array_equal(np.isnan(found), matrix[:, item] != 0)
 
 
@@ -98,13 +107,13 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
     np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("evaluate", [maps._combine, maps._combine_by_gathers])
+@pytest.mark.parametrize("evaluate", [primitives._linear_by_slices, primitives._linear_by_gathers])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("name", LINEAR)
 def test_a_linear_map_is_its_sum(name, axis, evaluate):
     matrix = LINEAR[name]
     x = jax.random.normal(jax.random.key(0), np.insert([3, 2], axis, matrix.shape[1]))
-    found = evaluate(x, matrix=maps._Matrix(matrix), axis=axis)
+    found = evaluate(x, matrix=primitives._Matrix(matrix), batch=axis)
     np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), rtol=0, atol=1e-13)
 
 
@@ -119,3 +128,83 @@ def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
     contracted = 1 - batch
     expected = np.moveaxis(np.tensordot(matrix.T, cotangent, (1, contracted)), 0, contracted)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+CONTRACTIONS = ["nij,njk->nik", "nij,nj->ni", "ik,jk->ij", "cdv,cd->v", "cka,va->ckv", "i,i->", "ni,n->ni"]
+_SIZES = dict(zip("nijkcdva", (4, 3, 2, 5, 2, 3, 4, 6), strict=True))
+
+
+def _factors(subscripts, *leading):
+    first, second, _ = subscripts.replace("->", ",").split(",")
+    shapes = [(*leading, *(_SIZES[letter] for letter in letters)) for letters in (first, second)]
+    return [jax.random.normal(jax.random.key(seed), shape) for seed, shape in enumerate(shapes)]
+
+
+@pytest.mark.parametrize("subscripts", CONTRACTIONS)
+@pytest.mark.parametrize("num_batches", [0, 1, 2])
+def test_a_contraction_and_its_derivatives_are_those_of_the_einstein_sum(subscripts, num_batches):
+    """With both factors in the batch, or one of them."""
+    leading = (3, 2)[:num_batches]
+    left, right = subscripts.split("->")
+    first, second = left.split(",")
+    every = f"...{first},...{second}->...{right}"
+    a, b = _factors(subscripts, *leading)
+    for share_second in (False, True) if num_batches else (False,):
+        other = b[(0,) * num_batches] if share_second else b
+        mapped = functools.partial(maps.contract, subscripts)
+        for _ in leading:
+            mapped = jax.vmap(mapped, (0, None if share_second else 0))
+        expected, pull = jax.vjp(lambda a, b: jnp.einsum(every, a, b), a, other)
+        found, ours = jax.vjp(mapped, a, other)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+        cotangent = jax.random.normal(jax.random.key(2), expected.shape)
+        for one, two in zip(ours(cotangent), pull(cotangent), strict=True):
+            np.testing.assert_allclose(one, two, rtol=0, atol=1e-12)
+
+
+def test_a_sum_of_many_products_is_not_written_out():
+    size = primitives._MOST_WRITTEN + 1
+    a, b = jnp.ones((2, 3, size)), jnp.ones((2, size))
+    mapped = jax.jit(jax.vmap(functools.partial(maps.contract, "ij,j->i")))
+    np.testing.assert_array_equal(mapped(a, b), np.full((2, 3), size))
+    assert "dot_general" in mapped.lower(a, b).as_text()
+    assert "dot_general" not in mapped.lower(a[..., :-1], b[..., :-1]).as_text()
+
+
+def _chain(x):
+    """Return what sums of all three kinds, and operations between them, make of a state."""
+    turned = 2.0 * spatial.cross(x, jnp.roll(x, 1, axis=0)) + 1.0
+    return maps.contract("ni,ni->n", jnp.sin(maps.combine(np.tril(np.ones((4, 4))), turned)), x)
+
+
+def test_on_a_cpu_the_batch_is_last_in_memory_from_one_sum_to_the_next():
+    """In the program that is compiled, with its operations between them, and with their derivatives."""
+    x = jax.random.normal(jax.random.key(0), (32, 4, 3))
+    compiled = jax.jit(jax.vmap(jax.value_and_grad(lambda x: _chain(x).sum()))).lower(x).compile().as_text()
+    layouts = re.findall(r"= f64\[32,4,3\]\{([\d,]*)\} fusion", compiled)
+    assert layouts.count("0,2,1") >= 3
+    assert layouts.count("2,1,0") <= 1, "the gradient alone goes back to where it came from"
+
+
+def test_a_program_that_is_shared_out_gathers_nothing():
+    """XLA would, wherever a layout is asked for."""
+    program = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import NamedSharding, Mesh, PartitionSpec as P
+from tests.dynamics.test_maps import _chain
+sharding = NamedSharding(Mesh(np.array(jax.devices()), ("batch",)), P("batch"))
+x = jax.device_put(jax.random.normal(jax.random.key(0), (32, 4, 3)), sharding)
+shared = jax.jit(jax.vmap(jax.grad(lambda x: _chain(x).sum()))).lower(x).compile()
+assert "all-gather" not in shared.as_text()
+where = dict(mesh=sharding.mesh, in_specs=P("batch"), out_specs=P("batch"), check_vma=False)
+apart = jax.shard_map(jax.vmap(jax.grad(lambda x: _chain(x).sum())), **where)
+assert "{0,2,1}" in jax.jit(apart).lower(x).compile().as_text()
+np.testing.assert_allclose(shared(x), jax.jit(apart)(x), rtol=1e-12)
+"""
+    flags = "--xla_force_host_platform_device_count=4"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"},
+        capture_output=True,
+    )
+    assert done.returncode == 0, done.stderr.decode()

@@ -1,0 +1,306 @@
+r"""Sums of products of many short vectors, as primitives of JAX that derive and compile well.
+
+Their derivatives are sums of the same kind. A cross product is written in components: slices, products, one concatenation.
+JAX's derivative of a slice, though, is a padded array, and the sum of many of those is what makes reverse mode slow; and that of
+a gather is a scatter, which XLA's CPU back end does one by one.
+
+**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory: an operation then runs along whole vectors of
+states, and one of a state's numbers is one piece of memory. XLA takes over a layout from one operation to the next, so it is
+enough that all primitives ask for it, of what they take and of what they give: a hopper's gradient takes less than half the
+time. A product of matrices would want the batch first, so Einstein sums are written out.
+
+**On a GPU** an operation takes a microsecond however short it is, and a slice of an array that is used elsewhere, or the
+transpose that a product of matrices asks for, is one. There linear and bilinear maps are sums of gathers, which are fused with
+what is before and after.
+"""
+
+import inspect
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.layout import Layout, with_layout_constraint
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+# (entry of the result, entry of the first factor, entry of the second, coefficient)
+Term = tuple[int, int, int, float]
+# Terms of a sum up to which it is written out, on a GPU gathered; more are a product of matrices.
+_MOST_WRITTEN, _MOST_GATHERED = 64, 32
+
+
+def bilinear(
+    a: Float[Array, "*n i"], b: Float[Array, "*n j"], terms: Sequence[Term], size: int
+) -> Float[Array, "*n size"]:
+    """Return the sums of products along the last axis that `terms` ask for; both factors have the same leading axes."""
+    return _bilinear.bind(a, b, terms=_ordered(terms), size=size, batch=0)
+
+
+def linear(x: Float[Array, "n *item"], matrix: np.ndarray) -> Float[Array, "m *item"]:
+    """Return the sums over items that the rows of a constant matrix ask for."""
+    return _linear.bind(x, matrix=_Matrix(np.asarray(matrix, float)), batch=0)
+
+
+def contract(a: Array, b: Array, subscripts: str) -> Array:
+    """Return the Einstein sum of two factors; each index of one is in the other or in the result."""
+    return _contract.bind(a, b, subscripts=_Subscripts(*subscripts.replace("->", ",").split(",")), batch=0)
+
+
+# What all have in common. The first `batch` axes of all arrays are those of `jax.vmap`.
+
+
+def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
+    """Return a primitive without its derivative."""
+    primitive = Primitive(name)
+
+    def infer(*factors, **parameters):
+        return jax.core.ShapedArray(shape(*factors, **parameters), factors[0].dtype)
+
+    def batch_last(*factors, batch, **parameters):
+        factors = [_batch_last(x, batch) for x in factors]
+        return _batch_last(evaluate(*factors, batch=batch, **parameters), batch)
+
+    def on_cpu(context: mlir.LoweringRuleContext, *factors, **parameters):
+        way = evaluate if _is_shared_out(context) else batch_last
+        return mlir.lower_fun(way, multiple_results=False)(context, *factors, **parameters)
+
+    def batched(factors, axes, *, batch, **parameters):
+        size = next(x.shape[axis] for x, axis in zip(factors, axes, strict=True) if axis is not None)
+        spread = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(factors, axes, strict=True)
+        ]
+        return primitive.bind(*spread, batch=batch + 1, **parameters), 0
+
+    names = [one.name for one in inspect.signature(evaluate).parameters.values() if one.kind is one.KEYWORD_ONLY]
+    primitive.def_impl(jax.jit(evaluate, static_argnames=names))
+    primitive.def_abstract_eval(infer)
+    mlir.register_lowering(primitive, on_cpu)
+    mlir.register_lowering(primitive, mlir.lower_fun(on_gpu, multiple_results=False), platform="cuda")
+    batching.primitive_batchers[primitive] = batched
+    return primitive
+
+
+def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
+    """Return whether XLA shares out the program over devices: it would gather all that asks for a layout."""
+    axes = context.module_context.axis_context
+    if hasattr(axes, "mesh"):  # in `jax.shard_map`, which shares out by some axes itself
+        return any(size > 1 for name, size in axes.mesh.shape.items() if name not in axes.manual_axes)
+    return getattr(axes, "num_devices", 1) > 1
+
+
+def _batch_last(x: Array, batch: int) -> Array:
+    """Return the same, laid out in memory with the batch last."""
+    if not 0 < batch < x.ndim:
+        return x
+    return with_layout_constraint(x, Layout(major_to_minor=(*range(batch, x.ndim), *range(batch))))
+
+
+def _total(terms: Iterator[Array]) -> Array:
+    total = next(terms)
+    for term in terms:
+        total = total + term
+    return total
+
+
+# The bilinear map.
+
+
+def _ordered(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return the terms by entry of the result, those that are added before those that are subtracted."""
+    return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
+
+
+def _bilinear_by_slices(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
+    last = a.ndim - 1
+    a_entries, b_entries = (jax.lax.split(x, (1,) * x.shape[last], last) for x in (a, b))
+    entries: list[Array | None] = [None] * size
+    for k, i, j, coefficient in terms:
+        product, so_far = a_entries[i] * b_entries[j], entries[k]
+        if abs(coefficient) != 1:
+            product = abs(coefficient) * product
+        if coefficient < 0:
+            entries[k] = -product if so_far is None else so_far - product
+        else:
+            entries[k] = product if so_far is None else so_far + product
+    none = jnp.zeros((*a.shape[:last], 1), a.dtype)
+    return jnp.concatenate([none if x is None else x for x in entries], axis=last)
+
+
+def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
+    """Return the same: of all entries the first terms, then the second ones, and so on."""
+    by_entry = [[term for term in terms if term[0] == k] for k in range(size)]
+    layers = []
+    for layer in range(max(map(len, by_entry), default=0)):
+        # Filled up by what an entry has anyway: nothing else may spoil it.
+        chosen = [
+            of_one[layer] if layer < len(of_one) else (*(of_one or [(k, 0, 0)])[0][:3], 0.0)
+            for k, of_one in enumerate(by_entry)
+        ]
+        _, i, j, coefficients = map(np.array, zip(*chosen, strict=True))
+        product = _entries(a, i, a.ndim - 1) * _entries(b, j, b.ndim - 1)
+        layers.append(product if (coefficients == 1).all() else product * jnp.asarray(coefficients, a.dtype))
+    if not layers:
+        return jnp.zeros((*a.shape[:-1], size), a.dtype)
+    return _where_terms(_total(iter(layers)), np.array([bool(of_one) for of_one in by_entry]))
+
+
+def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
+    """Return sums, zero where there is nothing to add up."""
+    return total if has_terms.all() else jnp.where(has_terms, total, 0.0)
+
+
+def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
+    """Return entries at constant places along an axis."""
+    if np.array_equal(index, np.arange(x.shape[axis])):
+        return x
+    return jnp.take(x, index, axis=axis, mode="clip")
+
+
+def _transpose_first(cotangent, a, b, *, terms, size, batch):
+    swapped = _ordered([(i, k, j, c) for k, i, j, c in terms])
+    return _bilinear.bind(cotangent, b, terms=swapped, size=a.aval.shape[-1], batch=batch)
+
+
+def _transpose_second(cotangent, a, b, *, terms, size, batch):
+    swapped = _ordered([(j, i, k, c) for k, i, j, c in terms])
+    return _bilinear.bind(a, cotangent, terms=swapped, size=b.aval.shape[-1], batch=batch)
+
+
+_bilinear = _define(
+    "bilinear",
+    lambda a, b, *, terms, size, batch: (*a.shape[:-1], size),
+    _bilinear_by_slices,
+    _bilinear_by_gathers,
+)
+ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
+
+
+# The linear map.
+
+
+class _Matrix:
+    """A constant matrix, compared by its entries."""
+
+    def __init__(self, entries: np.ndarray):
+        self.entries = entries
+        self._contents = entries.shape, entries.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Matrix) and self._contents == other._contents
+
+    def __hash__(self) -> int:
+        return hash(self._contents)
+
+
+def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    if not batch or not matrix.entries.size or (matrix.entries != 0).sum(axis=1).max() > _MOST_WRITTEN:
+        return _linear_by_product(x, matrix=matrix, batch=batch)
+    items = jax.lax.split(x, (1,) * x.shape[batch], batch)
+    none = jnp.zeros_like(items[0])
+
+    def row(weights: np.ndarray) -> Array:
+        terms = [items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights)]
+        return _total(iter(terms or [none]))
+
+    return jnp.concatenate([row(weights) for weights in matrix.entries], axis=batch)
+
+
+def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    product = jnp.tensordot(jnp.asarray(matrix.entries, x.dtype), x, axes=((1,), (batch,)), precision="highest")
+    return jnp.moveaxis(product, 0, batch)
+
+
+def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    """Return the same: of all sums the first terms, then the second ones, and so on."""
+    is_term = matrix.entries != 0
+    count = int(is_term.sum(axis=1).max(initial=0))
+    if not 0 < count <= _MOST_GATHERED:
+        return _linear_by_product(x, matrix=matrix, batch=batch)
+    order = np.argsort(~is_term, axis=1, kind="stable")[:, :count]
+    weights = np.take_along_axis(matrix.entries, order, axis=1)
+    order = np.where(weights != 0, order, order[:, :1])
+    along = (-1,) + (1,) * (x.ndim - batch - 1)
+    layers = []
+    for index, weight in zip(order.T, weights.T, strict=True):
+        part = _entries(x, index, batch)
+        layers.append(part if (weight == 1).all() else part * jnp.asarray(weight.reshape(along), x.dtype))
+    return _where_terms(_total(iter(layers)), is_term.any(axis=1).reshape(along))
+
+
+def _transpose_linear(cotangent, x, *, matrix, batch):
+    return (_linear.bind(cotangent, matrix=_Matrix(matrix.entries.T.copy()), batch=batch),)
+
+
+_linear = _define(
+    "linear",
+    lambda x, *, matrix, batch: (*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]),
+    _linear_by_slices,
+    _linear_by_gathers,
+)
+ad.deflinear2(_linear, _transpose_linear)
+
+
+# The Einstein sum.
+
+
+class _Subscripts(NamedTuple):
+    """One letter for each axis, but those of the batch, of both factors and of the result."""
+
+    first: str
+    second: str
+    result: str
+
+    @property
+    def summed(self) -> str:
+        return "".join(letter for letter in self.first if letter not in self.result)
+
+    def sizes(self, a: Any, b: Any, batch: int) -> dict[str, int]:
+        """Return how long the axis of each letter is."""
+        return dict(zip(self.first + self.second, (*a.shape[batch:], *b.shape[batch:]), strict=True))
+
+
+def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
+    sizes = subscripts.sizes(a, b, batch)
+    summed = [range(sizes[letter]) for letter in subscripts.summed]
+    if not batch or not 0 < np.prod([len(places) for places in summed]) <= _MOST_WRITTEN:
+        return _contract_by_product(a, b, subscripts=subscripts, batch=batch)
+
+    def at(x: Array, letters: str, place: dict[str, int]) -> Array:
+        """Return the entries at a place of the letters that are summed, with one axis for each letter of the result."""
+        chosen = x[(..., *(place.get(letter, slice(None)) for letter in letters))]
+        kept = [letter for letter in letters if letter not in place]
+        order = [batch + kept.index(letter) for letter in subscripts.result if letter in kept]
+        chosen = chosen.transpose(*range(batch), *order)
+        return jnp.expand_dims(chosen, [batch + k for k, letter in enumerate(subscripts.result) if letter not in kept])
+
+    places = (dict(zip(subscripts.summed, place, strict=True)) for place in itertools.product(*summed))
+    return _total(at(a, subscripts.first, place) * at(b, subscripts.second, place) for place in places)
+
+
+def _contract_by_product(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
+    first, second, result = subscripts
+    return jnp.einsum(f"...{first},...{second}->...{result}", a, b, precision="highest")
+
+
+def _contract_shape(a, b, *, subscripts, batch):
+    sizes = subscripts.sizes(a, b, batch)
+    return (*a.shape[:batch], *(sizes[letter] for letter in subscripts.result))
+
+
+def _contract_first(cotangent, a, b, *, subscripts, batch):
+    first, second, result = subscripts
+    return _contract.bind(cotangent, b, subscripts=_Subscripts(result, second, first), batch=batch)
+
+
+def _contract_second(cotangent, a, b, *, subscripts, batch):
+    first, second, result = subscripts
+    return _contract.bind(a, cotangent, subscripts=_Subscripts(first, result, second), batch=batch)
+
+
+_contract = _define("contract", _contract_shape, _contract_written_out, _contract_written_out)
+ad.defbilinear(_contract, _contract_first, _contract_second)
