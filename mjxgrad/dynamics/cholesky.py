@@ -75,17 +75,18 @@ def _solve_jvp(primals, tangents):
 
 
 def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
-    """Return matrix⁻¹ vector, column by column."""
+    """Return matrix⁻¹ vector, column by column; the vector goes through the factorisation as one more row."""
     columns: list[Array] = []  # of the factor, from the diagonal down
+    forward: list[Array] = []
     for k in range(len(vector)):
-        column = matrix[k:, k]
-        for j, earlier in enumerate(columns):
+        column, value = matrix[k:, k], vector[k]
+        for j, (earlier, known) in enumerate(zip(columns, forward, strict=True)):
             column = column - earlier[k - j :] * earlier[k - j]
-        columns.append(column * jax.lax.rsqrt(column[0]))
-    forward, rest = [], vector
-    for column in columns:
-        forward.append(rest[0] / column[0])
-        rest = rest[1:] - column[1:] * forward[-1]
+            value = value - known * earlier[k - j]
+        root = jnp.sqrt(column[0])
+        # XLA keeps what was divided; products it forms anew, and all that they are made of, wherever they are used.
+        columns.append(column / root)
+        forward.append(value / root)
     solution: list[Array] = []
     for column, value in zip(columns[::-1], forward[::-1], strict=True):
         for above, known in zip(column[1:], reversed(solution), strict=True):

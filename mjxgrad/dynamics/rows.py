@@ -204,15 +204,16 @@ def contact_jacobian(
     The second body counts positive, the first negative.
     """
     moves = jnp.asarray(tree.moving_dofs(model), position.dtype)[bodies]  # contacts, 2, nv
-    centre = maps.choose(jnp.asarray(model.body_rootid)[bodies], data.subtree_com)
-    push = jnp.broadcast_to(frame[:, None, : min(dim, 3)], (len(position), 2, min(dim, 3), 3))
-    lever = jnp.broadcast_to((position[:, None] - centre)[:, :, None], push.shape)
-    wrench = jnp.concatenate([spatial.cross(lever, push), push], axis=3)
+    lever = position[:, None] - maps.choose(jnp.asarray(model.body_rootid)[bodies], data.subtree_com)
     signs = moves * jnp.array([-1.0, 1.0], position.dtype)[:, None]
-    rows = linear.add(signs[:, i, None] * maps.contract("cka,va->ckv", wrench[:, i], data.cdof) for i in (0, 1))
+    turning, moving = data.cdof[:, :3], data.cdof[:, 3:]
+    # Of a joint velocity both sides have the same motion, about the same point if they have the same root.
+    sign, arm = signs[:, 0] + signs[:, 1], maps.contract("csv,csx->cvx", signs, lever)
+    point = maps.contract("cv,vx->cvx", sign, moving) + maps.contract("vxy,cvy->cvx", spatial.cross_matrix(turning), arm)
+    rows = maps.contract("ckx,cvx->ckv", frame[:, : min(dim, 3)], point)
     if dim > 3:
-        turning = maps.contract("cka,va->ckv", frame[:, : dim - 3], data.cdof[:, :3])
-        rows = jnp.concatenate([rows, linear.add(signs[:, i, None] for i in (0, 1)) * turning], axis=1)
+        spin = maps.contract("cv,vx->cvx", sign, turning)
+        rows = jnp.concatenate([rows, maps.contract("ckx,cvx->ckv", frame[:, : dim - 3], spin)], axis=1)
     return rows
 
 

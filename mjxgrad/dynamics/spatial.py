@@ -83,6 +83,7 @@ _CROSS = _cross_table()
 QUATERNION = _quaternion_table()
 cross = Bilinear(_CROSS)
 """a × b."""
+_cross_matrix = Bilinear(_CROSS.transpose(0, 2, 1).reshape(9, 3, 1))
 _multiply = Bilinear(QUATERNION)
 _rotation = Bilinear(_rotation_table())
 cross_motion = Bilinear(_motion_table())
@@ -92,6 +93,11 @@ cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
 momentum = Bilinear(_momentum_table())
 """Inertia times motion."""
 _steiner = Bilinear(_steiner_table())
+
+
+def cross_matrix(a: _Vectors) -> _Matrices:
+    """Return the matrix of x ↦ a × x."""
+    return _cross_matrix(a, jnp.ones((len(a), 1), a.dtype)).reshape(-1, 3, 3)
 
 
 def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
