@@ -31,6 +31,8 @@ from jaxtyping import Array, Float
 Term = tuple[int, int, int, float]
 # Terms of a sum up to which it is written out, on a GPU gathered; more are a product of matrices.
 _MOST_WRITTEN, _MOST_GATHERED = 64, 32
+# Terms of a gathered sum up to which what they are made of is computed within it, for each of them in turn.
+_MOST_FUSED = 4
 
 
 def bilinear(
@@ -207,7 +209,9 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
         terms = [items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights)]
         return _total(iter(terms or [none]))
 
-    return jnp.concatenate([row(weights) for weights in matrix.entries], axis=batch)
+    rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
+    sums = [row(weights) for weights in rows]
+    return jnp.concatenate([sums[k] for k in place.reshape(-1)], axis=batch)
 
 
 def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
@@ -216,13 +220,33 @@ def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
 
 
 def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
-    """Return the same: of all sums the first terms, then the second ones, and so on."""
-    is_term = matrix.entries != 0
+    """Return the same: of all sums the first terms, then the second ones, and so on; those of many terms apart."""
+    rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
+    count = (rows != 0).sum(axis=1)
+    order = np.argsort(count, kind="stable")
+    if count.max(initial=0) > _MOST_FUSED:
+        x = jax.lax.optimization_barrier(x)
+    parts = [_gathered(x, rows[part], batch) for part in np.split(order, _where_longer(count[order])) if part.size]
+    if not parts:
+        return _linear_by_product(x, matrix=matrix, batch=batch)
+    return _entries(jnp.concatenate(parts, axis=batch), np.argsort(order)[place.reshape(-1)], batch)
+
+
+def _where_longer(count: np.ndarray) -> list[int]:
+    """Return where to split sums, whose numbers of terms ascend, as all of a part take as long as its longest one."""
+    lengths = [n * count[n - 1] + (len(count) - n) * count[-1] for n in range(1, len(count))]
+    best = int(np.argmin(lengths)) if lengths else 0
+    return [best + 1] if lengths and 2 * lengths[best] <= len(count) * count[-1] else []
+
+
+def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
+    """Return sums of about as many terms each."""
+    is_term = rows != 0
     count = int(is_term.sum(axis=1).max(initial=0))
     if not 0 < count <= _MOST_GATHERED:
-        return _linear_by_product(x, matrix=matrix, batch=batch)
+        return _linear_by_product(x, matrix=_Matrix(rows), batch=batch)
     order = np.argsort(~is_term, axis=1, kind="stable")[:, :count]
-    weights = np.take_along_axis(matrix.entries, order, axis=1)
+    weights = np.take_along_axis(rows, order, axis=1)
     order = np.where(weights != 0, order, order[:, :1])
     along = (-1,) + (1,) * (x.ndim - batch - 1)
     layers = []

@@ -209,7 +209,9 @@ def contact_jacobian(
     turning, moving = data.cdof[:, :3], data.cdof[:, 3:]
     # Of a joint velocity both sides have the same motion, about the same point if they have the same root.
     sign, arm = signs[:, 0] + signs[:, 1], maps.contract("csv,csx->cvx", signs, lever)
-    point = maps.contract("cv,vx->cvx", sign, moving) + maps.contract("vxy,cvy->cvx", spatial.cross_matrix(turning), arm)
+    point = maps.contract("cv,vx->cvx", sign, moving) + maps.contract(
+        "vxy,cvy->cvx", spatial.cross_matrix(turning), arm
+    )
     rows = maps.contract("ckx,cvx->ckv", frame[:, : min(dim, 3)], point)
     if dim > 3:
         spin = maps.contract("cv,vx->cvx", sign, turning)

@@ -27,6 +27,7 @@ LINEAR = {
     "a choice": np.eye(4)[[2, 2, 0]],
     "signs": np.array([[1.0, 0, -1], [0, 0, 0], [0, 2.5, 0]]),
     "many terms": np.ones((2, primitives._MOST_WRITTEN + 1)),
+    "one that is long": np.concatenate([np.eye(6)[[0, 0, 1, 2]], np.ones((2, 6)), np.eye(6)[3:]]),
     "nothing": np.zeros((0, 3)),
     "of nothing": np.zeros((2, 0)),
 }
