@@ -31,6 +31,8 @@ from jaxtyping import Array, Float
 Term = tuple[int, int, int, float]
 # Terms of a sum up to which it is written out, on a GPU gathered; more are a product of matrices.
 _MOST_WRITTEN, _MOST_GATHERED = 64, 32
+# Terms of all sums together up to which they are slices, each with an operation of its own to compile.
+_MOST_SLICED = 96
 # Terms of a gathered sum up to which what they are made of is computed within it, for each of them in turn.
 _MOST_FUSED = 4
 
@@ -200,7 +202,9 @@ class _Matrix:
 
 
 def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
-    if not batch or not matrix.entries.size or (matrix.entries != 0).sum(axis=1).max() > _MOST_WRITTEN:
+    count = (matrix.entries != 0).sum(axis=1)
+    most = count.max(initial=0)
+    if not batch or not 0 < most <= _MOST_WRITTEN or (most > 1 and count.sum() > _MOST_SLICED):
         return _linear_by_product(x, matrix=matrix, batch=batch)
     items = jax.lax.split(x, (1,) * x.shape[batch], batch)
     none = jnp.zeros_like(items[0])
@@ -215,8 +219,10 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
 
 
 def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
-    product = jnp.tensordot(jnp.asarray(matrix.entries, x.dtype), x, axes=((1,), (batch,)), precision="highest")
-    return jnp.moveaxis(product, 0, batch)
+    # The batch last, as it is in memory on a CPU.
+    x = jnp.moveaxis(x, range(batch), range(x.ndim - batch, x.ndim))
+    product = jnp.tensordot(jnp.asarray(matrix.entries, x.dtype), x, axes=1, precision="highest")
+    return jnp.moveaxis(product, range(x.ndim - batch, x.ndim), range(batch))
 
 
 def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
