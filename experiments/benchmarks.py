@@ -22,6 +22,7 @@ compiled program and once as ten programs, as ten runs of a script would make th
 """
 
 import argparse
+import copy
 import dataclasses
 import functools
 import importlib.util
@@ -302,6 +303,8 @@ def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options
     data = mujoco.MjData(mj_model)
     data.qpos[:] = qpos[0]
     mujoco.mj_forward(mj_model, data)
+    mj_model = copy.copy(mj_model)
+    mj_model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # it refuses PGS, which the humanoid asks for
     model = mujoco_warp.put_model(mj_model)
     worlds = mujoco_warp.put_data(mj_model, data, nworld=len(qpos), nconmax=_WARP_ROOM, njmax=4 * _WARP_ROOM)
     begin = time.perf_counter()
