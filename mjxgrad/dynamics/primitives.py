@@ -210,7 +210,9 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
     none = jnp.zeros_like(items[0])
 
     def row(weights: np.ndarray) -> Array:
-        terms = [items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights)]
+        terms = [
+            items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights).tolist()
+        ]
         return _total(iter(terms or [none]))
 
     rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
