@@ -1,4 +1,4 @@
-"""Linear and bilinear maps of many short vectors, whose derivatives are maps of the same kind; see `primitives`."""
+"""Linear and bilinear maps and Einstein sums of many short vectors, whose derivatives are of the same kind; see `primitives`."""
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,11 @@ class Bilinear:
     def __init__(self, table: np.ndarray):
         """Keep the terms of T that are not zero."""
         self._size = len(table)
-        self._terms = [(*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table)]
+        self._terms = primitives.ordered((*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table))  # pyright: ignore[reportArgumentType]
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
         """Return c; both factors have the same leading axes."""
-        return primitives.bilinear(a, b, self._terms, self._size)  # pyright: ignore[reportArgumentType]
+        return primitives.bilinear(a, b, self._terms, self._size)
 
 
 def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *item"]:

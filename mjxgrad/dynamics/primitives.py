@@ -16,7 +16,7 @@ what is before and after.
 
 import inspect
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,10 +27,12 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+from mjxgrad.dynamics.linear import LONGEST_SUM, add
+
 # (entry of the result, entry of the first factor, entry of the second, coefficient)
 Term = tuple[int, int, int, float]
-# Terms of a sum up to which it is written out, on a GPU gathered; more are a product of matrices.
-_MOST_WRITTEN, _MOST_GATHERED = 64, 32
+# Terms of a sum up to which a GPU gathers them; more are a product of matrices.
+_MOST_GATHERED = 32
 # Terms of all sums together up to which they are slices, each with an operation of its own to compile.
 _MOST_SLICED = 96
 # Terms of a gathered sum up to which what they are made of is computed within it, for each of them in turn.
@@ -38,10 +40,10 @@ _MOST_FUSED = 4
 
 
 def bilinear(
-    a: Float[Array, "*n i"], b: Float[Array, "*n j"], terms: Sequence[Term], size: int
+    a: Float[Array, "*n i"], b: Float[Array, "*n j"], terms: tuple[Term, ...], size: int
 ) -> Float[Array, "*n size"]:
-    """Return the sums of products along the last axis that `terms` ask for; both factors have the same leading axes."""
-    return _bilinear.bind(a, b, terms=_ordered(terms), size=size, batch=0)
+    """Return the sums of products along the last axis that `ordered` terms ask for; factors have the same leading axes."""
+    return _bilinear.bind(a, b, terms=terms, size=size, batch=0)
 
 
 def linear(x: Float[Array, "n *item"], matrix: np.ndarray) -> Float[Array, "m *item"]:
@@ -83,7 +85,8 @@ def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) ->
     names = [one.name for one in inspect.signature(evaluate).parameters.values() if one.kind is one.KEYWORD_ONLY]
     primitive.def_impl(jax.jit(evaluate, static_argnames=names))
     primitive.def_abstract_eval(infer)
-    mlir.register_lowering(primitive, on_cpu)
+    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=False))
+    mlir.register_lowering(primitive, on_cpu, platform="cpu")
     mlir.register_lowering(primitive, mlir.lower_fun(on_gpu, multiple_results=False), platform="cuda")
     batching.primitive_batchers[primitive] = batched
     return primitive
@@ -104,17 +107,10 @@ def _batch_last(x: Array, batch: int) -> Array:
     return with_layout_constraint(x, Layout(major_to_minor=(*range(batch, x.ndim), *range(batch))))
 
 
-def _total(terms: Iterator[Array]) -> Array:
-    total = next(terms)
-    for term in terms:
-        total = total + term
-    return total
-
-
 # The bilinear map.
 
 
-def _ordered(terms: Sequence[Term]) -> tuple[Term, ...]:
+def ordered(terms: Iterable[Term]) -> tuple[Term, ...]:
     """Return the terms by entry of the result, those that are added before those that are subtracted."""
     return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
 
@@ -150,7 +146,7 @@ def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: i
         layers.append(product if (coefficients == 1).all() else product * jnp.asarray(coefficients, a.dtype))
     if not layers:
         return jnp.zeros((*a.shape[:-1], size), a.dtype)
-    return _where_terms(_total(iter(layers)), np.array([bool(of_one) for of_one in by_entry]))
+    return _where_terms(add(layers), np.array([bool(of_one) for of_one in by_entry]))
 
 
 def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
@@ -166,12 +162,12 @@ def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
 
 
 def _transpose_first(cotangent, a, b, *, terms, size, batch):
-    swapped = _ordered([(i, k, j, c) for k, i, j, c in terms])
+    swapped = ordered([(i, k, j, c) for k, i, j, c in terms])
     return _bilinear.bind(cotangent, b, terms=swapped, size=a.aval.shape[-1], batch=batch)
 
 
 def _transpose_second(cotangent, a, b, *, terms, size, batch):
-    swapped = _ordered([(j, i, k, c) for k, i, j, c in terms])
+    swapped = ordered([(j, i, k, c) for k, i, j, c in terms])
     return _bilinear.bind(a, cotangent, terms=swapped, size=b.aval.shape[-1], batch=batch)
 
 
@@ -204,7 +200,7 @@ class _Matrix:
 def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
     count = (matrix.entries != 0).sum(axis=1)
     most = count.max(initial=0)
-    if not batch or not 0 < most <= _MOST_WRITTEN or (most > 1 and count.sum() > _MOST_SLICED):
+    if not batch or not 0 < most <= LONGEST_SUM or (most > 1 and count.sum() > _MOST_SLICED):
         return _linear_by_product(x, matrix=matrix, batch=batch)
     items = jax.lax.split(x, (1,) * x.shape[batch], batch)
     none = jnp.zeros_like(items[0])
@@ -213,7 +209,7 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
         terms = [
             items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights).tolist()
         ]
-        return _total(iter(terms or [none]))
+        return add(terms or [none])
 
     rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
     sums = [row(weights) for weights in rows]
@@ -261,7 +257,7 @@ def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
     for index, weight in zip(order.T, weights.T, strict=True):
         part = _entries(x, index, batch)
         layers.append(part if (weight == 1).all() else part * jnp.asarray(weight.reshape(along), x.dtype))
-    return _where_terms(_total(iter(layers)), is_term.any(axis=1).reshape(along))
+    return _where_terms(add(layers), is_term.any(axis=1).reshape(along))
 
 
 def _transpose_linear(cotangent, x, *, matrix, batch):
@@ -299,7 +295,7 @@ class _Subscripts(NamedTuple):
 def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
     sizes = subscripts.sizes(a, b, batch)
     summed = [range(sizes[letter]) for letter in subscripts.summed]
-    if not batch or not 0 < np.prod([len(places) for places in summed]) <= _MOST_WRITTEN:
+    if not batch or not 0 < np.prod([len(places) for places in summed]) <= LONGEST_SUM:
         return _contract_by_product(a, b, subscripts=subscripts, batch=batch)
 
     def at(x: Array, letters: str, place: dict[str, int]) -> Array:
@@ -311,7 +307,7 @@ def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch:
         return jnp.expand_dims(chosen, [batch + k for k, letter in enumerate(subscripts.result) if letter not in kept])
 
     places = (dict(zip(subscripts.summed, place, strict=True)) for place in itertools.product(*summed))
-    return _total(at(a, subscripts.first, place) * at(b, subscripts.second, place) for place in places)
+    return add(at(a, subscripts.first, place) * at(b, subscripts.second, place) for place in places)
 
 
 def _contract_by_product(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
