@@ -28,7 +28,7 @@ LINEAR = {
     "a choice": np.eye(4)[[2, 2, 0]],
     "signs": np.array([[1.0, 0, -1], [0, 0, 0], [0, 2.5, 0]]),
     "many terms": np.ones((2, primitives.LONGEST_SUM + 1)),
-    "one that is long": np.concatenate([np.eye(6)[[0, 0, 1, 2]], np.ones((2, 6)), np.eye(6)[3:]]),
+    "one that is long": np.concatenate([np.eye(6)[[0, 0, 1, 2]], -np.ones((2, 6)), np.eye(6)[3:]]),
     "nothing": np.zeros((0, 3)),
     "of nothing": np.zeros((2, 0)),
 }
@@ -129,7 +129,16 @@ def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
-CONTRACTIONS = ["nij,njk->nik", "nij,nj->ni", "ik,jk->ij", "cdv,cd->v", "cka,va->ckv", "i,i->", "ni,n->ni"]
+CONTRACTIONS = [
+    "nij,njk->nik",
+    "nij,nj->ni",
+    "ik,jk->ij",
+    "cdv,cd->v",
+    "cka,va->ckv",
+    "i,i->",
+    "ni,n->ni",
+    "ija,aj->ji",
+]
 _SIZES = dict(zip("nijkcdva", (4, 3, 2, 5, 2, 3, 4, 6), strict=True))
 
 
