@@ -217,7 +217,7 @@ def test_in_single_precision_it_ends_when_what_is_left_is_rounding():
     np.testing.assert_allclose(acceleration, expected, atol=1e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("size", [4, 18])  # by the factorisation written out, and by LAPACK's
+@pytest.mark.parametrize("size", [4, 18])  # by the factorisation written out, and in blocks
 def test_a_row_so_stiff_that_rounding_hides_the_mass_leaves_a_finite_response(size: int):
     """(1 + w j jᵀ)⁻¹ f is f less its part along j, if w is large; from 10⁷ on, single precision has no Cholesky factor of it."""
     random, batch = np.random.default_rng(0), 512
