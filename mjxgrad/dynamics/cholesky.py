@@ -24,7 +24,7 @@ _Matrix = Float[Array, "n n *batch"]
 # Larger factorisations are not written out: they would take longer to compile than they save.
 _LARGEST = 16
 # Of a larger one the columns of a block, and at most how many blocks. 23 columns in six blocks take a third of LAPACK's time and
-# in two blocks nine tenths; each block is a quarter of a second to compile.
+# in two blocks nine tenths; each block is a tenth of a second to compile.
 _LEAST_BLOCK = 4
 _MOST_BLOCKS = 8
 SOLUTION = "solution"
