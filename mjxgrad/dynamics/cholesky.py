@@ -17,7 +17,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from mjxgrad.dynamics import on_gpu
-from mjxgrad.dynamics.linear import add, batch_last
+from mjxgrad.dynamics.linear import add, batch_last, dot, matvec, rmatvec
 
 _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
@@ -119,8 +119,8 @@ def in_blocks(matrix: _Matrix, vector: _Vector) -> _Vector:
     solution = vector[:0]
     for block in reversed(blocks):
         value = block[:, -1]
-        for k, known in enumerate(solution, start=len(block)):
-            value = value - block[:, k] * known
+        if len(solution):
+            value = value - matvec(block[:, len(block) : -1], solution)
         solution = jnp.concatenate([_solution_above(block, value), solution])
     return solution
 
@@ -129,7 +129,7 @@ def _factor_of(columns: Float[Array, "width rows *batch"]) -> Float[Array, "widt
     """Return the columns of the factor, from those of a matrix whose first rows are square; above its diagonal is rounding."""
 
     def turn(k: Array, factor: Array) -> Array:
-        column = columns[k] - add(earlier * earlier[k] for earlier in factor)  # zero from the k-th on
+        column = columns[k] - rmatvec(factor, factor[:, k])  # zero from the k-th on
         return factor.at[k].set(column / jnp.sqrt(column[k]))
 
     return jax.lax.fori_loop(0, len(columns), turn, jnp.zeros_like(columns))
@@ -141,7 +141,7 @@ def _solution_above(factor: Float[Array, "width rows *batch"], value: _Vector) -
 
     def turn(done: Array, solution: Array) -> Array:
         k = last - done
-        rest = value[k] - add(factor[k, j] * known for j, known in enumerate(solution))  # zero up to the k-th
+        rest = value[k] - dot(factor[k, : len(value)], solution)  # zero up to the k-th
         return solution.at[k].set(rest / factor[k, k])
 
     return jax.lax.fori_loop(0, len(value), turn, jnp.zeros_like(value))
