@@ -1,7 +1,7 @@
 """Many steps: a scan with a lean carry, checkpointed, that says when it has gone wrong."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 import equinox as eqx
@@ -13,11 +13,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from mjxgrad._arrays import form, known, whole
 from mjxgrad._mjx import mjx
-from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.cholesky import SOLUTION
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.onset import reach
+from mjxgrad.native import INPUTS, roll_out
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
 
@@ -148,7 +148,8 @@ def rollout(
     smoothing: Smoothing | None = None,
     velocity_limit: float | None = 1e4,
     measure_growth: bool = False,
-    engine: Engine = "mjx",
+    inputs: Mapping[str, Float[ArrayLike, "..."]] | None = None,
+    engine: Engine | None = None,
 ) -> Trajectory:
     """Step a scene many times.
 
@@ -171,17 +172,20 @@ def rollout(
             scene's resting one. This takes a second solve per step where they are observed.
         checkpoint: recompute each step in reverse mode and keep only its state and the solutions of its solves, so that memory
             grows by a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
-        gradient: of each step: "discrete" or "event", see `step`. The trajectory is the same. The default is what
-            finite differences of it give.
-        onset: lets contacts and limits begin within the step, see `step`; `mg.Onset()` for costs of motions that hit something,
-            as tasks take. None is MuJoCo's motion, to the bit, for which "event" is the derivative that is right in the mean.
+        gradient: "discrete", the derivative of each step, which finite differences of it give; or "slope", which knows that
+            contacts and limits begin and end at times that move, so that its mean is the slope of the outcome. The motion is the
+            same. Of C MuJoCo's step see `native.events`, of MJX's `step`.
+        onset: lets contacts and limits begin within the step, see `step`: a continuous motion, whose plain derivative is the
+            slope. None is MuJoCo's motion, to the bit.
         smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
             `SceneWarning` what of the scene it has no effect on.
         velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
         measure_growth: carry one tangent along and tell by `growth` and `explodes` whether derivatives of this rollout can be
             believed: contacts that chatter may multiply them at every switch. It takes as long as a derivative in forward mode.
-        engine: "mujoco" has C MuJoCo do it, on all cores of the processor: for controls, and where no derivative is wanted. Its
-            motion is that without an onset, to the solver's tolerance; what has no meaning there is refused.
+        inputs: what else is given to each step, one row per step, by MuJoCo's names: `qfrc_applied`, `xfrc_applied`,
+            `mocap_pos`, `mocap_quat`, `eq_active`. Differentiable, but for the last. What is not named stays as in `scene.data`.
+        engine: "mjx" or "mujoco": C MuJoCo on all cores of the processor, with nothing to compile, differentiable once. Its motion
+            has no onset, to the solver's tolerance; what has no meaning there is refused. None is the scene's own, `scene.engine`.
 
     Returns:
         The trajectory, with `horizon + 1` states.
@@ -211,35 +215,44 @@ def rollout(
         if (shape := jnp.shape(getattr(state, name))) != (size,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
+    applied = _applied(scene, inputs, horizon)
+    engine = scene.engine if engine is None else engine
     if engine != "mjx":
-        given = {"a policy": callable(controls), "observe": observe, "onset": onset, "smoothing": smoothing}
-        given |= {"measure_growth": measure_growth, f"gradient={gradient!r}": gradient != "discrete"}
+        given = {"observe": observe, "onset": onset, "smoothing": smoothing, "measure_growth": measure_growth}
         _check_engine(engine, [name for name, value in given.items() if value is not None and value is not False])
-        resting = jnp.broadcast_to(scene.data.ctrl if sequence is None else sequence, (horizon, nu))
-        return _native_trajectory(scene, state, resting + (0 if noise is None else jnp.asarray(noise)), velocity_limit)
+        base = (
+            None
+            if callable(controls)
+            else jnp.broadcast_to(scene.data.ctrl if sequence is None else sequence, (horizon, nu))
+        )
+        added = jnp.zeros((horizon, nu), state.qvel.dtype) if noise is None else jnp.asarray(noise)
+        if base is None:
+            return _native_loop(scene, state, controls, params, added, applied, gradient, velocity_limit)
+        return _native_trajectory(scene, state, base + added, applied, gradient, velocity_limit)
+    scene.check_mjx()
     policy = controls if callable(controls) else None
     resting = jnp.broadcast_to(scene.data.ctrl, (horizon, nu))
     base = resting if sequence is None else sequence
-    inputs = (base, jnp.zeros_like(base) if noise is None else noise)
+    rows = (base, jnp.zeros_like(base) if noise is None else noise, applied)
     settings = {"onset": onset, "smoothing": smoothing}
     has_stages = scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
-    def look(state: State, ctrl: Array, stepped: mjx.Data | None = None) -> PyTree:
+    def look(state: State, ctrl: Array, forces: dict, stepped: mjx.Data | None = None) -> PyTree:
         if observe is None:
             return None
-        data = data_of(scene, state, ctrl)
+        data = data_of(scene, state, ctrl).replace(**forces)
         if stepped is None or has_stages:  # what a step of several stages leaves is of its last
             return observe(scene.model, forward(scene.model, data, **settings))
         at_start = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
         return observe(scene.model, stepped.replace(**at_start))
 
-    def advance(carry: tuple, inputs: tuple[Array, Array, Array]):
+    def advance(carry: tuple, given: tuple[Array, Array, Array, dict]):
         state, before, first_bad, unsolved, crowded, tangent, growth = carry
-        index, row, disturbance = inputs
-        seen = None if before is None else look(state, before)
+        index, row, disturbance, forces = given
+        seen = None if before is None else look(state, before, forces)
         chosen = row if policy is None else _one_each(policy(params, state if before is None else seen), nu)
         ctrl = chosen + disturbance
-        data = data_of(scene, state, ctrl)
+        data = data_of(scene, state, ctrl).replace(**forces)
         if measure_growth:
 
             def take(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
@@ -259,7 +272,7 @@ def rollout(
         crowded += (first_bad < 0) & _is_crowded(scene.model, jax.lax.stop_gradient(stepped), onset, smoothing)
         shown = None if before is None else ctrl.astype(before.dtype)
         carry = (kept, shown, first_bad, unsolved, crowded, tangent, growth)
-        return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, stepped), seen)
+        return carry, (state.qpos, state.qvel, state.act, ctrl, look(state, ctrl, forces, stepped), seen)
 
     if checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
@@ -278,10 +291,10 @@ def rollout(
     (final, _, first_bad, unsolved, crowded, _, growth), (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(
         advance,
         start,
-        (jnp.arange(horizon, dtype=jnp.int32), *inputs),  # pyright: ignore[reportArgumentType]
+        (jnp.arange(horizon, dtype=jnp.int32), *rows),  # pyright: ignore[reportArgumentType]
     )
     if observe is not None:
-        last = look(final, ctrl[-1])
+        last = look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], applied))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)
     return Trajectory(
         qpos=jnp.concatenate([qpos, final.qpos[None]]),
@@ -320,23 +333,48 @@ def _has_numbers(scene: Scene) -> Bool[Array, ""]:
     return jnp.array(True) if not traced else ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced]))
 
 
+def _applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
+    """Return what is given to each step besides controls, or refuse what there is not."""
+    found = {}
+    for name, value in ({} if inputs is None else inputs).items():
+        if name not in INPUTS[1:]:
+            raise ValueError(f"inputs must be among {', '.join(INPUTS[1:])}, got {name!r}")
+        shape = (horizon, *getattr(scene.data, name).shape)
+        if np.shape(value) != shape:
+            raise ValueError(f"inputs[{name!r}] must have shape {shape}, one row per step, got {np.shape(value)}")
+        found[name] = jnp.asarray(value, getattr(scene.data, name).dtype)
+    return found
+
+
 def _check_engine(engine: str, given: list[str]) -> None:
     if engine != "mujoco":
         raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
     if given:
-        raise ValueError(
-            f'engine="mujoco" rolls out controls in MuJoCo\'s own motion, got {" and ".join(given)}: leave it out'
-        )
+        raise ValueError(f'engine="mujoco" is MuJoCo\'s own motion, got {" and ".join(given)}: leave it out')
 
 
+@eqx.filter_jit
 def _native_trajectory(
-    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], velocity_limit: float | None
+    scene: Scene,
+    state: State,
+    ctrl: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
 ) -> Trajectory:
     """Return what C MuJoCo makes of controls; from the first bad step on the last good state."""
-    start = (state.qpos, state.qvel, state.act)
+    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
     is_finite = jnp.isfinite(ctrl)  # MuJoCo takes another for zero
-    found = roll_out(scene, *start, jnp.asarray(state.time), jnp.where(is_finite, ctrl, 0.0))
-    qpos, qvel, act = (jnp.concatenate([first[None], rest]) for first, rest in zip(start, found, strict=True))
+    given = {
+        name: jnp.broadcast_to(getattr(scene.data, name), (len(ctrl), *getattr(scene.data, name).shape))
+        for name in INPUTS[1:]
+        if getattr(scene.data, name).size
+    }
+    found = roll_out(scene, start, given | applied | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
+    qpos, qvel, act = (
+        jnp.concatenate([first[None], rest])
+        for first, rest in zip((state.qpos, state.qvel, state.act), found, strict=True)
+    )
     time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
     states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
     is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
@@ -352,6 +390,45 @@ def _native_trajectory(
         diverged=diverged,
         first_bad_step=jnp.where(diverged, first_bad, -1),
         act=states.act,
+    )
+
+
+def _native_loop(
+    scene: Scene,
+    state: State,
+    policy: Policy,
+    params: PyTree,
+    noise: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
+) -> Trajectory:
+    """Return what C MuJoCo makes of a policy, which is asked before each step."""
+
+    def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
+        state, first_bad = carry
+        index, disturbance, forces = given
+        ctrl = _one_each(policy(params, state), scene.model.nu) + disturbance
+        forces = jax.tree.map(lambda x: x[None], forces)
+        one = _native_trajectory(scene, state, ctrl[None], forces, gradient, velocity_limit)
+        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
+        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
+        return (moved, first_bad), (state.qpos, state.qvel, state.act, ctrl)
+
+    steps = jnp.arange(len(noise), dtype=jnp.int32)
+    (final, first_bad), course = jax.lax.scan(advance, (state, jnp.int32(-1)), (steps, noise, applied))
+    qpos, qvel, act = (
+        jnp.concatenate([x, last[None]]) for x, last in zip(course, (final.qpos, final.qvel, final.act), strict=False)
+    )
+    return Trajectory(
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=course[3],
+        observations=None,
+        final=final,
+        diverged=first_bad >= 0,
+        first_bad_step=first_bad,
+        act=act,
     )
 
 

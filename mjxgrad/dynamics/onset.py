@@ -80,6 +80,7 @@ from mjxgrad.dynamics.kinematics import com_vel
 from mjxgrad.dynamics.newton import Variant
 from mjxgrad.dynamics.rows import Block, joined, law, per_row, row_map, weight_of
 
+_Vector = Float[Array, " nv"]
 _PerRow = Float[Array, " rows"]
 _PerContact = Float[Array, " contacts"]
 # Impedance of a partial contact is no smaller than this part of its own: a weight of zero has no logarithm's derivative.
@@ -89,6 +90,8 @@ _SLIP = 3.0
 # What motors press together adds this part to gravity, and this many times the impedance's width at most: with less of either,
 # feet of MuJoCo Playground's robots chatter; with no bound, a strong servo holds a light link off the floor.
 _PRESS, _WIDEST = 3.0, 10.0
+# Of the impedance's width, half the ramp's least width at MuJoCo's own motion; as for C MuJoCo's step, see `native.events`.
+_AT_MOTION = 0.06
 # In m, of impedances: wider than any contact, and what takes its place.
 _ENDLESS, _USUAL_WIDTH = 1e3, 1e-3
 # In m/s², where a scene has none: what is an impact and what chatters.
@@ -117,10 +120,10 @@ class Onset(eqx.Module):
         """Refuse what a single step cannot take."""
         if self.width.ndim:
             raise ValueError(f"width must be one value for a step, got shape {self.width.shape}: sweep under jax.vmap")
-        if gradient == "event":
+        if gradient == "slope":
             raise ValueError(
-                "gradient must be 'discrete' with an onset, got 'event': that one is for MuJoCo's motion to the bit, "
-                "onset=None; a motion without jumps needs no correction"
+                "gradient must be 'discrete' with an onset, got 'slope': that one is for MuJoCo's motion to the bit, "
+                "onset=None; a motion without jumps has the slope as its plain derivative"
             )
 
 
@@ -192,11 +195,18 @@ class Partial(eqx.Module):
 
 
 def begin(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], onset: Onset, *, without: tuple[bool, bool] = (False, False)
+    model: mjx.Model,
+    data: mjx.Data,
+    blocks: list[Block],
+    onset: Onset,
+    after: _Vector | None = None,
+    *,
+    without: tuple[bool, bool] = (False, False),
 ) -> tuple[list[Block], Shares | None]:
     """Return constraint rows present wherever they act for a part of the step, and for which; None if none begins or ends.
 
-    `without` says whether contacts, and limits, are left as they are, averaged over noise on their distance.
+    `after`, the velocity that MuJoCo's step leaves, makes the shares those of its own motion, for a derivative there. `without`
+    says whether contacts, and limits, are left as they are, averaged over noise on their distance.
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
@@ -210,7 +220,7 @@ def begin(
         each, count = block.rows_each, len(block.residual) // block.rows_each
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
-        share, side = _share(model, data, block, onset, geoms)
+        share, side = _share(model, data, block, onset, geoms, after)
         share = per_row(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
@@ -250,7 +260,7 @@ class _Side(eqx.Module):
 
 
 def _share(
-    model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None
+    model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None, after: _Vector | None
 ) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and what may push instead of it; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
@@ -272,6 +282,11 @@ def _share(
     width = jnp.where(travel > least, travel, least)
     slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
     distance = block.residual[::each] + h * rate * slow
+    if after is not None:
+        least = 2 * _AT_MOTION * depth
+        ahead = h * jnp.abs(_normal(block, block.map.rates(after).reshape(-1, each)))
+        width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
+        distance = block.residual[::each]
     if contacts is None:
         return _ramp(distance, width, 0.5), None
     slots = slot_geoms(model, data)

@@ -106,9 +106,9 @@ class Smoothing(eqx.Module):
             value = getattr(self, name)
             if value is not None and value.ndim:
                 raise ValueError(f"{name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap")
-        if gradient == "event":
+        if gradient == "slope":
             raise ValueError(
-                "gradient must be 'discrete' with smoothing, got 'event': the derivative of a smoothed contact already knows "
+                "gradient must be 'discrete' with smoothing, got 'slope': the derivative of a smoothed contact already knows "
                 "that its time moves; smooth limits by limit_length"
             )
 

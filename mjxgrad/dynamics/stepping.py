@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, cholesky, events, forces, implicit, kinematics
+from mjxgrad.dynamics import assembly, cholesky, forces, implicit, kinematics
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
@@ -35,7 +35,8 @@ _Vector = Float[Array, " nv"]
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
-Gradient = Literal["discrete", "event"]
+Gradient = Literal["discrete", "slope"]
+"""Along MuJoCo's own motion: the derivative of each step, or one whose mean is the slope of the outcome."""
 
 
 @contextlib.contextmanager
@@ -75,9 +76,8 @@ def step(
     Args:
         model: any model of MJX's JAX implementation; Euler, implicitfast or RK4.
         data: the present state, controls and applied forces.
-        gradient: "discrete", the exact derivative of the simulated map, or "event", which adds what that one does not
-            see, that the time of a contact's or limit's beginning and end moves; see `dynamics.events`. The step itself
-            is the same.
+        gradient: "discrete", the exact derivative of the simulated map, or "slope", which knows that contacts and limits begin
+            and end at times that move: that of the step with an onset, at MuJoCo's own motion. The step itself is the same.
         onset: lets contacts and limits begin within the step, so that the motion has no jumps and its plain derivative is
             right; see `dynamics.onset`. None is MuJoCo's step.
         smoothing: averages every contact over noise on its distance, for the motion or for its derivative alone.
@@ -90,21 +90,33 @@ def step(
 
     Raises:
         ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or onset or
-            smoothing have a leading axis or are to go with the gradient "event".
+            smoothing have a leading axis or are to go with the gradient "slope".
         NotImplementedError: if MJX lacks the integrator.
     """
     check_gradient(gradient, onset, smoothing)
-    integrator = model.opt.integrator
+    if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
+        kind = model.opt.integrator
+        raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
     with _at_full_precision(model, data):
-        if integrator == _Integrator.mjINT_RK4:
-            return _runge_kutta(model, data, gradient, onset, smoothing)
-        data, blocks = _forward(model, data, onset, smoothing)
-        moving = events.correct(model, data, blocks) if gradient == "event" else data
-        if integrator == _Integrator.mjINT_EULER:
-            return _advance(model, data, _euler_acceleration(model, moving), None)
-        if integrator == _Integrator.mjINT_IMPLICITFAST:
-            return _advance(model, data, _implicit_acceleration(model, moving), None)
-    raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {integrator}: set it in <option>")
+        if gradient == "discrete":
+            return _step(model, data, onset, smoothing)
+        moved = _step(*jax.lax.stop_gradient((model, data)), onset, smoothing)
+        return jax.tree.map(_with_derivative_of, moved, _step(model, data, Onset(), smoothing, moved.qvel))
+
+
+def _step(
+    model: mjx.Model,
+    data: mjx.Data,
+    onset: Onset | None,
+    smoothing: Smoothing | None,
+    after: _Vector | None = None,
+) -> mjx.Data:
+    integrator = model.opt.integrator
+    if integrator == _Integrator.mjINT_RK4:
+        return _runge_kutta(model, data, onset, smoothing, after)
+    data = _forward(model, data, onset, smoothing, after)
+    is_euler = integrator == _Integrator.mjINT_EULER
+    return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
 
 
 def forward(
@@ -128,20 +140,24 @@ def forward(
     """
     check_gradient("discrete", onset, smoothing)
     with _at_full_precision(model, data):
-        return _forward(model, data, onset, smoothing)[0]
+        return _forward(model, data, onset, smoothing)
 
 
 def _forward(
-    model: mjx.Model, data: mjx.Data, onset: Onset | None, smoothing: Smoothing | None
-) -> tuple[mjx.Data, list[Block]]:
-    """Return the data, and the constraint rows that went into it."""
+    model: mjx.Model,
+    data: mjx.Data,
+    onset: Onset | None,
+    smoothing: Smoothing | None,
+    after: _Vector | None = None,
+) -> mjx.Data:
+    """Return the data with all that depends on the state; `after` as for `onset.begin`."""
     data, blocks = _smooth(model, data)
     rows, shares = blocks, None
     if onset is not None:
         averaged = (False, False)
         if smoothing is not None and smoothing.mode == "forward":
             averaged = (True, smoothing.limit_length is not None)
-        rows, shares = onsets.begin(model, data, blocks, onset, without=averaged)
+        rows, shares = onsets.begin(model, data, blocks, onset, after, without=averaged)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
         data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
@@ -151,7 +167,7 @@ def _forward(
         )
     else:
         data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
-    return mjx.sensor_acc(model, data) if model.nsensor else data, blocks
+    return mjx.sensor_acc(model, data) if model.nsensor else data
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -319,7 +335,7 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
 
 
 def _runge_kutta(
-    model: mjx.Model, start: mjx.Data, gradient: Gradient, onset: Onset | None, smoothing: Smoothing | None
+    model: mjx.Model, start: mjx.Data, onset: Onset | None, smoothing: Smoothing | None, after: _Vector | None
 ) -> mjx.Data:
     """Advance by the classical fourth-order rule.
 
@@ -338,24 +354,16 @@ def _runge_kutta(
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data, blocks = _forward(model, data, onset, smoothing)
+        data = _forward(model, data, onset, smoothing, after)
         rates = (data.qvel, data.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
-        return (rates, sums, data.qacc), (data, blocks if gradient == "event" else None)
+        return (rates, sums, data.qacc), data
 
     tableau = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6)
     tableau = jax.tree.map(lambda x: x.astype(start.qvel.dtype), tableau)
-    (_, (velocity, acceleration, act_dot), _), (stages, blocks) = jax.lax.scan(
-        stage, (rest, rest, start.qacc_warmstart), tableau
-    )
+    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )
     last = last.tree_replace({"_impl.solver_niter": jnp.max(stages._impl.solver_niter, axis=0)})
-    if gradient == "event":
-        first, blocks = jax.tree.map(lambda x: x[0], (stages, blocks))
-        change = events.impulse(model, first, blocks, velocity)
-        acceleration = acceleration + change / h
-        # An event falls on average in the middle of the step.
-        velocity = velocity + 0.5 * change
     return _advance(model, last, acceleration, velocity)

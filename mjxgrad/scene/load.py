@@ -22,17 +22,13 @@ from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors, searched_contacts
 from mjxgrad.scene.omissions import LeaveOut, omit, omit_pairs, switch_off
 from mjxgrad.scene.refusals import refusal_messages
-from mjxgrad.scene.scene import Scene, SceneWarning, numbers_of
+from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
 """Pairs of geoms beyond which loading takes minutes and a scene is refused."""
 _LISTENING = threading.Lock()  # there is one handler of warnings for all threads
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
-
-
-class SceneError(ValueError):
-    """A scene cannot be loaded; the message says what, what is required and the remedy."""
 
 
 def load_scene(

@@ -5,6 +5,7 @@ import difflib
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,6 +29,10 @@ _WIDTH = 118  # characters; what a laptop's terminal shows
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
+class SceneError(ValueError):
+    """A scene cannot be loaded or stepped; the message says what, what is required and the remedy."""
+
+
 class SceneWarning(UserWarning):
     """A scene moves otherwise than its file says, or has a contact that its time step cannot."""
 
@@ -46,6 +51,7 @@ class Scene(eqx.Module):
         pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
         omitted_pairs: pairs whose contact is left out although the file has it, as `LeaveOut` asked.
         name: where the scene came from.
+        unsupported: why MJX cannot step it, so that C MuJoCo does; empty where it can.
     """
 
     model: mjx.Model
@@ -56,6 +62,21 @@ class Scene(eqx.Module):
     pairs: tuple[ContactPair, ...] = eqx.field(static=True)
     omitted_pairs: tuple[ContactPair, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    unsupported: str = eqx.field(static=True, default="")
+
+    @property
+    def engine(self) -> Literal["mjx", "mujoco"]:
+        """What steps the scene where nothing else is said: MJX, or C MuJoCo where MJX lacks something."""
+        return "mujoco" if self.unsupported else "mjx"
+
+    def check_mjx(self) -> None:
+        """Refuse a scene that MJX cannot step.
+
+        Raises:
+            SceneError: with what MJX lacks.
+        """
+        if self.unsupported:
+            raise SceneError(self.unsupported)
 
     def contact_parameters(self) -> ContactParameters:
         """Effective parameters of the pairs that can touch, one row each; traceable."""

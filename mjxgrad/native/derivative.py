@@ -1,0 +1,124 @@
+"""Rollouts of C MuJoCo under `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`.
+
+The motion is one call; the Jacobians of all its steps are another, once the motion is known, and a recursion in tangent space takes
+a change of the start to the end. JAX transposes that recursion, so forward and reverse mode are one formula.
+"""
+
+import functools
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.native.engine import Gradient, engine_of
+from mjxgrad.scene import Scene
+from mjxgrad.scene.scene import numbers_of
+
+_Arrays = Mapping[str, Array]
+
+
+def roll_out(
+    scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient
+) -> tuple[Float[Array, "horizon nq"], Float[Array, "horizon nv"], Float[Array, "horizon na"]]:
+    """Return positions, velocities and activations after each step, as MuJoCo gives them.
+
+    Args:
+        scene: its model's numbers are arguments of the call, so that they may be traced, mapped over and differentiated by.
+        start: `time` of shape (1,), `qpos`, `qvel` and `act`.
+        inputs: what each step is given, by names of `INPUTS`; `ctrl` at least.
+        gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `native.events`.
+
+    Returns:
+        Each with one row per step. Differentiable once, by start, inputs and numbers.
+    """
+    engine, dtype = engine_of(scene.mj_model), start["qpos"].dtype
+    horizon = len(inputs["ctrl"])
+    shapes = {k: jax.ShapeDtypeStruct((horizon, *start[k].shape), dtype) for k in ("qpos", "qvel", "act")}
+
+    @jax.custom_jvp
+    def call(numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, Array]:
+        return _callback(engine.run, shapes, numbers, start, inputs)
+
+    @functools.partial(call.defjvp, symbolic_zeros=True)
+    def _derivative(primals, tangents):
+        numbers, start, inputs = primals
+        found = call(*primals)
+        by_number, by_start, by_input = tangents
+        given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
+        before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in found}
+        before["time"] = start["time"] + numbers["opt.timestep"] * jnp.arange(horizon, dtype=dtype)[:, None]
+        jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs, dtype)
+        forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
+        for name, change in given.items():
+            is_by_step = name in by_input
+            change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
+            forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
+        changes = {k: _or_zero(by_start[k]) for k in found}
+        first = jnp.concatenate([_to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
+
+        def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+            matrix, force = step
+            change = jnp.einsum("sc,c->s", matrix, change, precision="highest") + force
+            return change, change
+
+        _, course = jax.lax.scan(advance, first, (jacobians["state"], forced))
+        nv = scene.model.nv
+        parts = jnp.split(course, (nv, 2 * nv), axis=1)
+        parts[0] = jax.vmap(functools.partial(_to_coordinates, scene))(found["qpos"], parts[0])
+        return found, dict(zip(("qpos", "qvel", "act"), parts, strict=True))
+
+    found = call(numbers_of(scene.model), start, inputs)
+    return found["qpos"], found["qvel"], found["act"]
+
+
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
+    """Return the Jacobians of one step by "state" and "ctrl", in tangent space; arguments as those of `roll_out`."""
+    engine, dtype = engine_of(scene.mj_model), start["qpos"].dtype
+    before = {k: x[None] for k, x in start.items()}
+    found = _jacobians(engine, gradient, ("ctrl",), numbers_of(scene.model), before, inputs, dtype)
+    return {name: value[0] for name, value in found.items()}
+
+
+def _jacobians(engine, gradient: Gradient, wanted: tuple[str, ...], numbers, before, inputs, dtype) -> dict[str, Array]:
+    horizon, size = len(inputs["ctrl"]), 2 * before["qvel"].shape[1] + before["act"].shape[1]
+    widths = {"state": size} | {
+        k: int(np.prod(inputs[k].shape[1:]) if k in inputs else numbers[k].size) for k in wanted
+    }
+    shapes = {k: jax.ShapeDtypeStruct((horizon, size, width), dtype) for k, width in widths.items()}
+
+    @jax.custom_jvp
+    def call(numbers, before, inputs):
+        return _callback(functools.partial(engine.linearise, gradient, wanted), shapes, numbers, before, inputs)
+
+    @call.defjvp
+    def _refuse(primals, tangents):
+        raise ValueError('engine="mujoco" has first derivatives alone: take engine="mjx" for second ones')
+
+    return call(numbers, before, inputs)
+
+
+def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
+    def run(*given) -> dict[str, np.ndarray]:
+        given = jax.tree.map(np.asarray, given)
+        return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
+
+    return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
+
+
+def _or_zero(tangent) -> Array:
+    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def _to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Return a change of coordinates in tangent space."""
+    return jax.jvp(lambda end: position_change(scene.model, qpos, end), (qpos,), (change,))[1]
+
+
+def _to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+    """Return a change in tangent space as one of coordinates."""
+    rest = jnp.zeros_like(change)
+    return jax.jvp(lambda velocity: integrate_position(scene.model, qpos, velocity, 1.0), (rest,), (change,))[1]

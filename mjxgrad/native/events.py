@@ -1,0 +1,179 @@
+r"""The slope of C MuJoCo's outcome: derivatives of a step that know of the contacts and limits about to begin or end.
+
+MuJoCo decides once per step whether a contact or limit acts, by the sign of its gap r (distance less margin). The step is
+therefore a smooth map with jumps at r = 0, and its Jacobian A₀, by differences of any small width, does not see them. Yet a change
+of the start moves each crossing to another step, and the slope of the outcome has that in it. Where trajectories that differ in
+phase fill the gap evenly, as in flight, the expected derivative of a step is that over the travel of one step about r = 0:
+
+    A = A₀ (1 - P J) + D J,        D_i = (f(q⁺_i) - f(q⁻_i)) / 2w_i,        J P = 1,
+
+for the events i, the rows with |r_i| < w_i. J holds their normal rows, P displacements of which each changes one gap alone, and
+q±_i is the present position moved along P_i until its gap is ±w_i. So D_i holds the jump and the mean derivative to both sides, and
+each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
+of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
+
+- **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
+  impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
+- **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
+  its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
+  Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are moved
+  together, as one.
+- **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
+  Of parameters that do move surfaces (sizes, places) events are not spanned. Jumps that are no event remain unseen: hit or miss,
+  an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
+
+References:
+    Kong, Payne, Zhu, Johnson. Saltation matrices: the essential tool for linearizing hybrid dynamical systems. arXiv:2306.06862.
+    Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+_LEAST_WIDTH = 0.06  # of the impedance's width
+_USUAL_WIDTH, _ENDLESS = 1e-3, 1e3  # m or rad, of an impedance that has none, and what counts as none
+# Rows count as independent if nothing need move farther than so many times the gap to change one alone.
+_FARTHEST = 10.0
+_LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON.value)
+
+_Rows = Float[np.ndarray, "rows nv"]
+_PerRow = Float[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True)
+class Events:
+    """Contacts and limits that a step may begin or end.
+
+    Attributes:
+        rows: J, the rate of each gap by joint velocity.
+        gaps: distance less margin at present (m or rad).
+        widths: half the travel about zero that is spanned (m or rad).
+        moves: P, the displacement that changes one gap by one and leaves the others.
+    """
+
+    rows: Float[np.ndarray, "events nv"]
+    gaps: Float[np.ndarray, " events"]
+    widths: Float[np.ndarray, " events"]
+    moves: Float[np.ndarray, "nv events"]
+
+
+class Surfaces:
+    """The gaps of a model's contacts and limits, also of those that do not act yet."""
+
+    def __init__(
+        self, model: mujoco.MjModel, levers: Float[np.ndarray, "nbody nv"], speeds: Float[np.ndarray, "states nv"]
+    ):
+        """Widen all margins by what states of these speeds travel in half a step, at most."""
+        self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
+        travel = 0.5 * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
+        least = _LEAST_WIDTH * _USUAL_WIDTH
+        self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
+        self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
+        self.model = far = copy.deepcopy(model)
+        far.geom_margin[:] += self.contact_reach / 2
+        far.pair_margin[:] += self.contact_reach
+        far.opt.o_margin += self.contact_reach
+        far.jnt_margin[:] += self.limit_reach
+        far.tendon_margin[:] += self.limit_reach
+        far.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+
+    def events(
+        self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
+    ) -> Events | None:
+        """Return what begins or ends within half a step of the position in `data`, moving as before and after the step."""
+        mujoco.mj_fwdPosition(self.model, data)
+        if not data.nefc:
+            return None
+        rows, gaps, least = self._gaps(data)
+        rates = np.maximum(np.abs(rows @ before), np.abs(rows @ after))
+        widths = np.maximum(0.5 * self.timestep * rates, least)
+        chosen = np.abs(gaps) < widths
+        return _moved_apart(rows / self.lengths, gaps, widths, chosen, self.lengths) if chosen.any() else None
+
+    def _gaps(self, data: mujoco.MjData) -> tuple[_Rows, _PerRow, _PerRow]:
+        """Return J, gap and least width of each contact, along its normal, and of each limit."""
+        model, jacobian = self.model, data.efc_J.reshape(-1, self.model.nv)
+        contact = data.contact
+        first = np.asarray(contact.efc_address)
+        acts = first >= 0
+        first, dim = first[acts], np.asarray(contact.dim)[acts]
+        is_pyramid = (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL) & (dim > 1)
+        # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
+        other = first + is_pyramid
+        limits = np.flatnonzero(np.isin(data.efc_type, _LIMITS))
+        is_joint = data.efc_type[limits] == _LIMITS[0]
+        widths = [np.asarray(contact.solimp).reshape(-1, 5)[acts, 2]]
+        for i, joint in zip(data.efc_id[limits].tolist(), is_joint.tolist(), strict=True):
+            widths.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i, 2:3])
+        margin = np.concatenate([np.full(len(first), self.contact_reach), np.full(len(limits), self.limit_reach)])
+        address = np.concatenate([first, limits])
+        width = np.concatenate(widths)
+        width = np.where((width > 0) & (width < _ENDLESS), width, _USUAL_WIDTH)
+        rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
+        return rows, data.efc_pos[address] - data.efc_margin[address] + margin, _LEAST_WIDTH * width
+
+
+def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
+    """Return how far each joint velocity moves the farthest point below it, for each body that it moves (m or 1)."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    is_below = np.eye(model.nbody, dtype=bool)  # whether a body, by column, is another or hangs below it
+    for body in range(1, model.nbody):
+        is_below[:, body] |= is_below[:, model.body_parentid[body]]
+    radius = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 0.0, model.geom_rbound)
+    levers = np.zeros((model.nbody, model.nv))
+    for dof, joint in enumerate(model.dof_jntid.tolist()):
+        kind, first, below = model.jnt_type[joint], model.jnt_dofadr[joint], is_below[model.dof_bodyid[dof]]
+        geoms = below[model.geom_bodyid]
+        far = np.linalg.norm(data.geom_xpos[geoms] - data.xanchor[joint], axis=1) + radius[geoms]
+        moves_along = kind == mujoco.mjtJoint.mjJNT_SLIDE or (kind == mujoco.mjtJoint.mjJNT_FREE and dof < first + 3)
+        levers[below, dof] = 1.0 if moves_along else max(far.max(initial=0.0), 1e-3 * model.stat.extent)
+    return levers
+
+
+def _moved_apart(
+    scaled: _Rows, gaps: _PerRow, widths: _PerRow, chosen: np.ndarray, lengths: np.ndarray
+) -> Events | None:
+    """Return the chosen rows as events, with displacements that change one gap each and carry no other row across zero."""
+    index = np.flatnonzero(chosen)
+    apart = _independent(scaled[index], np.zeros((0, scaled.shape[1])))
+    if not apart:
+        return None
+    # What cannot be told apart from another event goes with the one that it is most like.
+    unit = scaled[index[apart]] / np.linalg.norm(scaled[index[apart]], axis=1, keepdims=True)
+    group = np.argmax(np.abs(scaled[index] @ unit.T), axis=1)
+    group[apart] = np.arange(len(apart))
+    members = [index[group == i] for i in range(len(apart))]
+    rows = np.array([scaled[one].mean(axis=0) for one in members])
+    width = np.array([widths[one].max() for one in members])
+    gap = gaps[index[apart]]
+    held = np.zeros(0, int)
+    while True:
+        kept = held[_independent(scaled[held], rows)]
+        moves = np.linalg.pinv(np.concatenate([rows, scaled[kept]]))[:, : len(rows)]
+        reach = np.max(np.abs(scaled @ moves) * (width + np.abs(gap)), axis=1)
+        crossed = np.setdiff1d(np.flatnonzero((np.abs(gaps) < reach) & ~chosen), held)
+        if not crossed.size:
+            break
+        held = np.concatenate([held, crossed])
+    return Events(rows * lengths, gap, width, moves / lengths[:, None])
+
+
+def _independent(rows: _Rows, others: Float[np.ndarray, "others nv"]) -> list[int]:
+    """Return which rows can be changed alone, without moving anything far; the farthest from the others first."""
+    basis = np.linalg.qr(others.T)[0].T if len(others) else others
+    rest, found = rows - (rows @ basis.T) @ basis, []
+    for _ in range(len(rows)):
+        size = np.linalg.norm(rest, axis=1)
+        size[found] = 0.0
+        best = int(np.argmax(size))
+        if size[best] < 1 / _FARTHEST:
+            break
+        found.append(best)
+        direction = rest[best] / size[best]
+        rest = rest - np.outer(rest @ direction, direction)
+    return found
