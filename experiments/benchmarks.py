@@ -15,7 +15,7 @@ With several batches it also draws the steps per second of the forward rows agai
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
-`costs`: onset, event gradient and smoothing over the plain step and its gradient; all take turns, so that load meets all alike.
+`costs`: onset, slope at MuJoCo's motion and smoothing over the plain step and its gradient; all take turns, so that load meets all alike.
 
 `throughput`: ten stiffness values × 1000 samples × three estimators on `ball_wall`, once with the softness as an argument of one
 compiled program and once as ten programs, as ten runs of a script would make them. Nothing is read from a compilation cache.
@@ -70,14 +70,14 @@ _NUM_STEPS = 100
 _WAYS: dict[str, Callable[[], dict[str, Any]]] = {
     "": dict,
     "onset": lambda: {"onset": mg.Onset()},
-    "event": lambda: {"gradient": "event"},
+    "slope": lambda: {"gradient": "slope"},
     "smoothed": lambda: {"smoothing": mg.Smoothing(1e-3)},
     "smoothed backward": lambda: {"smoothing": mg.Smoothing(1e-3, mode="backward")},
 }
 _COSTS = {
     "rollout": ("", "onset", "smoothed"),
-    "value_and_grad": ("", "onset", "event", "smoothed", "smoothed backward"),
-    "jvp": ("", "onset", "event"),
+    "value_and_grad": ("", "onset", "slope", "smoothed", "smoothed backward"),
+    "jvp": ("", "onset", "slope"),
 }
 
 # Of `throughput`.
@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
     bench.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
     bench.set_defaults(run=_bench)
-    costs = commands.add_parser("costs", help="what onset, event gradient and smoothing cost")
+    costs = commands.add_parser("costs", help="what onset, slope at MuJoCo's motion and smoothing cost")
     costs.add_argument("--batch", type=int, default=256)
     costs.add_argument("--repeats", type=int, default=7)
     costs.add_argument("--only", default="", help="word that cases must hold, besides the plain ones")

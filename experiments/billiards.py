@@ -34,7 +34,7 @@ class MethodSettings(SettingsTable):
     """In legends and tables."""
     estimator: Literal["first_order", "zeroth_order", "alpha_order"] = "first_order"
     """Of `mjxgrad.estimators`."""
-    gradient: Literal["discrete", "event"] = "discrete"
+    gradient: Literal["discrete", "slope"] = "discrete"
     """Derivative of the steps."""
     start: Positive = 1.3
     """Constant force of the start, in N along each axis; below 1.43 the balls do not touch."""

@@ -16,7 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from pydantic import Field, model_validator
 
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT, at_time_step, motion
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, at_time_step, motion
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
@@ -215,7 +215,7 @@ def _sample(
 _STEPS = (0, 3, 6, 10, 20, np.inf)
 # Largest time step at which the tolerance is asked for, and one at which this one is enough (s).
 _FINE, _COARSE, _COARSE_TOLERANCE = 5e-4, 2e-3, 0.3
-_ORDER = (CONTINUOUS, EVENT, DISCRETE)
+_ORDER = (CONTINUOUS, SLOPE, DISCRETE)
 
 
 def answer(outcome: Outcome) -> str:
@@ -262,7 +262,7 @@ def findings(outcome: Outcome) -> list[str]:
             f"Where contact sets in with a jump of force the discrete gradient is {float(jumps.median()):.3g} times the slope "
             f"in the median and up to {float(jumps.max()):.3g} times."
         )
-    gentle = (abs(grid["mean"].sel(arm=EVENT) - discrete) / slope).where(grid.judged & (grid.impedance_first == 0))
+    gentle = (abs(grid["mean"].sel(arm=SLOPE) - discrete) / slope).where(grid.judged & (grid.impedance_first == 0))
     if gentle.notnull().any():
         sentences.append(
             "Where contact sets in gently there is nothing to correct, and both gradients differ by "
@@ -306,7 +306,7 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(("steps in contact", "judged", *heads), rows, caption)]
 
 
-_LOOKS = {DISCRETE: (FIRST, "o"), EVENT: (ZEROTH, "s"), CONTINUOUS: (ONSET, "D")}
+_LOOKS = {DISCRETE: (FIRST, "o"), SLOPE: (ZEROTH, "s"), CONTINUOUS: (ONSET, "D")}
 
 
 def drawings(outcome: Outcome) -> Drawings:

@@ -35,7 +35,7 @@ class Settings(RunSettings):
     contacts: Annotated[tuple[Literal["published", "default"], ...], Field(min_length=1)] = ("published", "default")
     """Of the cube with the floor: as DiffMJX published it, whose force begins continuously, or MuJoCo's default."""
     timesteps: Annotated[tuple[Positive, ...], Field(min_length=2)]
-    """For discrete and event gradients and contact that begins within the step, in s; each must divide a second."""
+    """For discrete and slopes at MuJoCo's motion and contact that begins within the step, in s; each must divide a second."""
     refined_timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)]
     """For short steps at events, in s."""
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
@@ -85,7 +85,7 @@ def cube_toss(contact: str = "published", *, timestep: float | None = None) -> C
 Derivative = Callable[[CubeToss, Array, Array], tuple[Array, Array, Array]]
 METHODS = {
     "discrete": "discrete",
-    "event": "event",
+    "slope": "slope",
     "continuous": "contact that begins within the step",
     "substeps": "event, short steps at events",
     "adaptive": "adaptive, differentiated",
@@ -93,7 +93,7 @@ METHODS = {
 }
 _SHORT = {
     "discrete": "plain step",
-    "event": "event gradient",
+    "slope": "slope at MuJoCo's motion",
     "continuous": "continuous onset",
     "substeps": "event substeps",
     "adaptive": "adaptive steps",
@@ -175,7 +175,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     for timestep in (*settings.timesteps, *settings.refined_timesteps):
         if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
             raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
-    jobs = [(name, h) for name in ("discrete", "event", "continuous") for h in settings.timesteps]
+    jobs = [(name, h) for name in ("discrete", "slope", "continuous") for h in settings.timesteps]
     jobs += [("substeps", h) for h in settings.refined_timesteps]
     jobs += [(name, tolerance) for name in ("adaptive", "quotient") for tolerance in settings.tolerances]
     courses = []
@@ -279,9 +279,9 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
 
 _DERIVATIVES: dict[str, Derivative] = {
     "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
-    "event": functools.partial(_by_steps, functools.partial(mg.step, gradient="event")),
+    "slope": functools.partial(_by_steps, functools.partial(mg.step, gradient="slope")),
     "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),
-    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, gradient="event")),
+    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, gradient="slope")),
     "adaptive": _adaptive,
     "quotient": _quotient,
 }
@@ -388,7 +388,7 @@ def _percent(share: float) -> str:
 
 _LOOKS = {
     "discrete": {"color": FIRST, "marker": "o"},
-    "event": {"color": ZEROTH, "marker": "s"},
+    "slope": {"color": ZEROTH, "marker": "s"},
     "continuous": {"color": ONSET, "marker": "D"},
     "substeps": {"color": DEFAULT, "marker": "^"},
     "adaptive": {"color": "#e69f00", "marker": "v"},
@@ -434,7 +434,7 @@ def bias(outcome: Outcome):
     figure, axes = subplots(1, len(outcome.courses), height=4.0, sharey=True)
     for axis, course in zip(axes[0], outcome.courses, strict=True):
         axis.axhline(0, color=MUTED, lw=0.8)
-        for method in ("discrete", "event", "continuous", "substeps"):
+        for method in ("discrete", "slope", "continuous", "substeps"):
             points = _finite(course, method)
             steps, errors = [point.setting for point in points], np.array([course.errors(point) for point in points])
             axis.plot(steps, errors, color=_LOOKS[method]["color"], lw=0.5, alpha=0.5)

@@ -25,11 +25,11 @@ from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
 
-Method = Literal["onset", "discrete", "event", "bundled", "alpha", "inverse_variance", "zeroth", "ppo"]
+Method = Literal["onset", "discrete", "slope", "bundled", "alpha", "inverse_variance", "zeroth", "ppo"]
 NAMES = {
     "onset": "first order",
     "discrete": "first order without an onset",
-    "event": "first order by event gradients",
+    "slope": "first order by the slope",
     "bundled": "first order, bundled",
     "alpha": "α-order",
     "inverse_variance": "weighed by variance",
@@ -313,7 +313,7 @@ def _every(settings: Settings) -> int:
 
 def _stepped(environment: Environment, method: Method) -> Environment:
     """Return the environment whose derivative is the method's."""
-    if method in ("discrete", "event"):
+    if method in ("discrete", "slope"):
         return environment.with_gradient(method)
     if method == "bundled":
         return dataclasses.replace(environment.with_onset(None), bundle=envs.Bundle())

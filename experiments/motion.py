@@ -12,8 +12,8 @@ from mjxgrad._mjx import mjx
 Read = Callable[[Float[Array, " nq"], Float[Array, " nv"]], Float[Array, "..."]]
 
 # What derivatives are compared: MuJoCo's motion with either of its own, and a motion whose contacts begin within the step.
-DISCRETE, EVENT, CONTINUOUS = "discrete", "event", "continuous onset"
-ARMS = {DISCRETE: ("discrete", None), EVENT: ("event", None), CONTINUOUS: ("discrete", mg.Onset())}
+DISCRETE, SLOPE, CONTINUOUS = "discrete", "slope", "continuous onset"
+ARMS = {DISCRETE: ("discrete", None), SLOPE: ("slope", None), CONTINUOUS: ("discrete", mg.Onset())}
 
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 

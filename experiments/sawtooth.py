@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT, Read, at_time_step, motion
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, at_time_step, motion
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
@@ -319,7 +319,7 @@ def verdict(outcome: Outcome) -> str:
         f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
         f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings ({within[DISCRETE]:.0%} without, "
-        f"{within[EVENT]:.0%} for the event gradient), and single derivatives scatter by {np.median(spread):.2f} of it."
+        f"{within[SLOPE]:.0%} for the slope at MuJoCo's motion), and single derivatives scatter by {np.median(spread):.2f} of it."
     )
 
 
@@ -375,10 +375,10 @@ def _name(course: xr.Dataset) -> str:
     return f"{course.title.values}, {1e3 * float(course.timestep):g} ms"
 
 
-_COLOURS = {DISCRETE: FIRST, EVENT: ZEROTH, CONTINUOUS: ONSET}
+_COLOURS = {DISCRETE: FIRST, SLOPE: ZEROTH, CONTINUOUS: ONSET}
 _NAMES = {
     DISCRETE: "MuJoCo's step; its derivative",
-    EVENT: "event gradient",
+    SLOPE: "slope at MuJoCo's motion",
     CONTINUOUS: "contact begins within the step",
 }
 

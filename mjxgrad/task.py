@@ -94,16 +94,17 @@ class InScene(eqx.Module):
 
     Attributes:
         scene: from `load_scene`.
-        gradient: of each step, "discrete" or "event", see `step`.
-        onset: lets contacts begin within the step, so that the cost has no jumps but real ones and its plain derivative is right
-            sample by sample; None is MuJoCo's motion. A leaf.
+        gradient: of each step, "slope" or "discrete", see `rollout`. The slope is that of the outcome, hit or miss apart.
+        onset: None for MuJoCo's own motion, or how contacts begin within the step: a continuous motion of its own. A leaf.
         smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
+        engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
     """
 
     scene: Scene
-    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
-    onset: Onset | None = eqx.field(default_factory=Onset, kw_only=True)
+    gradient: Gradient = eqx.field(static=True, default="slope", kw_only=True)
+    onset: Onset | None = eqx.field(default=None, kw_only=True)
     smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
+    engine: Engine | None = eqx.field(static=True, default=None, kw_only=True)
 
     def with_gradient(self: Same, gradient: Gradient) -> Same:
         """Return the same with MuJoCo's own motion and one of its derivatives."""
@@ -111,8 +112,12 @@ class InScene(eqx.Module):
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_onset(self: Same, onset: Onset | None) -> Same:
-        """Return the same with contacts that begin otherwise; None is MuJoCo's motion."""
-        return dataclasses.replace(self, gradient="discrete", onset=onset)
+        """Return the same with contacts that begin within the step; None is MuJoCo's motion and the slope."""
+        return dataclasses.replace(self, gradient="slope" if onset is None else "discrete", onset=onset)
+
+    def with_engine(self: Same, engine: Engine) -> Same:
+        """Return the same in MuJoCo's own motion, by MJX or by C MuJoCo."""
+        return dataclasses.replace(self, onset=None, engine=engine)
 
     def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
         """Return the same with contact averaged over noise."""
@@ -123,21 +128,7 @@ class InScene(eqx.Module):
         return dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
-class InEngine(InScene):
-    """What moves in a scene by controls alone, so that C MuJoCo may do it where no derivative is wanted.
-
-    Attributes:
-        engine: "mjx", or "mujoco" for costs alone; see `with_engine`.
-    """
-
-    engine: Engine = eqx.field(static=True, default="mjx", kw_only=True)
-
-    def with_engine(self: Same, engine: Engine) -> Same:
-        """Return the same in MuJoCo's own motion, by MJX or, for controls and without derivatives, by C MuJoCo."""
-        return dataclasses.replace(self.with_onset(None), engine=engine)
-
-
-class SceneTask(Task, InEngine):
+class SceneTask(Task, InScene):
     """A scene, where it starts, how long it runs, and what the trajectory costs.
 
     Attributes:

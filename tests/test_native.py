@@ -78,7 +78,7 @@ def test_zeroth_order_is_the_same_by_either_engine():
     ("settings", "message"),
     [
         ({"engine": "mujoco", "onset": mg.Onset()}, "in MuJoCo's own motion, got onset: leave it out"),
-        ({"engine": "mujoco", "gradient": "event"}, "got gradient='event'"),
+        ({"engine": "mujoco", "gradient": "slope"}, "got gradient='slope'"),
     ],
 )
 def test_what_it_cannot_do_is_refused(scene, settings, message):

@@ -26,7 +26,7 @@ from mjxgrad.tasks import scene_path
 # Which force jumps: under the shape's own contact, which begins with a jump of force but for lattices; with an impedance that
 # rises from zero; under the shape's own contact, smoothed; and C MuJoCo's.
 PLAIN, GENTLE, SMOOTHED, C = "plain", "gentle", "smoothed", "C MuJoCo"
-WAYS = ("first order, discrete", "first order, event", "zeroth order")
+WAYS = ("first order, discrete", "first order, slope", "zeroth order")
 
 
 @dataclass(frozen=True)
@@ -390,7 +390,7 @@ def slopes_at(
     shape = (sizes.num_repeats, sizes.num_strata)
     strata = norm.ppf((np.arange(sizes.num_strata) + rng.uniform(size=shape)) / sizes.num_strata)
     every = np.concatenate([noise, strata.ravel()])
-    found = in_threads(lambda name: simulate(place + stddev * every, name), ("discrete", "event"))
+    found = in_threads(lambda name: simulate(place + stddev * every, name), ("discrete", "slope"))
     (values, discrete), (_, event) = ([np.asarray(each) for each in both] for both in found)
     own, repeats = values[: sizes.num_samples], values[sizes.num_samples :].reshape(shape)
     # Less the mean of the others, which keeps it unbiased.

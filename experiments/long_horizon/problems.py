@@ -124,7 +124,7 @@ def _hopper(num_times: int) -> Problem:
         params=jnp.zeros(3),
         stddev=0.05,
         title="hopper",
-        gradients=("discrete", "event", "onset"),
+        gradients=("discrete", "slope", "onset"),
         num_times=num_times,
         steps_per_time=288 // num_times,
     )

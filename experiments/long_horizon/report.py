@@ -164,7 +164,7 @@ def _percent(share: float) -> str:
 
 COLOURS = {
     "first order, discrete": FIRST,
-    "first order, event": DEFAULT,
+    "first order, slope": DEFAULT,
     "first order, onset": ONSET,
     ZEROTH: BLUE,
 }

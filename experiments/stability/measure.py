@@ -42,7 +42,7 @@ from mjxgrad.diagnostics import soundness
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1
 """In the place of a value of `Derivative` that was not asked for."""
-_JUDGED = ("derivative", "derivative_by_parameters", "event_derivative")
+_JUDGED = ("derivative", "derivative_by_parameters", "slope_derivative")
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SceneOutcome:
     points: Points  # of its grid
     # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that of the
     # discrete gradient along a change of the start (`derivative`) and of the model's parameters
-    # (`derivative_by_parameters`), and that of the event gradient (`event_derivative`); whether numbers that are not finite
+    # (`derivative_by_parameters`), and that of the slope at MuJoCo's motion (`slope_derivative`); whether numbers that are not finite
     # left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
     # (`untold`), whether the gradient is not finite or explodes where `Trajectory.diverged` is false
     # (`gradient_unflagged_by_rollout`), and `soundness` finds nothing wrong either (`missed`); difference of the final
@@ -116,10 +116,10 @@ _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
 """Fields of the model that are changed in proportion, to judge the derivative by them."""
 _PARAMETER_WIDTHS = (1e-6, 2e-7)
 _TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
-_EVENT_TOLERANCE = 0.1
+_SLOPE_TOLERANCE = 0.1
 # What C MuJoCo is not asked for.
 _NOTHING = {
-    "derivative_by_parameters": NOT_ASKED, "event_derivative": NOT_ASKED, "silent": False, "untold": False,
+    "derivative_by_parameters": NOT_ASKED, "slope_derivative": NOT_ASKED, "silent": False, "untold": False,
     "gradient_unflagged_by_rollout": False, "missed": False, "apart_from_c": 0.0,
 }  # fmt: skip
 
@@ -184,7 +184,7 @@ class _Runs:
     """What mjxgrad did on all points of a scene in one precision."""
 
     discrete: Run  # motion and discrete gradient
-    event: Run | None  # the same with the event gradient; None where it was not asked for
+    event: Run | None  # the same with the slope at MuJoCo's motion; None where it was not asked for
     differences: np.ndarray | None  # of the outcome (start and parameters, widths, points), in float64
 
 
@@ -245,7 +245,7 @@ def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_
         onset = mg.Onset() if settings.onset else None
         program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
         has_event = not settings.onset and (size.event is None or scene.name in size.event)
-        event = Program(scene, settings.num_steps, "event", size.chunk).run(*arrays) if has_event else None
+        event = Program(scene, settings.num_steps, "slope", size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
         truth = _differences(case, program) if precision == "float64" else None
         return _Runs(program.run(*arrays), event, truth)
@@ -352,7 +352,7 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
         "motion": motion,
         "derivative": kinds[0],
         "derivative_by_parameters": kinds[1],
-        "event_derivative": np.array(NOT_ASKED) if event is None else _judge_event(record, event, bound),
+        "slope_derivative": np.array(NOT_ASKED) if event is None else _judge_event(record, event, bound),
         "silent": run.is_silent if event is None else run.is_silent | event.is_silent,
         "untold": (motion == Motion.UNSOLVED) & ~run.is_unsolved,
         "gradient_unflagged_by_rollout": is_wild & record.is_sound,
@@ -365,5 +365,5 @@ def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> 
 def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
     """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
     truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
-    slope, bounds = run.gradient[1][:, 0], {"largest": bound, "tolerance": _EVENT_TOLERANCE}
+    slope, bounds = run.gradient[1][:, 0], {"largest": bound, "tolerance": _SLOPE_TOLERANCE}
     return classify_derivative(slope, run.is_gradient_finite, record.is_sound, truth, 0 * truth, **bounds)

@@ -27,7 +27,7 @@ _SAME_MOTION = 1e-3
 """Difference of final positions, over what a body flies in the rollout, up to which two motions are one."""
 _LITTLE_FRICTION = 0.03
 """Below it the edges of a pyramid weigh more than a thousand times what its normal would."""
-_LINES = {"derivative": "by the start", "derivative_by_parameters": "by parameters", "event_derivative": "event"}
+_LINES = {"derivative": "by the start", "derivative_by_parameters": "by parameters", "slope_derivative": "slope"}
 
 
 def answer(outcome: Outcome) -> str:
@@ -141,7 +141,7 @@ def tables(outcome: Outcome) -> list[Table]:
             ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),
             derivatives,
             "Points by what the derivative is. C MuJoCo’s is a central difference; it is unjudged where two widths disagree. "
-            "Those of mjxgrad are judged by central differences of mjxgrad in float64, the event gradient by the restitution.",
+            "Those of mjxgrad are judged by central differences of mjxgrad in float64, the slope at MuJoCo's motion by the restitution.",
         ),
         Table(
             ("scene", "precision", "reason", "points", "for instance"),

@@ -17,7 +17,7 @@ class Sizes(SettingsTable):
     scenes: tuple[str, ...] | None = None
     """By name; None for all."""
     event: tuple[str, ...] | None = None
-    """Scenes whose event gradient is looked at, too; None for all."""
+    """Scenes whose slope at MuJoCo's motion is looked at, too; None for all."""
     chunk: int
     """Rollouts that go through a program at once."""
 

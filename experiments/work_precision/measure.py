@@ -64,7 +64,7 @@ _REACH = 0.25
 ESTIMATORS: dict[str, tuple[str, str | None]] = {
     "zeroth order": ("zeroth_order", None),
     "first order, discrete": ("first_order", "discrete"),
-    "first order, event": ("first_order", "event"),
+    "first order, slope": ("first_order", "slope"),
     "first order, onset": ("first_order", "onset"),
     "α-order, onset": ("alpha_order", "onset"),
 }
@@ -99,7 +99,7 @@ def variants(one: Case, settings: Settings, has_asides: bool) -> list[Variant]:
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     if model.npair or touching.any():
         found = [replace(plain, onset=True, derivative="discrete"), *found, replace(plain, onset=True)]
-        found += [replace(plain, derivative="event")] if everything else []
+        found += [replace(plain, derivative="slope")] if everything else []
     has_own_rule = has_own_implicit(one)
     for library in (MJX, MG):
         own = replace(plain, library=library)

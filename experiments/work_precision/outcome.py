@@ -33,7 +33,7 @@ class Variant:
     cone: Cone = "pyramidal"
     precision: Precision = "float64"
     batch: int = 1
-    derivative: Literal["discrete", "event"] | None = None
+    derivative: Literal["discrete", "slope"] | None = None
     onset: bool = False
     iterations: int = NUM_ITERATIONS
 

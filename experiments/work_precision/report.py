@@ -271,7 +271,7 @@ _COLOURS = {MG: ZEROTH, ONSET: "#cc79a7", MJX: FIRST, C: "#009e73"}
 _ESTIMATORS = {
     "zeroth order": ZEROTH,
     "first order, discrete": FIRST,
-    "first order, event": "#e69f00",
+    "first order, slope": "#e69f00",
     "first order, onset": "#009e73",
     "α-order, onset": DEFAULT,
 }

@@ -123,7 +123,7 @@ def derivative_against_slope(
     interval: tuple[float, float],
     *,
     num_phases: int = 64,
-    gradients: Sequence[str] = ("discrete", "event"),
+    gradients: Sequence[str] = ("discrete", "slope"),
 ) -> SlopeComparison:
     """Compare derivatives of a simulated outcome with the slope of the outcome itself.
 
@@ -173,7 +173,7 @@ def compare_to_slope(
     parameters: ArrayLike,
     outcomes: ArrayLike,
     derivatives: Sequence[ArrayLike],
-    gradients: Sequence[str] = ("discrete", "event"),
+    gradients: Sequence[str] = ("discrete", "slope"),
 ) -> SlopeComparison:
     """Compare derivatives with the slope, from what was simulated elsewhere.
 

@@ -38,7 +38,7 @@ from mjxgrad.scene import Scene
 LEAST_FRICTION = 0.01
 """Of pyramids, in single precision."""
 STEPS_IN_CONTACT = 6.0
-"""Time steps below which a bounce is too short for the event gradient, by the experiment `bounce`."""
+"""Time steps below which a bounce is too short for the slope at MuJoCo's motion, by the experiment `bounce`."""
 _WIDTH = 118  # characters; what a laptop's terminal shows
 _COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
 _LEGEND = (
@@ -323,7 +323,7 @@ def _short(spring: Spring) -> str | None:
     if spring.kind == "equality" or spring.num_steps >= STEPS_IN_CONTACT or spring.load >= 1:
         return None
     return (
-        f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the event gradient, which needs about "
+        f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the slope at MuJoCo's motion, which needs about "
         f"{STEPS_IN_CONTACT:g}; use a time step below {format_number(spring.timestep * spring.num_steps / STEPS_IN_CONTACT)} s, "
         "or a softer contact"
     )

@@ -100,17 +100,12 @@ class Smoothing(eqx.Module):
         """The kernel itself, in units of the length."""
         return KERNELS[self.kernel]
 
-    def check(self, gradient: str) -> None:
+    def check(self, _: str) -> None:
         """Refuse what a single step cannot take."""
         for name in ("length", "limit_length"):
             value = getattr(self, name)
             if value is not None and value.ndim:
                 raise ValueError(f"{name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap")
-        if gradient == "slope":
-            raise ValueError(
-                "gradient must be 'discrete' with smoothing, got 'slope': the derivative of a smoothed contact already knows "
-                "that its time moves; smooth limits by limit_length"
-            )
 
 
 def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:

@@ -46,6 +46,8 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
             "model and data must be of MJX's JAX implementation, got "
             f"{model.impl} and {data.impl}: create them with impl='jax'"
         )
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # which MJX has not, and by which scenes for C MuJoCo are known
+        raise ValueError("this model is of a scene that C MuJoCo steps, as scene.unsupported says: use mg.rollout")
     with jax.default_matmul_precision("highest"):
         yield
 

@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
 from mjxgrad._rollout import State, Trajectory, initial_state, rollout
+from mjxgrad.dynamics import Gradient
 from mjxgrad.envs.bundle import Bundle
 from mjxgrad.scene import Scene
-from mjxgrad.task import InEngine, optional_pytree
+from mjxgrad.task import InScene, optional_pytree
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """From a key and a scene to one with other friction, masses, gains, by `scene.with_model`."""
@@ -56,12 +57,13 @@ class EnvState(eqx.Module):
         return self.terminated | self.truncated
 
 
-class Environment(InEngine):
+class Environment(InScene):
     """A scene with a reward; a subclass says what is seen, what counts, where it starts and when it is over.
 
     An action has one number per actuator, from −1 to 1, the ends of its `ctrlrange`; beyond them nothing changes. It holds for
-    `frame_skip` time steps. Contacts begin within the step (`mg.Onset()`), so that rewards have no jumps but real ones;
-    `with_onset(None)` is MuJoCo's motion, `with_engine("mujoco")` C MuJoCo's.
+    `frame_skip` time steps. The motion is MuJoCo's own, in which policies are judged, with the derivative of its steps: ants and
+    hoppers learn most by it. `with_gradient("slope")` takes that of the outcome, `with_onset(mg.Onset())` a continuous motion,
+    `with_engine("mujoco")` C MuJoCo.
 
     Attributes:
         frame_skip: time steps per action.
@@ -70,6 +72,7 @@ class Environment(InEngine):
         randomisation: from a key and the scene to the scene of one copy; see `randomised`.
     """
 
+    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
     bundle: Bundle | None = eqx.field(default=None, kw_only=True)

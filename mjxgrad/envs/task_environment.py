@@ -90,13 +90,11 @@ def from_task(task: SceneTask) -> TaskEnvironment:
         task: without `observe`; a policy of its own plays no part.
 
     Raises:
-        ValueError: if its cost needs observations, or its engine has no derivatives.
+        ValueError: if its cost needs observations.
     """
     if task.observe is not None:
         raise ValueError(f"task must have a cost of positions, velocities and controls, got observe={task.observe!r}")
-    if task.engine != "mjx":
-        raise ValueError(f'task must be stepped by "mjx", got {task.engine!r}: leave out with_engine')
-    settings = {"gradient": task.gradient, "onset": task.onset, "smoothing": task.smoothing}
+    settings = {"gradient": task.gradient, "onset": task.onset, "smoothing": task.smoothing, "engine": task.engine}
     return TaskEnvironment(task.scene, task=task, episode_length=task.horizon, **settings)
 
 

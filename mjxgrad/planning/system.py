@@ -113,13 +113,13 @@ class SceneSystem(System):
     Attributes:
         scene: from `load_scene`.
         num_substeps: time steps per step of the system.
-        gradient: which derivative of contact and limit events, "discrete" or "event"; see `mjxgrad.step`.
+        gradient: which derivative of contact and limit events, "discrete" or "slope"; see `mjxgrad.step`.
         smoothing: of contacts and limits in the solver, or None; see `mjxgrad.step`.
     """
 
     scene: Scene
     num_substeps: int = eqx.field(static=True, default=1)
-    gradient: Literal["discrete", "event"] = eqx.field(static=True, default="discrete")
+    gradient: Literal["discrete", "slope"] = eqx.field(static=True, default="discrete")
     smoothing: Smoothing | None = None
 
     def __check_init__(self):

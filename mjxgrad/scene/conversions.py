@@ -4,6 +4,7 @@ Each rule changes a copy of the C model in place and says what it did. Where the
 kept exactly the conversion says so, and loading the scene warns.
 """
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
 _SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
+_SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE.value
 _IMPEDANCES = (
     "geom_solimp",
     "pair_solimp",
@@ -251,6 +253,25 @@ def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
         word = "delayed " if delayed[i] else ""
         given = word + kind.name.removeprefix("mjSENS_").lower()
         yield Conversion(name, given, "reads 0", "MJX cannot compute it", exact=False)
+
+
+def kinematics_alone(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return what MJX can hold of a model that C MuJoCo steps: its tree and its numbers, without anything that acts."""
+    bare = copy.deepcopy(model)
+    bare.opt.solver, bare.opt.integrator = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtIntegrator.mjINT_EULER
+    bare.opt.cone, bare.opt.enableflags, bare.opt.noslip_iterations = mujoco.mjtCone.mjCONE_PYRAMIDAL, 0, 0
+    bare.geom_contype[:] = bare.geom_conaffinity[:] = 0
+    bare.geom_type[np.concatenate([bare.pair_geom1, bare.pair_geom2])] = _SPHERE
+    for of, enumeration, used in (
+        ("actuator_trntype", mjx.TrnType, mujoco.mjtTrn.mjTRN_JOINT),
+        ("actuator_dyntype", mjx.DynType, mujoco.mjtDyn.mjDYN_NONE),
+        ("actuator_gaintype", mjx.GainType, mujoco.mjtGain.mjGAIN_FIXED),
+        ("actuator_biastype", mjx.BiasType, mujoco.mjtBias.mjBIAS_NONE),
+    ):
+        kinds = getattr(bare, of)
+        kinds[~np.isin(kinds, [int(kind) for kind in enumeration])] = used
+    list(drop_sensors(bare))
+    return bare
 
 
 def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:

@@ -8,7 +8,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 import equinox as eqx
 import jax
@@ -19,7 +19,14 @@ import numpy as np
 from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.scene.conversions import AFTER_REFUSALS, BEFORE_REFUSALS, Conversion, drop_sensors, searched_contacts
+from mjxgrad.scene.conversions import (
+    AFTER_REFUSALS,
+    BEFORE_REFUSALS,
+    Conversion,
+    drop_sensors,
+    kinematics_alone,
+    searched_contacts,
+)
 from mjxgrad.scene.omissions import LeaveOut, omit, omit_pairs, switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
@@ -40,8 +47,11 @@ def load_scene(
     timestep: float | None = None,
     max_contacts: int | None = None,
     distance_fields: bool = False,
+    engine: Literal["mjx", "mujoco"] | None = None,
 ) -> Scene:
-    """Load a scene, convert or refuse what MJX lacks and leave out what the scene does not need.
+    """Load a scene, convert what MJX lacks and leave out what the scene does not need.
+
+    What MJX cannot step C MuJoCo does, with derivatives, too: `scene.engine` says which, `scene.unsupported` why.
 
     Arrays are float64 if `jax_enable_x64` is set and float32 otherwise. In float32 a solver
     tolerance below 1e-6 is raised to it: the scaled improvement and gradient that it is compared
@@ -59,7 +69,8 @@ def load_scene(
             some step, `Trajectory.crowded` says so.
         distance_fields: take contacts of cylinders and ellipsoids with each other and capsules, and of ellipsoids with
             spheres, on your own responsibility. MJX searches them on distance fields: the motion may be good, the gradient
-            is often not, or NaN.
+            is often not, or NaN. Else C MuJoCo steps such a scene.
+        engine: "mjx" refuses what MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None is MJX where it can.
 
     Returns:
         The scene. `print(scene.summary())` shows what it has.
@@ -70,8 +81,8 @@ def load_scene(
         TypeError: if the source is none of these.
         ValueError: if `timestep` or `max_contacts` is not positive, `leave_out` does not fit the scene or is given beside
             `keep_everything`, or as `Softness.apply`.
-        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, so many geoms can touch that
-            loading would take minutes, or MJX cannot simulate it; all unsupported features are named at once.
+        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or, where MJX is asked for, so many geoms can touch
+            that loading would take minutes, or MJX cannot simulate it; all unsupported features are named at once.
     """
     if keep_everything and leave_out is not None:
         raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
@@ -85,7 +96,6 @@ def load_scene(
         raise SceneError(
             f"{name} must have names in UTF-8, got {mj_model.names[error.start :][:1]!r}; save it as UTF-8"
         ) from None
-    _refuse_many_pairs(mj_model, name, leave_out or LeaveOut())
     if timestep is not None:
         if not (math.isfinite(timestep) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
@@ -96,20 +106,33 @@ def load_scene(
     if mj_model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
-    conversions = _make_simulable(mj_model, name, leave_out or LeaveOut(), distance_fields)
-    stepped = copy.deepcopy(mj_model)
-    conversions += list(drop_sensors(stepped))
+    unsupported, wish = "", leave_out or LeaveOut()
+    original = copy.deepcopy(mj_model)
+    try:
+        if engine == "mujoco":
+            raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
+        _refuse_many_pairs(mj_model, name, wish)
+        conversions = _make_simulable(mj_model, name, wish, distance_fields)
+        stepped = copy.deepcopy(mj_model)
+        conversions += list(drop_sensors(stepped))
+    except SceneError as error:
+        if engine == "mjx" or original.nflex:
+            raise
+        mj_model, stepped, conversions, unsupported = original, kinematics_alone(original), [], str(error)
     omitted, omissions = omit(stepped, leave_out) if leave_out is not None else ((), ())
-    if not keep_everything:
+    if not keep_everything and not unsupported:
         omissions += switch_off(stepped)
         conversions += _fit_solver(stepped)
-    pairs = contact_pairs(stepped)
+    pairs = contact_pairs(stepped) if not unsupported or count_pairs(mj_model) > MOST_PAIRS else contact_pairs(mj_model)
     with jax.ensure_compile_time_eval():  # also where a function that is traced loads its own scene
         model, data = _put(stepped, name, max_contacts)
+    if unsupported:
+        model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name)
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name, unsupported)
     messages = [f"MuJoCo says: {text}" for text in told]
+    messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
@@ -215,10 +238,10 @@ def _make_simulable(
         omit_pairs(lean, leave_out)
     refused = refusal_messages(lean, distance_fields=distance_fields)
     if len(refused) == 1:
-        raise SceneError(f"{name} cannot be simulated: {refused[0]}")
+        raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
     if refused:
         listed = "\n".join(f"  - {message}" for message in refused)
-        raise SceneError(f"{name} cannot be simulated for {len(refused)} reasons:\n{listed}")
+        raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
     return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model)), *searched_contacts(lean)]
 
 
@@ -253,7 +276,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
             f"{name} must hold numbers up to {largest} in single precision, got a larger one; set jax_enable_x64 for those"
         ) from None
     except NotImplementedError as error:
-        raise SceneError(f"{name} cannot be simulated: MJX says: {error}") from error
+        raise SceneError(f"{name} cannot be stepped by MJX: MJX says: {error}") from error
 
 
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:

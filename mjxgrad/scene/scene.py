@@ -188,6 +188,7 @@ class Scene(eqx.Module):
         converted = [(c.what, f"{c.given} → {c.used}", c.reason + differs * (not c.exact)) for c in self.conversions]
         sections = [
             _heading(self),
+            f"Stepped by C MuJoCo: {self.unsupported}" if self.unsupported else "",
             _contacts(self),
             _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),

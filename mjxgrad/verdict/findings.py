@@ -26,7 +26,7 @@ _CLOSE = 0.05  # typical error of a derivative that is the slope
 # Of an onset's mean derivative: from which error on another kind is taken, and how many times nearer that must be.
 _WILD, _FARTHER = 0.5, 4.0
 
-_WORDS = {"discrete": "MuJoCo's step", "event": 'gradient="event"', "onset": "onset=mg.Onset()"}
+_WORDS = {"discrete": "MuJoCo's step", "slope": 'gradient="slope"', "onset": "onset=mg.Onset()"}
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _times(advantage: float) -> str:
 def slopes(measured: Measured) -> tuple[Slope, ...]:
     """Count over all lines, times and outcomes how often each derivative is not the slope, where there is a clear one."""
     found = []
-    for kind in ("discrete", "event", "onset"):
+    for kind in ("discrete", "slope", "onset"):
         off, errors = [], []
         for line in measured.lines:
             comparison = line.smooth if kind == "onset" else line.plain
@@ -228,7 +228,7 @@ def recommend(
     discrete, event, onset = slopes(measured)
     is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
     needs_none = not touches or is_exact
-    # Where contacts chatter an event gradient has no bound, so it must be better beyond chance, of two counts.
+    # Where contacts chatter an slope at MuJoCo's motion has no bound, so it must be better beyond chance, of two counts.
     is_event_better = event.num_readings > 0 and onset.num_off - event.num_off > 2 * math.sqrt(
         onset.num_off + event.num_off
     )
@@ -254,7 +254,7 @@ def recommend(
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
         onset=best.kind == "onset",
-        gradient="event" if best.kind == "event" else "discrete",
+        gradient="slope" if best.kind == "slope" else "discrete",
         estimator="alpha_order" if has_jumps or is_limited or is_unknown else "first_order",
         stddev=stddev,
         horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),

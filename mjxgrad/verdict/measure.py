@@ -241,7 +241,7 @@ class _Probe:
             return self.programs.move(kind, states, varied, direction, self.lengths)
 
         places = phases((-1.0, 1.0), self.programs.size)
-        kinds = [kind for kind in ("discrete", "event") if kind in self.programs.kinds]
+        kinds = [kind for kind in ("discrete", "slope") if kind in self.programs.kinds]
         onset, *others = (along(kind, places) for kind in ("onset", *kinds))
         spreads = np.nanstd(onset.outcomes, axis=0)
         is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)

@@ -29,13 +29,13 @@ from mjxgrad.task import finite_cost
 
 CHUNK = 10
 """Steps of one call."""
-KINDS = ("onset", "discrete", "event")
+KINDS = ("onset", "discrete", "slope")
 """What may be asked of a step: contacts that begin within it, and MuJoCo's motion with two derivatives; the dearest first."""
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's code of the first level: half the time to compile (hopper, jax 0.10.2: 12 s in place of 24) and as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _WORKERS = 2
-_EVENT = 1.5  # times as long as the kind compiled before it takes the event gradient, at most
+_SLOPE = 1.5  # times as long as the kind compiled before it takes the slope at MuJoCo's motion, at most
 _TINY = 1e-5  # m, rad: of a central difference through the exponential map of orientations, exact to its square
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
@@ -119,9 +119,9 @@ class Programs:
         pool.shutdown(wait=False)
 
     def _compile(self, kind: str, lowered: Any) -> Callable | None:
-        """Compile a kind; the event gradient only where it will be ready in time, going by the one that was before it."""
+        """Compile a kind; the slope at MuJoCo's motion only where it will be ready in time, going by the one that was before it."""
         started = time.perf_counter()
-        if kind == "event" and started + _EVENT * self._compile_seconds > self.deadline:
+        if kind == "slope" and started + _SLOPE * self._compile_seconds > self.deadline:
             return None
         program = lowered.compile(compiler_options=_options())
         self._compile_seconds = time.perf_counter() - started

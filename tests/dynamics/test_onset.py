@@ -432,7 +432,7 @@ def test_an_impedance_without_a_width_begins_where_mujocos_does():
 
 @pytest.mark.slow
 def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
-    """The same push at 4 ms with the event gradient, which chatter multiplies; a free flight grows by its duration at most."""
+    """The same push at 4 ms with the slope at MuJoCo's motion, which chatter multiplies; a free flight grows by its duration at most."""
     scene = mg.load_scene(_PUSHED.format(timestep=1e-3, kind="sphere", turning=""))
     controls = jnp.linspace(0.7, 0.98, 32)[:, None, None] * jnp.ones((240, 1))
 
@@ -440,7 +440,7 @@ def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
         start = mg.initial_state(scene)
         return mg.rollout(scene, start, force, measure_growth=True, **how)
 
-    event = jax.jit(jax.vmap(lambda force: pushed(force, gradient="event")))(controls)
+    event = jax.jit(jax.vmap(lambda force: pushed(force, gradient="slope")))(controls)
     assert event.explodes.any()
     free = mg.load_scene(
         _PUSHED.replace('type="plane"', 'type="plane" pos="0 0 -9"').format(timestep=1e-3, kind="sphere", turning="")
@@ -476,7 +476,7 @@ def test_a_width_without_meaning_is_refused(width):
 def test_the_event_gradient_is_refused_beside_an_onset():
     scene = _scene(_BALL.format(cone="pyramidal", condim=3))
     with pytest.raises(ValueError, match="gradient must be 'discrete' with an onset"):
-        mg.step(scene.model, scene.data, gradient="event", onset=mg.Onset())
+        mg.step(scene.model, scene.data, gradient="slope", onset=mg.Onset())
     with pytest.raises(ValueError, match=r"sweep under jax\.vmap"):
         mg.step(scene.model, scene.data, onset=mg.Onset(jnp.ones(3)))
 

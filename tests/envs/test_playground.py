@@ -53,9 +53,9 @@ def test_the_step_is_ours_inside_and_theirs_outside(falling, monkeypatch):
     thing, data = falling
     theirs, counted = mujoco.mjx.step, []
     monkeypatch.setattr(playground, "step", lambda model, data, **settings: counted.append(settings) or data)
-    right = playground.stepped_right(thing, gradient="event")
+    right = playground.stepped_right(thing, gradient="slope")
     right.step(data)
-    assert counted == [{"gradient": "event", "onset": None, "smoothing": None}]
+    assert counted == [{"gradient": "slope", "onset": None, "smoothing": None}]
     assert mujoco.mjx.step is theirs
 
 
@@ -81,7 +81,7 @@ def test_other_threads_step_as_ever(falling, monkeypatch):
 
 def test_a_gradient_that_does_not_go_with_an_onset_is_refused_at_once(falling):
     with pytest.raises(ValueError, match="onset"):
-        playground.stepped_right(falling[0], gradient="event", onset=Onset())
+        playground.stepped_right(falling[0], gradient="slope", onset=Onset())
 
 
 @pytest.fixture(scope="module")

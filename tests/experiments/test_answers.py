@@ -106,13 +106,13 @@ def planned(**moved):
 
 
 def toss(**seconds):
-    """By contact, the seconds of an event gradient that is right, or of one that is not."""
+    """By contact, the seconds of an slope at MuJoCo's motion that is right, or of one that is not."""
     from experiments.cube_toss import Course, Point
 
     reference = np.array([0.5, 0.5])
     return SimpleNamespace(
         courses=[
-            Course(contact, reference, (Point("event", 1e-3, reference * (1 if s > 0 else 2), s, 1.0, 10.0, False),))
+            Course(contact, reference, (Point("slope", 1e-3, reference * (1 if s > 0 else 2), s, 1.0, 10.0, False),))
             for contact, s in seconds.items()
         ]
     )
@@ -295,11 +295,11 @@ CASES = [
         long(("double pendulum", np.inf, 0.1), ("hopper", 0.1, 0.6)),
         "Better beyond 2 s (double pendulum), nowhere (hopper); windows help the double pendulum.",
     ),
-    ("cube_toss", toss(default=-1.0), "None comes within 2%; the nearest, event gradient, is 100% off."),
+    ("cube_toss", toss(default=-1.0), "None comes within 2%; the nearest, slope at MuJoCo's motion, is 100% off."),
     (
         "cube_toss",
         toss(published=0.052, default=-1.0),
-        "Continuous force: 0.052 s, event gradient; MuJoCo's default: none within 2%.",
+        "Continuous force: 0.052 s, slope at MuJoCo's motion; MuJoCo's default: none within 2%.",
     ),
     (
         "real_tosses",
@@ -308,12 +308,12 @@ CASES = [
     ),
     (
         "bounce",
-        bounced(0, **{"continuous onset": 0, "event": 0, "discrete": 0}),
+        bounced(0, **{"continuous onset": 0, "slope": 0, "discrete": 0}),
         "At no contact is the slope known well enough: take more phases.",
     ),
     (
         "bounce",
-        bounced(4, **{"continuous onset": 4, "event": 3, "discrete": 1}),
+        bounced(4, **{"continuous onset": 4, "slope": 3, "discrete": 1}),
         "Right at 4 (continuous onset), 3 (event) and 1 (discrete) of 4 settings.",
     ),
     (
@@ -373,7 +373,7 @@ CASES = [
     (
         "learning",
         taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3], late=("discrete",)),
-        "Soonest: first order by event gradients; worth most: first order without an onset, 9.00 (unproven).",
+        "Soonest: first order by the slope; worth most: first order without an onset, 9.00 (unproven).",
     ),
     (
         "learning",

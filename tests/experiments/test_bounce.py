@@ -9,7 +9,7 @@ import pytest
 from experiments.__main__ import main
 from experiments.bounce import Outcome, Settings, drawings, findings, grid_of, tables, verdict
 from experiments.config import ConfigurationError, load_runs
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, EVENT
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE
 from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases
 
@@ -57,14 +57,14 @@ def outcome():
     def compared(derivative, name):
         return compare_to_slope(starts, heights, [np.full_like(heights, derivative)], (name,))
 
-    found = [compared({DISCRETE: 5.0, EVENT: 2.2, CONTINUOUS: 2.0}[arm], arm) for arm in ARMS]
+    found = [compared({DISCRETE: 5.0, SLOPE: 2.2, CONTINUOUS: 2.0}[arm], arm) for arm in ARMS]
     # Less the restitution, in closed form under the first impedance alone, and how long the contact lasts (s).
     truths = np.array([[2.0, 2.0, 0.04], [2.0, np.nan, 0.04]]) * np.ones((2, 1, 1, 1))
     return Outcome(settings, grid_of(settings, found, compared(2.1, "wide"), truths))
 
 
 def test_the_verdict_counts_where_the_derivatives_hold(outcome):
-    # Two damping ratios and two impedances at each time step; only the onset is within 5 %, the event gradient within 30 %.
+    # Two damping ratios and two impedances at each time step; only the onset is within 5 %, the slope at MuJoCo's motion within 30 %.
     assert verdict(outcome) == (
         "Up to 0.5 ms the mean derivative is within 5% of the slope at 4 (continuous onset), 0 (event) and 0 (discrete) of 4 "
         "contacts and time steps. At 2 ms it is within 30% at 4 and 4 (event) of 4."

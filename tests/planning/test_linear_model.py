@@ -214,7 +214,7 @@ SPRING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
   <actuator><motor joint="x"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("gradient", ["discrete", pytest.param("event", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gradient", ["discrete", pytest.param("slope", marks=pytest.mark.slow)])
 def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
     """One step: v ← (m v + h (u − k q)) / (m + h c), q ← q + h v; here two of them."""
     h, m, k, c = 0.01, 0.5, 3.0, 0.4
@@ -319,9 +319,9 @@ def test_through_a_bounce_mean_jacobians_agree_with_least_squares_only_with_even
         return estimate(SceneSystem(scene, 120, gradient=gradient), at, CONTROL, key, **noise)
 
     truth = model(zeroth_order, "discrete")
-    right, wrong = model(first_order, "event"), model(first_order, "discrete")
+    right, wrong = model(first_order, "slope"), model(first_order, "discrete")
     error = np.hypot(truth.A_error, right.A_error)
-    # Beyond sampling, the event gradient is right up to a few per cent at this time step.
+    # Beyond sampling, the slope at MuJoCo's motion is right up to a few per cent at this time step.
     np.testing.assert_array_less(np.abs(right.A[0] - truth.A[0]), 4 * error[0] + 0.05 * np.abs(truth.A[0]))
     assert abs(wrong.A[0, 0] - truth.A[0, 0]) > 10 * abs(right.A[0, 0] - truth.A[0, 0])
 

@@ -49,7 +49,7 @@ def test_the_drop_costs_what_c_mujoco_says(task):
 
 
 @pytest.mark.slow
-def test_after_the_landing_only_the_event_derivative_is_the_slope():
+def test_after_the_landing_only_the_slope_derivative_is_the_slope():
     """With respect to the angle that the foot holds, moved so far that the landing passes through many time steps.
 
     Under a window w that vanishes at both ends the mean slope of the cost c, the teeth of its time steps included, is
@@ -66,7 +66,7 @@ def test_after_the_landing_only_the_event_derivative_is_the_slope():
     def along(gradient):
         return jax.jit(jax.vmap(jax.value_and_grad(lambda shift: cost(shift, gradient))))(shifts)
 
-    (costs, event), (_, discrete) = along("event"), along("discrete")
+    (costs, event), (_, discrete) = along("slope"), along("discrete")
     angle = np.pi * np.asarray(shifts) / 0.1
     window, change = 1 + np.cos(angle), -np.pi / 0.1 * np.sin(angle)
     slope = -float(np.mean(change * costs) / np.mean(window))

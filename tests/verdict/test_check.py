@@ -170,11 +170,11 @@ def test_questions_that_there_is_no_time_for_are_left_out_by_name(kinds):
     measured = measure(scene, motions, programs, rng, from_start=False, seconds=1, log=lambda _: None)
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
     (told,) = left_out_findings(kinds, measured, 60)
-    for words in ("budget of 60 s", 'gradient="event"', "a line along the controls", "noise of 0.3", "contacts at"):
+    for words in ("budget of 60 s", 'gradient="slope"', "a line along the controls", "noise of 0.3", "contacts at"):
         assert words in told.text
     assert ("MuJoCo's step" in told.text) == ("discrete" not in kinds)
     (slope,) = [finding.text for finding in measured_findings(measured) if finding.kind == "slope"]
-    assert "event" not in slope
+    assert "slope" not in slope
     assert ("MuJoCo's step" in slope) == ("discrete" in kinds)
     advice = recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None)
     assert (advice.gradient, advice.onset) == ("discrete", "discrete" not in kinds)
@@ -211,7 +211,7 @@ def test_rounding_is_no_jump_and_no_slope(diverges):
     measured = measure(scene, motions, programs, rng, from_start=False, seconds=1, log=lambda _: None)
     assert [len(line.jumps.places) for line in measured.lines] == [0, 0, 0]
     num_moving = sum(line.varied != "the controls" for line in measured.lines)
-    readings = {slope.num_readings for slope in slopes(measured) if slope.kind != "event"}
+    readings = {slope.num_readings for slope in slopes(measured) if slope.kind != "slope"}
     assert readings == {num_moving * (len(measured.times) - diverges)}
 
 
@@ -320,7 +320,7 @@ def test_a_derivative_of_any_size_is_not_recommended():
     wild = 1 + 3000 * (np.arange(64) % 10 == 0)
     for discrete, event, onset, expected in (
         (0.8, 0.8, 0.8, ("discrete", True)),
-        (0.8, 0.9, wild, ("event", False)),
+        (0.8, 0.9, wild, ("slope", False)),
         (0.9, 0.6, wild, ("discrete", False)),
     ):
         advice = recommend(scene, motions, stability, line_of(discrete, event, onset), None)
