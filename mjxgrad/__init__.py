@@ -25,6 +25,7 @@ from mjxgrad.devices import over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.identification import identify
+from mjxgrad.linearisation import Linearisation, linearise
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import (
     Convergence,
@@ -46,6 +47,7 @@ __all__ = [
     "DivergedError",
     "History",
     "LeaveOut",
+    "Linearisation",
     "Objective",
     "Onset",
     "Optimisation",
@@ -77,6 +79,7 @@ __all__ = [
     "integration",
     "learning",
     "linear_policy",
+    "linearise",
     "load_scene",
     "mlp_policy",
     "open_loop",

@@ -5,6 +5,7 @@ a change of the start to the end. JAX transposes that recursion, so forward and 
 """
 
 import functools
+import math
 from collections.abc import Mapping
 
 import jax
@@ -14,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.dynamics.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import Gradient, engine_of
+from mjxgrad.native.engine import Engine, Gradient, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
@@ -51,7 +52,7 @@ def roll_out(
         given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
         before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in found}
         before["time"] = start["time"] + numbers["opt.timestep"] * jnp.arange(horizon, dtype=dtype)[:, None]
-        jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs, dtype)
+        jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs)
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
             is_by_step = name in by_input
@@ -76,19 +77,20 @@ def roll_out(
 
 
 def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
-    """Return the Jacobians of one step by "state" and "ctrl", in tangent space; arguments as those of `roll_out`."""
-    engine, dtype = engine_of(scene.mj_model), start["qpos"].dtype
-    before = {k: x[None] for k, x in start.items()}
-    found = _jacobians(engine, gradient, ("ctrl",), numbers_of(scene.model), before, inputs, dtype)
+    """Return the Jacobians of one step by "state" and "ctrl", and those of its sensors, "C" and "D"; see `roll_out`."""
+    before = {name: x[None] for name, x in start.items()}
+    found = _jacobians(engine_of(scene.mj_model), gradient, ("ctrl", "C", "D"), numbers_of(scene.model), before, inputs)
     return {name: value[0] for name, value in found.items()}
 
 
-def _jacobians(engine, gradient: Gradient, wanted: tuple[str, ...], numbers, before, inputs, dtype) -> dict[str, Array]:
-    horizon, size = len(inputs["ctrl"]), 2 * before["qvel"].shape[1] + before["act"].shape[1]
-    widths = {"state": size} | {
-        k: int(np.prod(inputs[k].shape[1:]) if k in inputs else numbers[k].size) for k in wanted
-    }
-    shapes = {k: jax.ShapeDtypeStruct((horizon, size, width), dtype) for k, width in widths.items()}
+def _jacobians(
+    engine: Engine, gradient: Gradient, wanted: tuple[str, ...], numbers: _Arrays, before: _Arrays, inputs: _Arrays
+) -> dict[str, Array]:
+    """Return what `Engine.linearise` gives of states before each step; it has no derivative of its own."""
+    horizon, dtype = len(inputs["ctrl"]), before["qpos"].dtype
+    sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
+    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(wanted, sizes).items()}
+    shapes = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
 
     @jax.custom_jvp
     def call(numbers, before, inputs):

@@ -72,20 +72,17 @@ class Engine:
     ) -> dict[str, np.ndarray]:
         """Return the Jacobians of single steps in tangent space, by "state" and by each input and number that is wanted.
 
+        Those of the sensors, "C" and "D", are of small differences with either gradient.
+
         States before each step are in `start`, with an axis of steps as inputs have it.
         """
         with self.lock, _quietly():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
             steps = inputs["ctrl"].shape[1]
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in (start | inputs).items()})
-            size = 2 * self.mj_model.nv + self.mj_model.na
-            sizes = {
-                one: np.asarray(numbers[one]).size // max(1, _leading(numbers[one], batch))
-                for one in wanted
-                if one in numbers
-            }
-            widths = {"state": size} | {one: sizes.get(one, self._width(one)) for one in wanted}
-            found = {name: np.zeros((len(rows), size, width)) for name, width in widths.items()}
+            sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
+            sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
+            found = {k: np.zeros((len(rows), *shape)) for k, shape in self.shapes(wanted, sizes).items()}
             pieces = np.array_split(np.arange(len(rows)), min(_NUM_THREADS, len(rows)))
 
             def work(thread: int) -> None:
@@ -95,6 +92,12 @@ class Engine:
 
             list(self.threads.map(work, range(len(pieces))))
         return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in found.items()}
+
+    def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+        """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
+        model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
+        by_sensor = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu)}
+        return {"state": (size, size)} | {k: by_sensor[k] if k in by_sensor else (size, sizes[k]) for k in wanted}
 
     def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
         """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
@@ -188,27 +191,32 @@ class _Linearisation:
 
     def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
         """Write differences of small width by all that is wanted."""
-        matrix, by_control = found["state"], found.get("ctrl", np.zeros((len(found["state"]), model.nu)))
-        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:  # which MuJoCo's own function refuses
-            for column, change in enumerate(np.eye(len(matrix))):
-                ends = [self._moved(model, row, side * _WIDTH * change) for side in (1, -1)]
-                matrix[:, column] = self._difference(model, *ends) / (2 * _WIDTH)
+        nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))
+        if is_refused:  # by MuJoCo's own function
+            self._by_columns(model, row, found)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
-            mujoco.mjd_transitionFD(model, self.data, _WIDTH, True, matrix, by_control, None, None)
-        done = ("state",) if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else ("state", "ctrl")
-        for name, jacobian in found.items():
-            if name in done:
+            sensors = (found.get("C"), found.get("D"))
+            mujoco.mjd_transitionFD(model, self.data, _WIDTH, True, found["state"], by_control, *sensors)
+        for name in found.keys() - {"state", "C", "D"} - ({"ctrl"} if not is_refused else set()):
+            if name not in INPUTS:
+                self._by_number(model, row, name, found[name])
                 continue
-            if name in INPUTS:
-                place = self.engine.places[name]
-                for column in range(jacobian.shape[1]):
-                    ends = [row.copy(), row.copy()]
-                    for end, side in zip(ends, (1, -1), strict=True):
-                        end[place + column] += side * _WIDTH
-                    jacobian[:, column] = self._difference(model, *ends) / (2 * _WIDTH)
-            else:
-                self._by_number(model, row, name, jacobian)
+            for column in range(found[name].shape[1]):
+                ends = [row.copy(), row.copy()]
+                for end, side in zip(ends, (1, -1), strict=True):
+                    end[self.engine.places[name] + column] += side * _WIDTH
+                found[name][:, column] = self._difference(model, *ends) / (2 * _WIDTH)
+                if name == "ctrl" and "D" in found:
+                    found["D"][:, column] = self.sensed / (2 * _WIDTH)
+
+    def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
+        for column, change in enumerate(np.eye(len(found["state"]))):
+            ends = [self._moved(model, row, side * _WIDTH * change) for side in (1, -1)]
+            found["state"][:, column] = self._difference(model, *ends) / (2 * _WIDTH)
+            if "C" in found:
+                found["C"][:, column] = self.sensed / (2 * _WIDTH)
 
     def _by_number(self, model: mujoco.MjModel, row: np.ndarray, name: str, jacobian: np.ndarray) -> None:
         """Write differences by the entries of an array of the model."""
@@ -238,7 +246,12 @@ class _Linearisation:
         return [self.data.qpos.copy(), self.data.qvel.copy(), self.data.act.copy()]
 
     def _difference(self, model: mujoco.MjModel, above: np.ndarray, below: np.ndarray) -> Float[np.ndarray, " size"]:
-        return _change(model, self._step(model, above), self._step(model, below))
+        """Return the change of the end of a step, and keep that of its sensors."""
+        ends = []
+        for row in (above, below):
+            ends.append([*self._step(model, row), self.data.sensordata.copy()])
+        self.sensed = ends[0][3] - ends[1][3]
+        return _change(model, *ends)
 
     def _moved(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state moved in tangent space: by its position, or by position, velocity and activation."""
@@ -255,10 +268,6 @@ def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarr
     positions = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, positions, 1.0, below[0], above[0])
     return np.concatenate([positions, above[1] - below[1], above[2] - below[2]])
-
-
-def _leading(value: np.ndarray, batch: tuple[int, ...]) -> int:
-    return math.prod(np.shape(value)[: len(batch)])
 
 
 class _quietly:  # noqa: N801 - a context, used as a word

@@ -74,23 +74,50 @@ def test_zeroth_order_is_the_same_by_either_engine():
     np.testing.assert_allclose(costs[1].value, costs[0].value, atol=1e-6 * np.abs(costs[0].value).max())
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"engine": "mujoco", "onset": mg.Onset()}, "in MuJoCo's own motion, got onset: leave it out"),
-        ({"engine": "mujoco", "gradient": "slope"}, "got gradient='slope'"),
-    ],
-)
-def test_what_it_cannot_do_is_refused(scene, settings, message):
-    with pytest.raises(ValueError, match=message):
-        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, **settings)
+def test_an_onset_is_refused(scene):
+    with pytest.raises(ValueError, match="MuJoCo's own motion, got onset: leave it out"):
+        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, engine="mujoco", onset=mg.Onset())
 
 
-def test_a_derivative_is_refused(scene):
-    def cost(qvel):
-        return _rollout(scene, qvel, None, horizon=2, engine="mujoco").qpos.sum()
+def test_a_policy_is_asked_before_each_step(scene):
+    """The controls that it gave, given as numbers, make the same motion."""
 
-    with pytest.raises(
-        ValueError, match='engine="mujoco" has no derivative: take "mjx", or an estimator of zeroth order'
-    ):
-        jax.grad(cost)(jnp.zeros(scene.model.nv))
+    def policy(gain, state):
+        return -gain * state.qvel[: scene.model.nu] + 0.3 * jnp.sin(30 * state.time)
+
+    start = mg.initial_state(scene, qvel=0.1 * jnp.arange(scene.model.nv))
+    closed = mg.rollout(scene, start, policy, 0.5, horizon=HORIZON, engine="mujoco")
+    again = mg.rollout(scene, start, closed.ctrl, engine="mujoco")
+    # A solve that starts from another acceleration ends within its tolerance, not at the same bit.
+    np.testing.assert_allclose(closed.qpos, again.qpos, atol=1e-7)
+    assert np.ptp(closed.ctrl) > 0.1
+
+
+def test_what_is_given_to_each_step_acts_alike_in_both_engines():
+    scene = mg.load_scene(
+        """<mujoco><option tolerance="1e-12"/><default><geom condim="1"/></default><worldbody><body mocap="true" pos="0 0 .5">
+        <geom size=".05"/></body><body pos="0 0 .4"><freejoint/><geom size=".05" mass=".2"/></body><body pos="1 0 0">
+        <joint name="a" type="slide"/><joint name="b" type="slide" axis="1 0 0"/><geom size=".05"/></body></worldbody>
+        <equality><joint joint1="a" joint2="b"/></equality></mujoco>"""
+    )
+    time = np.arange(HORIZON)[:, None]
+    inputs = {
+        "mocap_pos": np.array([[[0, 0, 0.5]]]) + 1e-3 * time[..., None] * np.array([0.1, 0.05, -1.0]),
+        "xfrc_applied": np.where(np.arange(4)[:, None] == 2, np.sin(0.1 * time)[..., None], 0.0) * np.ones(6),
+        "qfrc_applied": np.cos(0.2 * time) * np.linspace(0.1, 0.8, 8),
+        "eq_active": (time < HORIZON // 2).astype(np.uint8),
+    }
+    ours, theirs = (
+        mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, inputs=inputs, engine=engine).qpos
+        for engine in ("mjx", "mujoco")
+    )
+    np.testing.assert_allclose(theirs, ours, atol=1e-7)  # what the solves leave, and contacts multiply
+    still = mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, engine="mujoco").qpos
+    assert np.abs(still - theirs).max() > 1e-2
+
+
+def test_wrong_inputs_are_refused(scene):
+    with pytest.raises(ValueError, match="inputs must be among qfrc_applied, .* got 'ctrl'"):
+        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"ctrl": np.zeros((2, 2))})
+    with pytest.raises(ValueError, match=r"inputs\['qfrc_applied'\] must have shape \(2, \d\), one row per step"):
+        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"qfrc_applied": np.zeros(3)})

@@ -1,0 +1,80 @@
+"""A, B, C and D of one step, in the coordinates and the order of MuJoCo's `mjd_transitionFD`."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from mjxgrad._rollout import Engine, State, data_of
+from mjxgrad.dynamics import Gradient, Onset, step
+from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.native import INPUTS
+from mjxgrad.native import linearise as by_mujoco
+from mjxgrad.scene import Scene
+
+
+class Linearisation(eqx.Module):
+    """Derivatives of the next state and of the sensors; a change of state is (positions, velocities, activations).
+
+    Positions change in tangent space, a quaternion by three numbers (m, rad).
+
+    Attributes:
+        A: of the next state by the present one.
+        B: of the next state by the controls.
+        C: of the sensors by the present state.
+        D: of the sensors by the controls.
+    """
+
+    A: Float[Array, "changes changes"]
+    B: Float[Array, "changes nu"]
+    C: Float[Array, "nsensordata changes"]
+    D: Float[Array, "nsensordata nu"]
+
+
+def linearise(
+    scene: Scene,
+    state: State,
+    ctrl: Float[ArrayLike, " nu"] | None = None,
+    *,
+    gradient: Gradient = "slope",
+    onset: Onset | None = None,
+    engine: Engine | None = None,
+) -> Linearisation:
+    """Return the linear model of one step; a batch of states is `jax.vmap`.
+
+    Args:
+        scene: from `load_scene`.
+        state: where the step begins.
+        ctrl: the controls; None for the scene's resting ones.
+        gradient: "slope" or "discrete", see `rollout`. The discrete one is what `mjd_transitionFD` gives.
+        onset: of the step, see `rollout`; for MJX alone, with the gradient "discrete".
+        engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
+    if (scene.engine if engine is None else engine) == "mujoco":
+        if onset is not None:
+            raise ValueError('engine="mujoco" is MuJoCo\'s own motion, got onset: leave it out')
+        start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
+        inputs = {name: getattr(scene.data, name)[None] for name in INPUTS[1:] if getattr(scene.data, name).size}
+        found = by_mujoco(scene, start, inputs | {"ctrl": ctrl[None]}, gradient)
+        return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
+    scene.check_mjx()
+    nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
+    end = step(scene.model, data_of(scene, state, ctrl), gradient=gradient, onset=onset)
+
+    def moved(change: Float[Array, " both"]) -> tuple[Array, Array]:
+        data = data_of(scene, state, ctrl + change[size:]).replace(
+            qpos=integrate_position(scene.model, state.qpos, change[:nv], 1.0),
+            qvel=state.qvel + change[nv : 2 * nv],
+            act=state.act + change[2 * nv : size],
+        )
+        found = step(scene.model, data, gradient=gradient, onset=onset)
+        return jnp.concatenate(
+            [position_change(scene.model, end.qpos, found.qpos), found.qvel, found.act]
+        ), found.sensordata
+
+    of_state, of_sensors = jax.jacfwd(moved)(jnp.zeros(size + scene.model.nu, state.qvel.dtype))
+    return Linearisation(of_state[:, :size], of_state[:, size:], of_sensors[:, :size], of_sensors[:, size:])

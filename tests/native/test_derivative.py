@@ -1,0 +1,192 @@
+"""Derivatives through C MuJoCo: those of its steps are `mjd_transitionFD`'s, and rollouts are differentiable both ways."""
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+
+# MuJoCo's own tolerance would leave more in each difference than it is to be compared to.
+_SOLVER = 'tolerance="1e-14" iterations="200"'
+SCENES = {
+    "free box, pyramids": f"""<mujoco><option {_SOLVER}/><worldbody><geom type="plane" size="2 2 .1"/>
+        <body pos="0 0 .098" euler="1 2 3"><freejoint/><geom type="box" size=".1 .15 .1" mass="1"/></body></worldbody></mujoco>""",
+    "ball joint, rolling, elliptic": f"""<mujoco><option cone="elliptic" {_SOLVER}/><worldbody>
+        <geom type="plane" size="2 2 .1" condim="6"/><body pos="0 0 .3"><joint type="ball"/><geom size=".05" pos=".1 0 -.1"/>
+        <body pos=".2 0 -.201"><joint type="ball"/><geom type="ellipsoid" size=".1 .08 .1" condim="6"/></body></body>
+        </worldbody></mujoco>""",
+    "muscle, tendon, filter": f"""<mujoco><option {_SOLVER}/><worldbody><body name="a"><joint name="j" axis="0 1 0" range="-1 1"
+        damping=".1"/><geom type="capsule" size=".05" fromto="0 0 0 .3 0 0"/><body pos=".3 0 0"><joint name="k" axis="0 1 0"
+        frictionloss=".01"/><geom type="capsule" size=".04" fromto="0 0 0 .3 0 0"/></body></body></worldbody>
+        <tendon><fixed name="t" limited="true" range="-.2 .2"><joint joint="j" coef=".5"/><joint joint="k" coef="-.3"/></fixed></tendon>
+        <actuator><muscle joint="j" lengthrange="-1 1"/><general joint="k" dyntype="filter" dynprm=".05" gainprm="3"/>
+        <position tendon="t" kp="5" ctrlrange="-.1 .1"/></actuator></mujoco>""",
+    "RK4 and a slider-crank": f"""<mujoco><option integrator="RK4" {_SOLVER}/><worldbody><body><joint name="j" axis="0 0 1"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 .2 0 0"/><site name="crank" pos=".2 0 0"/></body><site name="slider"
+        pos=".6 0 0" zaxis="1 0 0"/></worldbody><actuator><position cranksite="crank" slidersite="slider" cranklength=".3" kp="50"/>
+        </actuator></mujoco>""",
+}
+
+
+def _random(scene):
+    """Return a state within reach of the contacts, and controls within range of some actuators and beyond those of others."""
+    rng, model = np.random.default_rng(1), scene.mj_model
+    qpos = scene.mj_model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, 0.02 * rng.normal(size=model.nv), 1.0)
+    qvel, act = 0.3 * rng.normal(size=model.nv), rng.uniform(0.2, 0.8, model.na)
+    return qpos, qvel, act, rng.uniform(0.05, 0.6, model.nu)
+
+
+def _by_mujoco(scene, qpos, qvel, act, ctrl):
+    """Return A and B by MuJoCo's own differences, or by ours of `mj_step` where it has none."""
+    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+    size = 2 * model.nv + model.na
+    A, B = np.zeros((size, size)), np.zeros((size, model.nu))
+    data.qpos, data.qvel, data.act, data.ctrl = qpos, qvel, act, ctrl
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
+        return A, B
+
+    def step(change, push):
+        data.qpos, data.qvel, data.ctrl = qpos, qvel + change[model.nv :], ctrl + push
+        mujoco.mj_integratePos(model, data.qpos, change[: model.nv], 1.0)
+        mujoco.mj_step(model, data)
+        return np.concatenate([data.qpos, data.qvel])  # all its coordinates are scalar
+
+    for matrix, changes in ((A, np.eye(size)), (B, np.eye(model.nu))):
+        for column, one in enumerate(1e-6 * changes):
+            ends = [
+                step(s * one, np.zeros(model.nu)) if matrix is A else step(np.zeros(size), s * one) for s in (1, -1)
+            ]
+            matrix[:, column] = (ends[0] - ends[1]) / 2e-6
+    return A, B
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_one_step_is_that_of_mujocos_own_differences(name):
+    scene = mg.load_scene(SCENES[name], engine="mujoco")
+    qpos, qvel, act, ctrl = _random(scene)
+    found = mg.linearise(scene, mg.initial_state(scene, qpos, qvel, act), ctrl, gradient="discrete")
+    for ours, theirs in zip((found.A, found.B), _by_mujoco(scene, qpos, qvel, act, ctrl), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-8 * max(1.0, np.abs(theirs).max(initial=0.0)))
+
+
+def test_the_solve_does_not_end_early_in_differences():
+    """At MuJoCo's default tolerance its own differences are off; ours are those of a solve that has ended."""
+    coarse, fine = (
+        mg.load_scene(SCENES["free box, pyramids"].replace(_SOLVER, solver), engine="mujoco")
+        for solver in ("", _SOLVER)
+    )
+    qpos, qvel, act, ctrl = _random(fine)
+    found = mg.linearise(coarse, mg.initial_state(coarse, qpos, qvel, act), ctrl, gradient="discrete").A
+    np.testing.assert_allclose(found, _by_mujoco(fine, qpos, qvel, act, ctrl)[0], atol=1e-6)
+
+
+HORIZON = 12
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """A box that slides, pushed by a servo, with what it depends on; and what becomes of it."""
+    scene = mg.load_scene(
+        f"""<mujoco><option {_SOLVER}/><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body name="box" pos="0 0 .0995">
+        <freejoint/><geom name="box" type="box" size=".1 .1 .1" mass="1"/></body><body name="pusher" pos="-.3 0 .1">
+        <joint name="p" type="slide" axis="1 0 0" damping="1"/><geom size=".05" mass=".5"/></body></worldbody>
+        <actuator><position joint="p" kp="200"/></actuator></mujoco>"""
+    )
+    rng = np.random.default_rng(0)
+    at = {
+        "qvel": jnp.array([0.5, 0.2, 0.0, 0.1, -0.1, 1.0, 0.3]),
+        "ctrl": 0.1 * jnp.asarray(rng.normal(size=(HORIZON, 1))),
+        "force": jnp.asarray(rng.normal(size=(HORIZON, 7))),
+        "mass": scene.model.body_mass,
+        "friction": scene.model.geom_friction,
+        "stiffness": jnp.array(900.0),
+    }
+
+    def end(at, engine="mujoco", gradient="discrete"):
+        changed = scene.with_model(body_mass=at["mass"], geom_friction=at["friction"])
+        changed = changed.with_softness(mg.Softness(stiffness=at["stiffness"], damping_ratio=1.0))
+        state = mg.initial_state(changed, qvel=at["qvel"])
+        inputs = {"qfrc_applied": at["force"]}
+        course = mg.rollout(changed, state, at["ctrl"], inputs=inputs, engine=engine, gradient=gradient)
+        return jnp.concatenate([course.qpos[-1], course.qvel[-1]]) @ jnp.arange(1.0, 16.0)
+
+    return at, end
+
+
+def test_every_argument_has_its_derivative(pushed):
+    """Against central differences of the rollout, by a random direction in each."""
+    at, end = pushed
+    gradient, rng = jax.grad(end)(at), np.random.default_rng(3)
+    for name, value in at.items():
+        direction = jnp.asarray(rng.normal(size=value.shape)) * jnp.maximum(jnp.abs(value), 1e-2)
+        move = lambda s, name=name, d=direction: end(at | {name: at[name] + s * 1e-5 * d})  # noqa: E731
+        expected = (move(1) - move(-1)) / 2e-5
+        # 1e-5 of a difference of differences; entries are up to hundreds.
+        np.testing.assert_allclose(jnp.sum(gradient[name] * direction), expected, rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_both_engines_and_both_modes_agree(pushed):
+    at, end = pushed
+    ours, theirs = (jax.jit(jax.grad(lambda a, e=engine: end(a, e)))(at) for engine in ("mjx", "mujoco"))
+    forward = jax.jacfwd(lambda v: end(at | {"qvel": v}))(at["qvel"])
+    np.testing.assert_allclose(forward, theirs["qvel"], rtol=1e-10)
+    for name in at:
+        scale = np.abs(ours[name]).max()
+        np.testing.assert_allclose(theirs[name], ours[name], atol=1e-4 * scale, err_msg=name)
+
+
+def test_batches_are_those_of_single_calls(pushed):
+    """Starts and parameters mapped over at once, two axes deep."""
+    at, end = pushed
+    speeds, stiffness = at["qvel"] * jnp.array([[1.0], [0.5]]), jnp.array([400.0, 900.0, 2500.0])
+    gradient = jax.grad(lambda v, k: end(at | {"qvel": v, "stiffness": k}), argnums=(0, 1))
+    found = jax.jit(jax.vmap(jax.vmap(gradient, (None, 0)), (0, None)))(speeds, stiffness)
+    single = [[gradient(v, k) for k in stiffness] for v in speeds]
+    for part in range(2):
+        expected = np.array([[one[part] for one in row] for row in single])
+        np.testing.assert_allclose(found[part], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_policy_is_differentiated_through_the_loop(pushed):
+    scene = mg.load_scene(SCENES["muscle, tendon, filter"])
+
+    def cost(gain):
+        policy = lambda gain, state: 0.3 - gain * state.qvel[:1] * jnp.ones(3)  # noqa: E731
+        return mg.rollout(scene, mg.initial_state(scene), policy, gain, horizon=HORIZON, engine="mujoco").qpos[-1].sum()
+
+    expected = (cost(0.5 + 1e-4) - cost(0.5 - 1e-4)) / 2e-4
+    for derivative in (jax.grad(cost), jax.jacfwd(cost)):
+        np.testing.assert_allclose(derivative(0.5), expected, rtol=1e-6)
+
+
+def test_a_motion_that_diverges_has_finite_derivatives():
+    """It stays at its last good state, and is flagged."""
+    scene = mg.load_scene(SCENES["free box, pyramids"])
+
+    def last(speed):
+        state = mg.initial_state(scene, qvel=jnp.full(6, speed))
+        return mg.rollout(scene, state, horizon=5, velocity_limit=5.0, engine="mujoco")
+
+    course = last(6.0)
+    assert course.diverged
+    assert np.isfinite(jax.jacrev(lambda v: last(v).qpos[-1])(6.0)).all()
+
+
+def test_second_derivatives_are_refused_by_name(pushed):
+    at, end = pushed
+    with pytest.raises(ValueError, match='engine="mujoco" has first derivatives alone'):
+        jax.hessian(lambda k: end(at | {"stiffness": k}))(at["stiffness"])
+
+
+def test_a_model_that_is_differentiated_is_left_as_it_was(pushed):
+    at, end = pushed
+    before = end(at)
+    jax.grad(end)(at)
+    assert end(at) == before
+    assert copy.deepcopy(at).keys() == at.keys()

@@ -1,0 +1,148 @@
+"""The slope of C MuJoCo's outcome: closed forms, secants of the outcome, and what events are."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.diagnostics import compare_to_slope, phases
+from mjxgrad.native.events import Surfaces, levers_of
+
+BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
+    <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+STICK = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .45" euler="0 50 0">
+    <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0 1 0"/>
+    <geom type="capsule" fromto="-.25 0 0 .25 0 0" size=".03"/></body></worldbody></mujoco>"""
+# Both feet land at once, beside knees at their limits, and each hardly moves without the other.
+LEGS = """<mujoco><default><geom friction=".9"/><joint axis="0 1 0" armature=".01" damping=".1"/></default><worldbody>
+    <geom type="plane" size="5 5 .1"/><body pos="0 0 1.03"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint/>
+    <geom type="capsule" size=".05" fromto="0 0 0 0 0 .4"/>
+    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 .1 0 0 .1 -.5"/><body pos="0 .1 -.5"><joint range="-150 0"/>
+    <geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body>
+    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 -.1 0 0 -.1 -.5"/><body pos="0 -.1 -.5"><joint range="-150 0"/>
+    <geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body></body></worldbody></mujoco>"""
+
+
+def _compared(scene, index, interval, horizon, speeds, count=96, read=3):
+    """Return slope and mean derivative of the first coordinates, half way and at the end, over where the motion starts."""
+
+    def outcome(place):
+        start = mg.initial_state(scene, scene.data.qpos.at[index].add(place), jnp.asarray(speeds))
+        course = mg.rollout(scene, start, horizon=horizon, engine="mujoco", gradient="slope")
+        return course.qpos[jnp.array([horizon // 2, horizon]), :read]
+
+    parameters = phases(interval, count)
+    outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))
+    return compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
+
+
+@pytest.mark.parametrize("h", [0.002, 0.005])
+def test_a_bounce_has_minus_its_restitution_as_slope(h):
+    """Critically damped contact of constant impedance leaves e⁻² of the speed; MuJoCo's own derivative is −3 at every step."""
+    scene = mg.load_scene(BALL.format(h=h))
+    found = _compared(scene, 0, (0.0, 0.03), round(0.24 / h), [-2.0], read=1)
+    np.testing.assert_allclose(found.mean[0, 1], found.slope[1], atol=0.02)
+    np.testing.assert_allclose(found.mean[0, 1], -np.exp(-2), atol=0.02)  # the impedance is nearly constant
+
+
+@pytest.mark.parametrize(
+    ("name", "xml", "index", "horizon", "speeds", "read"),
+    [("stick", STICK, 1, 230, [0.3, 0, 0], 3), ("legs", LEGS, 1, 150, [0.5, 0, 0.3, 0, 0, 0, 0], 3)],
+)
+def test_the_mean_derivative_is_the_slope_of_the_outcome(name, xml, index, horizon, speeds, read):
+    found = _compared(mg.load_scene(xml), index, (0.0, 0.02), horizon, speeds, read=read)
+    off, slope = np.abs(found.mean[0] - found.slope), np.maximum(np.abs(found.slope), 0.1)
+    # The rule is of first order in the time step: of six readings one may be off by more than errors and a twentieth.
+    is_right = off <= np.maximum(2 * found.standard_error[0], 0.05 * slope)
+    assert is_right.sum() >= is_right.size - 1, (found.mean[0], found.slope)
+    assert (off <= np.maximum(2 * found.standard_error[0], 0.25 * slope)).all()
+
+
+def test_the_motion_is_the_same_to_the_last_bit():
+    scene = mg.load_scene(STICK)
+    courses = [
+        jax.jvp(
+            lambda v, g=gradient: (
+                mg.rollout(scene, mg.initial_state(scene, qvel=v), horizon=150, engine="mujoco", gradient=g).qpos
+            ),
+            (jnp.array([0.3, 0.0, 0.0]),),
+            (jnp.ones(3),),
+        )[0]
+        for gradient in ("discrete", "slope")
+    ]
+    np.testing.assert_array_equal(*courses)
+
+
+def _events(xml, qpos, qvel):
+    model = mujoco.MjModel.from_xml_string(xml)
+    surfaces = Surfaces(model, levers_of(model), np.array([qvel], float))
+    data = mujoco.MjData(surfaces.model)
+    data.qpos, data.qvel = qpos, qvel
+    return surfaces.events(data, np.array(qvel, float), np.array(qvel, float))
+
+
+def test_an_event_is_a_gap_within_half_a_step_of_travel():
+    """At 2 m/s and 2 ms half a step is 2 mm; the ball touches where its coordinate is −0.1."""
+    ball = BALL.format(h=0.002)
+    for gap, is_event in ((1.9e-3, True), (-1.9e-3, True), (2.1e-3, False), (-2.1e-3, False)):
+        found = _events(ball, [gap - 0.1], [-2.0])
+        assert (found is not None) == is_event
+        if found is not None:
+            np.testing.assert_allclose([found.gaps[0], found.widths[0]], [gap, 2e-3], rtol=1e-9)
+            np.testing.assert_allclose(found.rows @ found.moves, [[1.0]])
+
+
+def test_without_speed_the_impedance_gives_the_width():
+    """0.06 of its width, 1 mm by default."""
+    assert _events(BALL.format(h=0.002), [5.9e-5 - 0.1], [0.0]) is not None
+    assert _events(BALL.format(h=0.002), [6.1e-5 - 0.1], [0.0]) is None
+
+
+def test_margins_and_joint_limits_have_gaps_of_their_own():
+    """With a margin of 5 mm at both geoms contact begins at 10 mm; the limit lies at 0.05."""
+    ball = (
+        BALL.format(h=0.002)
+        .replace("<geom size", '<geom margin=".005" size')
+        .replace('"1 1 .1"', '"1 1 .1" margin=".005"')
+    )
+    np.testing.assert_allclose(_events(ball, [0.011 - 0.1], [-2.0]).gaps, [1e-3], rtol=1e-9)
+    limited = BALL.format(h=0.002).replace('axis="0 0 1"', 'axis="0 0 1" range="-.05 1"')
+    np.testing.assert_allclose(_events(limited, [-0.049], [-2.0]).gaps, [1e-3], rtol=1e-9)
+
+
+def test_feet_that_cannot_move_apart_are_one_event():
+    model = mujoco.MjModel.from_xml_string(LEGS)
+    qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
+    qpos[1], qvel[1] = -0.09 + 1e-3, -1.0
+    qpos[3:] = -0.02  # away from all limits
+    data = mujoco.MjData(model)
+    data.qpos = qpos
+    mujoco.mj_fwdPosition(model, data)
+    lowest = (
+        min(data.geom_xpos[g, 2] - data.geom_xmat[g].reshape(3, 3)[2, 2] * model.geom_size[g, 1] for g in (3, 5)) - 0.04
+    )
+    qpos[1] -= lowest - 5e-4
+    found = _events(LEGS, qpos, qvel)
+    assert found is not None
+    assert len(found.gaps) == 1
+    assert np.abs(found.moves).max() < 10
+
+
+def test_a_landing_foot_does_not_carry_its_knee_across_the_limit():
+    """The knee lies 0.1 mrad within its limit, which is no event: whatever moves the foot leaves it where it is."""
+    model = mujoco.MjModel.from_xml_string(LEGS)
+    qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
+    qpos[3:], qvel[1] = -1e-4, -1.0
+    data = mujoco.MjData(model)
+    data.qpos = qpos
+    mujoco.mj_kinematics(model, data)
+    lowest = (
+        min(data.geom_xpos[g, 2] - data.geom_xmat[g].reshape(3, 3)[2, 2] * model.geom_size[g, 1] for g in (3, 5)) - 0.04
+    )
+    qpos[1] -= lowest - 5e-4
+    found = _events(LEGS, qpos, qvel)
+    assert found is not None
+    carried = np.abs(found.moves[3:] * (found.widths + np.abs(found.gaps)))
+    assert (carried < 1e-4).all()
