@@ -59,7 +59,7 @@ def roll_out(
             change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
             forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
         changes = {k: _or_zero(by_start[k]) for k in found}
-        first = jnp.concatenate([_to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
+        first = jnp.concatenate([to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
 
         def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
             matrix, force = step
@@ -69,7 +69,7 @@ def roll_out(
         _, course = jax.lax.scan(advance, first, (jacobians["state"], forced))
         nv = scene.model.nv
         parts = jnp.split(course, (nv, 2 * nv), axis=1)
-        parts[0] = jax.vmap(functools.partial(_to_coordinates, scene))(found["qpos"], parts[0])
+        parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])
         return found, dict(zip(("qpos", "qvel", "act"), parts, strict=True))
 
     found = call(numbers_of(scene.model), start, inputs)
@@ -115,12 +115,12 @@ def _or_zero(tangent) -> Array:
     return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
 
 
-def _to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
+def to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Return a change of coordinates in tangent space."""
     return jax.jvp(lambda end: position_change(scene.model, qpos, end), (qpos,), (change,))[1]
 
 
-def _to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Return a change in tangent space as one of coordinates."""
     rest = jnp.zeros_like(change)
     return jax.jvp(lambda velocity: integrate_position(scene.model, qpos, velocity, 1.0), (rest,), (change,))[1]

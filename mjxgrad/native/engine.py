@@ -14,7 +14,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.native.events import Surfaces, levers_of
+from mjxgrad.native.events import Events, Surfaces, levers_of
 from mjxgrad.scene.scene import with_numbers
 
 Gradient = Literal["discrete", "slope"]
@@ -93,6 +93,41 @@ class Engine:
             list(self.threads.map(work, range(len(pieces))))
         return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in found.items()}
 
+    def follow(
+        self,
+        gradient: Gradient,
+        numbers: _Arrays,
+        start: _Arrays,
+        inputs: _Arrays,
+        changes: tuple[np.ndarray, np.ndarray],
+    ) -> dict[str, np.ndarray]:
+        """Return a course as `run` does and, as "change", what becomes of a change of the start and of the controls.
+
+        Changes are in tangent space; along one direction a step takes two differences in place of one for each coordinate.
+        """
+        with self.lock, _quietly():
+            _, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+            num_steps, model = inputs["ctrl"].shape[1], self.mj_model
+            sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "change": 2 * model.nv + model.na}
+            found = {name: np.zeros((len(models), num_steps, size)) for name, size in sizes.items()}
+            first = self._rows(start | {name: value[:, 0] for name, value in inputs.items()})
+
+            def work(piece: tuple[int, np.ndarray]) -> None:
+                one = _Linearisation(self, self.data[piece[0]], gradient)
+                for i in piece[1].tolist():
+                    # Speeds are not known before, so margins reach as far as those of twice the start's, or of a fall.
+                    fall = np.full(model.nv, num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity))
+                    one.use(models, i, np.maximum(2 * np.abs(start["qvel"][i]), fall)[None])
+                    course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
+                    one.follow(first[i], *course, {k: v[i] for k, v in found.items()})
+
+            list(
+                self.threads.map(
+                    work, enumerate(np.array_split(np.arange(len(models)), min(_NUM_THREADS, len(models))))
+                )
+            )
+        return found
+
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
@@ -153,41 +188,82 @@ class _Linearisation:
         for i in index.tolist():
             trajectory = i // num_steps
             if models[trajectory] is not self.models[0]:
-                model = copy.deepcopy(models[trajectory])
-                model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
-                self.models = (models[trajectory], model)
-                if self.gradient == "slope":
-                    alike = [k for k, one in enumerate(models) if one is models[trajectory]]
-                    self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
-                    self.far = mujoco.MjData(self.surfaces.model)
+                alike = [k for k, one in enumerate(models) if one is models[trajectory]]
+                self.use(models, trajectory, speeds[alike].reshape(-1, self.engine.mj_model.nv))
             if np.isfinite(rows[i]).all():
                 self._one(self.models[1], rows[i].copy(), {name: value[i] for name, value in found.items()})
 
+    def use(self, models: list, index: int, speeds: np.ndarray) -> None:
+        """Take a model for what follows, in which states move so fast."""
+        model = copy.deepcopy(models[index])
+        model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
+        self.models = (models[index], model)
+        if self.gradient == "slope":
+            self.surfaces = Surfaces(model, self.engine.levers, speeds)
+            self.far = mujoco.MjData(self.surfaces.model)
+
+    def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
+        """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
+        plain, model = self.models
+        parts, row, change = [self.engine._place(name) for name in START[1:]], row.copy(), change.copy()
+        for t, push in enumerate(pushes):
+            for name, value in inputs.items():
+                row[self.engine._place(name)] = value[t].reshape(-1)
+            ends = self._step(plain, row)
+            row[self.engine._place("warmstart")] = self.data.qacc_warmstart
+            events, clear = self._events(model, row, ends[1])
+            size = max(np.abs(change).max(), np.abs(push).max(initial=0.0), 1e-30)
+            nv, felt = model.nv, np.zeros(0)
+            if events is not None:
+                felt = events.rows @ change[:nv]
+                rest = np.concatenate([change[:nv] - events.moves @ felt, change[nv:]])
+            else:
+                rest = change
+            sides = []
+            for side in (_WIDTH / size, -_WIDTH / size):
+                sides.append(self._moved(model, clear, side * rest))
+                sides[-1][self.engine._place("ctrl")] += side * push
+            change = self._difference(model, *sides) * size / (2 * _WIDTH)
+            if events is not None:
+                change += self._spanned(model, row, events) @ felt
+            for place, end in zip(parts, ends, strict=True):
+                row[place] = end
+            row[self.engine._place("time")] += model.opt.timestep
+            for name, value in zip(START[1:], ends, strict=True):
+                found[name][t] = value
+            found["change"][t] = change
+
     def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
-        engine, data = self.engine, self.data
         _, after, _ = self._step(model, row)
         if not np.isfinite(after).all():
             return
-        row[engine._place("warmstart")] = data.qacc_warmstart
-        events, clear = None, row
-        if self.gradient == "slope":
-            before = row[engine._place("qvel")].copy()
-            mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
-            events = self.surfaces.events(self.far, before, after)
-        if events is not None:
-            # Small differences stay on one side of every surface.
-            near = 4 * _WIDTH * np.abs(events.rows).max(axis=1)
-            side = np.where(events.gaps < 0, -near, near)
-            clear = self._moved(
-                model, row, events.moves @ np.where(np.abs(events.gaps) < near, side - events.gaps, 0.0)
-            )
+        row[self.engine._place("warmstart")] = self.data.qacc_warmstart
+        events, clear = self._events(model, row, after)
         self._small(model, clear, found)
         if events is not None:
-            matrix, spanned = found["state"], np.zeros((len(found["state"]), len(events.gaps)))
-            for k, (gap, width) in enumerate(zip(events.gaps, events.widths, strict=True)):
-                ends = [self._moved(model, row, (end - gap) * events.moves[:, k]) for end in (width, -width)]
-                spanned[:, k] = self._difference(model, *ends) / (2 * width)
-            matrix[:, : model.nv] += (spanned - matrix[:, : model.nv] @ events.moves) @ events.rows
+            matrix = found["state"]
+            change = self._spanned(model, row, events) - matrix[:, : model.nv] @ events.moves
+            matrix[:, : model.nv] += change @ events.rows
+
+    def _events(self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray) -> tuple[Events | None, np.ndarray]:
+        """Return what a step may begin or end, and the state from which small differences stay on one side of each surface."""
+        if self.gradient != "slope" or not np.isfinite(after).all():
+            return None, row
+        mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
+        events = self.surfaces.events(self.far, row[self.engine._place("qvel")], after)
+        if events is None:
+            return None, row
+        near = 4 * _WIDTH * np.abs(events.rows).max(axis=1)
+        shift = np.where(np.abs(events.gaps) < near, np.where(events.gaps < 0, -near, near) - events.gaps, 0.0)
+        return events, self._moved(model, row, events.moves @ shift)
+
+    def _spanned(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> Float[np.ndarray, "size events"]:
+        """Return D, the differences that span each event."""
+        columns = []
+        for gap, width, move in zip(events.gaps, events.widths, events.moves.T, strict=True):
+            ends = [self._moved(model, row, (end - gap) * move) for end in (width, -width)]
+            columns.append(self._difference(model, *ends) / (2 * width))
+        return np.array(columns).T
 
     def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
         """Write differences of small width by all that is wanted."""

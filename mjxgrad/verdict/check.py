@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import Trajectory
+from mjxgrad._rollout import Engine, Trajectory
 from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.omissions import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
@@ -36,8 +36,8 @@ from mjxgrad.verdict.findings import (
 )
 from mjxgrad.verdict.measure import Measured, measure
 from mjxgrad.verdict.motions import Motions, half_range, random_motions
+from mjxgrad.verdict.moving import Mover, Outcomes
 from mjxgrad.verdict.page import page
-from mjxgrad.verdict.programs import Outcomes, Programs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -46,7 +46,7 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
-_COMPILED, _MOVED = 0.8, 0.25  # shares of the budget: when to give up compiling, and how long to follow motions at most
+_MOVED = 0.7  # share of the budget for which motions are followed, about
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,8 @@ def check(
     cost: Cost | None = None,
     *,
     derivatives: bool = True,
-    budget: int | float = 120.0,
+    engine: Engine = "mujoco",
+    budget: int | float = 20.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Verdict:
@@ -156,10 +157,11 @@ def check(
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
         cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
             their start. None looks at random mixes of where bodies end up, and how fast.
-        derivatives: measure them; False is a matter of seconds.
-        budget: how long it may take in s, compilation included, once the scene is loaded. Slow scenes are followed for fewer
-            steps; what does not fit is left out, and the verdict says what. A compilation that is given up goes on behind it
-            until it ends.
+        derivatives: measure them; False looks at motions alone.
+        engine: "mujoco" measures by C MuJoCo, with nothing to compile; "mjx" by the step that a GPU would run, which is to be given
+            a budget of minutes.
+        budget: how long it may take in s once the scene is loaded, about. Slow scenes are followed for fewer steps; what does not
+            fit is left out, and the verdict says what.
         seed: of all that is random.
         log: called with what is being done.
 
@@ -168,8 +170,7 @@ def check(
 
     Raises:
         ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
-        SceneError: if MuJoCo cannot read the source, MJX cannot simulate it, or so many geoms can touch that loading would take
-            minutes; and what else `load_scene` raises.
+        SceneError: if MuJoCo cannot read the source; and what else `load_scene` raises.
     """
     if not budget > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
@@ -189,27 +190,13 @@ def check(
     names, outcomes = _outcomes(scene, cost, rng)
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
-        say("compiling three kinds of derivative")
-        compiling, loaded = time.perf_counter(), started + spent["loading"]
-        size, end = _BATCHES[scene.model.nv > _SMALL], loaded + budget
-        programs = Programs(scene, size, outcomes, deadline=loaded + _COMPILED * budget, end=end)
-        programs.wait()
-        spent["compiling"] = time.perf_counter() - compiling
+        say(f"measuring derivatives by {'MJX, which compiles first' if engine == 'mjx' else 'C MuJoCo'}")
         measuring = time.perf_counter()
-        if "onset" in programs.kinds:
-            seconds = min(_MOVED * budget, end - measuring)
-            measured = measure(
-                scene,
-                motions,
-                programs,
-                rng,
-                from_start=cost is not None,
-                seconds=seconds,
-                log=say,
-            )
-            found += measured_findings(measured)
-            spent["measuring"] = time.perf_counter() - measuring
-        found += left_out_findings(programs.kinds, measured, budget)
+        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
+        measured = measure(scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say)
+        found += measured_findings(measured) if measured.lines else ()
+        spent["measuring"] = time.perf_counter() - measuring
+        found += left_out_findings(measured if measured.lines else None, budget)
     advice = recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
         name=scene.name,
@@ -322,7 +309,7 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
-    step = "onset=mg.Onset()" if advice.onset else f'onset=None, gradient="{advice.gradient}"'
+    step = f'gradient="{advice.gradient}"'
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
     if scene.model.nu:

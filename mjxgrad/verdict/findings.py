@@ -13,6 +13,7 @@ from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.measure import STDDEVS, Measured
 from mjxgrad.verdict.motions import Motions
+from mjxgrad.verdict.moving import REFINED
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
@@ -23,10 +24,9 @@ MANY_PAIRS = 1000
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
-# Of an onset's mean derivative: from which error on another kind is taken, and how many times nearer that must be.
-_WILD, _FARTHER = 0.5, 4.0
+_APART = 0.1  # by which share of it the slopes of two time steps are another
 
-_WORDS = {"discrete": "MuJoCo's step", "slope": 'gradient="slope"', "onset": "onset=mg.Onset()"}
+_WORDS = {"slope": 'gradient="slope"', "discrete": 'gradient="discrete"'}
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ class Recommendation:
     """What to ask for.
 
     Attributes:
-        onset: whether contacts should begin within the step.
-        gradient: of the step, where they do not.
+        gradient: of MuJoCo's motion, "slope" or "discrete".
         estimator: name in `mjxgrad.estimators`.
         stddev: of the noise, as a share of half the range of controls.
         horizon: in steps, up to which first order was the better one, or as far as it was measured.
@@ -68,7 +67,6 @@ class Recommendation:
         max_contacts: room for so many.
     """
 
-    onset: bool
     gradient: str
     estimator: str
     stddev: float
@@ -135,31 +133,26 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     if largest > LARGEST_GROWTH:
         when = measured.times[int(np.nanmax(growth, axis=0).argmax())]
         text = f"The derivative explodes: a change of the start grows {largest:.1e} times within {when:.3g} s."
-        yield Finding("explodes", text + " Shorten the horizon, soften the contact or widen the onset.", True)
+        yield Finding("explodes", text + " Shorten the horizon or soften the contact.", True)
     num_diverged = sum(line.num_diverged for line in measured.lines)
     if num_diverged:
         yield Finding("not_finite", f"{num_diverged} motions along the lines diverged: shorten the time step.", True)
-    if crowded := sum(line.num_crowded for line in measured.lines):
-        yield Finding(
-            "note", f"In {crowded} motions more contacts may have acted than there was room for: raise max_contacts."
-        )
     if scattered := [one for one in measured.noises if one.stiffness is None and one.advantage < 1]:
         until = min(one.crossover.horizon for one in scattered)
         text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
-        yield Finding("explodes", text + " Shorten the horizon, soften the contact or widen the onset.", True)
+        yield Finding("explodes", text + " Shorten the horizon or soften the contact.", True)
     yield _slope_finding(slopes(measured))
+    yield from _time_step_findings(measured)
     yield from _order_findings(measured)
 
 
-def left_out_findings(kinds: Sequence[str], measured: Measured | None, budget: int | float) -> Iterator[Finding]:
-    """Yield what there was no time for, from the kinds of derivative that were compiled in time."""
+def left_out_findings(measured: Measured | None, budget: int | float) -> Iterator[Finding]:
+    """Yield what there was no time for."""
     if measured is None:
-        text = f"Not measured: {_WORDS['onset']} did not compile within a budget of {budget:g} s."
-        yield Finding("not_measured", f"{text} What is said is of motions alone; a larger budget measures the rest.")
-        return
-    missing = [words for kind, words in _WORDS.items() if kind not in kinds] + list(measured.left_out)
-    if missing:
-        text = f"Left out for a budget of {budget:g} s: {'; '.join(missing)}. A larger one measures it, too."
+        text = f"Derivatives were not measured within a budget of {budget:g} s; a larger one measures them."
+        yield Finding("not_measured", text)
+    elif measured.left_out:
+        text = f"Left out for a budget of {budget:g} s: {'; '.join(measured.left_out)}. A larger one measures it, too."
         yield Finding("left_out", text)
 
 
@@ -170,6 +163,20 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     parts = [f"{_WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
     lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}")
+
+
+def _time_step_findings(measured: Measured) -> Iterator[Finding]:
+    """Yield where the slope of MuJoCo's outcome is that of its time step alone."""
+    apart, readings = 0, 0
+    for line in measured.lines:
+        own, fine = line.plain, line.fine
+        size, error = np.abs(fine.slope), np.hypot(own.slope_error, fine.slope_error)
+        is_clear = (size > fine.resolution) & (error <= _CLEAR * size)
+        readings += int(is_clear.sum())
+        apart += int((is_clear & (np.abs(own.slope - fine.slope) > 2 * error + _APART * size)).sum())
+    if apart:
+        text = f"At {apart} of {readings} readings the slope is another at a time step {REFINED} times shorter."
+        yield Finding("note", f"{text} What is said of slopes is of the file's own time step.")
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
@@ -195,12 +202,10 @@ def _times(advantage: float) -> str:
 def slopes(measured: Measured) -> tuple[Slope, ...]:
     """Count over all lines, times and outcomes how often each derivative is not the slope, where there is a clear one."""
     found = []
-    for kind in ("discrete", "slope", "onset"):
+    for kind in ("slope", "discrete"):
         off, errors = [], []
         for line in measured.lines:
-            comparison = line.smooth if kind == "onset" else line.plain
-            if comparison is None or kind not in comparison.gradients:
-                continue
+            comparison = line.plain
             at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
             is_clear = (size > comparison.resolution) & (
                 comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution)
@@ -221,22 +226,15 @@ def recommend(
     """Say what to ask for, from what was measured; without measurements what is never wrong."""
     needed = [largest_step(spring, touch_speed(motions)) for spring in steps_too_long(stability, touch_speed(motions))]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
-    touches = bool(motions.touches or motions.touching)
-    if measured is None:
+    if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
-        return Recommendation(touches, "discrete", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
-    discrete, event, onset = slopes(measured)
+        return Recommendation("slope", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
+    slope, discrete = slopes(measured)
+    # Where both are the slope MuJoCo's own derivative is cheaper, and the more common.
     is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
-    needs_none = not touches or is_exact
-    # Where contacts chatter an slope at MuJoCo's motion has no bound, so it must be better beyond chance, of two counts.
-    is_event_better = event.num_readings > 0 and onset.num_off - event.num_off > 2 * math.sqrt(
-        onset.num_off + event.num_off
-    )
-    best = discrete if needs_none else event if is_event_better else onset
-    # Slow contacts under load may leave an onset derivatives of any size, so that their mean is that of a few.
-    nearest = min((one for one in (event, discrete) if one.num_readings), key=lambda one: one.error, default=onset)
-    if not needs_none and onset.error > max(_WILD, _FARTHER * nearest.error):
-        best = nearest
+    is_better = discrete.num_readings > 0 and discrete.num_off < slope.num_off
+    touches = bool(motions.touches or motions.touching)
+    best = discrete if not touches or is_exact or is_better else slope
     has_jumps = any(len(line.jumps.places) for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
@@ -253,8 +251,7 @@ def recommend(
     is_unknown = not measured.lines or not own
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
-        onset=best.kind == "onset",
-        gradient="slope" if best.kind == "slope" else "discrete",
+        gradient=best.kind,
         estimator="alpha_order" if has_jumps or is_limited or is_unknown else "first_order",
         stddev=stddev,
         horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
@@ -295,8 +292,9 @@ def _time_step(spring: Spring, speed: float | None) -> str:
 
 def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
     """Answer in at most 15 words."""
-    asked = "onset=mg.Onset()" if advice.onset else f'gradient="{advice.gradient}"'
-    answer = f"{asked} and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
+    answer = (
+        f'gradient="{advice.gradient}"' + f" and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
+    )
     minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
     words = {
         "time_step": "the time step is too long",

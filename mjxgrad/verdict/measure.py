@@ -22,7 +22,7 @@ from mjxgrad.estimators.samples import Plan, Samples
 from mjxgrad.objective.base import unchanged
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.verdict.programs import CHUNK, Direction, Moved, Programs, contact_of, moved
+from mjxgrad.verdict.moving import KINDS, Direction, Kind, Moved, Mover, contact_of, moved
 
 _TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
 _SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
@@ -33,7 +33,7 @@ SOFTER = 0.1
 """Stiffness that is tried beside the file's, as a share of it."""
 _NUM_LINES, _NUM_TIMES = 3, 4
 _BEFORE, _AFTER = 30, 40  # steps around the first touch
-_FEWEST_STEPS, _MOST_STEPS = 4 * CHUNK, 30 * CHUNK
+_FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 4
 _NUM_BATCHES = 24.0  # that are moved in all, about
 _LINE_BATCHES, _NOISE_BATCHES = 6, 1
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
@@ -49,24 +49,22 @@ class Line:
     Attributes:
         pose: where it starts, in words.
         varied: what is changed along it, in words.
-        plain: MuJoCo's motion: its slope, and its derivatives by kind; None where there was no time for them.
-        smooth: the motion with an onset, likewise.
-        jumps: of the motion with an onset, over its spread; the parameter is the place on the line.
+        plain: MuJoCo's motion: its slope, and its derivatives by kind.
+        fine: the slope of the motion at a much shorter time step, beside the same derivatives.
+        jumps: of that motion, over its spread; the parameter is the place on the line.
         changed: pairs that touch on one side of the largest jump alone.
         growth: of a change of the start, by time; NaN where only controls are changed.
         num_diverged: motions that left all numbers.
-        num_crowded: motions in which contacts may have found no room.
     """
 
     pose: str
     varied: str
-    plain: SlopeComparison | None
-    smooth: SlopeComparison
+    plain: SlopeComparison
+    fine: SlopeComparison
     jumps: Jumps
     changed: tuple[str, ...]
     growth: Float[np.ndarray, " times"]
     num_diverged: int
-    num_crowded: int
 
 
 @dataclass(frozen=True)
@@ -113,23 +111,23 @@ class Measured:
 def measure(
     scene: Scene,
     motions: Motions,
-    programs: Programs,
+    mover: Mover,
     rng: np.random.Generator,
     *,
     from_start: bool,
     seconds: int | float,
     log: Callable[[str], None],
 ) -> Measured:
-    """Measure along lines and under noise, in about so many seconds, and leave out what does not end before the programs do."""
+    """Measure along lines and under noise, in about so many seconds, and leave out what would not end in time."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
-    lengths = _lengths(programs, motions, onsets, seconds)
+    lengths = _lengths(mover, motions, onsets, seconds)
     num_steps = lengths[-1]
     # A motion that begins to touch late is followed from shortly before.
     begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
     log(f"derivatives over {num_steps} steps, {num_steps * motions.timestep:.3g} s, from motions that touch")
-    probe = _Probe(scene, motions, programs, lengths)
+    probe = _Probe(scene, motions, mover, lengths)
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
     speed = max((touch.speed for touch in motions.touches), default=0.0) or 1.0
     directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
@@ -153,8 +151,8 @@ def measure(
 
     def in_time(_: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
         # Going by what the steps before it took.
-        seconds = num_batches * num_steps / CHUNK * programs.chunk_seconds
-        if time.perf_counter() + seconds > programs.end:
+        seconds = num_batches * num_steps * mover.step_seconds
+        if time.perf_counter() + seconds > mover.end:
             return None
         try:
             return task()
@@ -174,18 +172,17 @@ def measure(
     )
 
 
-def _lengths(programs: Programs, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
+def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
     """Choose how many steps, by when things touch and by how long a step takes here, and at which of them to look."""
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
     still = np.zeros(motions.qvel.shape[2])
-    direction = Direction(still, still, np.zeros((CHUNK, motions.controls.shape[2])))
-    states = _repeated(motions.state(0, 0), programs.size)
-    controls = np.repeat(motions.controls[:1, :CHUNK], programs.size, axis=0)
-    programs.move("onset", states, controls, direction, [CHUNK])
-    affordable = CHUNK * seconds / (_NUM_BATCHES * programs.chunk_seconds)
+    direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
+    states = _repeated(motions.state(0, 0), mover.size)
+    controls = np.repeat(motions.controls[:1, :_TRIED_STEPS], mover.size, axis=0)
+    mover.move("slope", states, controls, direction, [_TRIED_STEPS])
+    affordable = seconds / (_NUM_BATCHES * mover.step_seconds)
     num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
-    num_chunks = num_steps // CHUNK
-    return sorted({CHUNK * max(1, round(num_chunks * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
+    return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
 
 
 def _repeated(state: State, size: int) -> State:
@@ -223,7 +220,7 @@ def _softer(scene: Scene) -> float | None:
 class _Probe:
     scene: Scene
     motions: Motions
-    programs: Programs
+    mover: Mover
     lengths: Sequence[int]
 
     def _at(self, motion: int, begin: int) -> tuple[State, Float[np.ndarray, "steps nu"]]:
@@ -233,31 +230,29 @@ class _Probe:
         """Measure slope, derivatives and jumps along a line."""
         state, controls = self._at(motion, begin)
 
-        def along(kind: str, places: Float[np.ndarray, " motions"]) -> Moved:
-            states = _repeated(state, self.programs.size)
+        def along(kind: Kind, places: Float[np.ndarray, " motions"]) -> Moved:
+            states = _repeated(state, self.mover.size)
             states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
             states.qvel[:] += places[:, None] * direction.velocities
             varied = controls + places[:, None, None] * direction.controls
-            return self.programs.move(kind, states, varied, direction, self.lengths)
+            return self.mover.move(kind, states, varied, direction, self.lengths)
 
-        places = phases((-1.0, 1.0), self.programs.size)
-        kinds = [kind for kind in ("discrete", "slope") if kind in self.programs.kinds]
-        onset, *others = (along(kind, places) for kind in ("onset", *kinds))
-        spreads = np.nanstd(onset.outcomes, axis=0)
+        places = phases((-1.0, 1.0), self.mover.size)
+        found = [along(kind, places) for kind in (*KINDS, "fine")]
+        spreads = np.nanstd(found[0].outcomes, axis=0)
         is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)
-        onset, *others = (one.where(is_felt) for one in (onset, *others))
-        derivatives = [one.derivatives for one in others]
-        plain = compare_to_slope(places, others[0].outcomes, derivatives, kinds) if kinds else None
-        continuous = compare_to_slope(places, onset.outcomes, [onset.derivatives], ("onset",))
-        centre = np.nanmean(onset.outcomes[:, -1], axis=0)
+        *own, fine = (one.where(is_felt) for one in found)
+        derivatives = [one.derivatives for one in own]
+        plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[0], fine))
+        centre = np.nanmean(fine.outcomes[:, -1], axis=0)
         # What has come to rest by then varies by rounding alone.
         is_moving = is_felt[-1] & (spreads[-1] > _AT_REST * spreads.max(axis=0))
         scale = np.where(is_moving, spreads[-1], np.inf)
         jumps = jumps_along(
-            lambda x: (along("onset", x).outcomes[:, -1] - centre) / scale,
+            lambda x: (along("fine", x).outcomes[:, -1] - centre) / scale,
             (-1.0, 1.0),
-            num_points=self.programs.size,
-            num_candidates=self.programs.size // 8,
+            num_points=self.mover.size,
+            num_candidates=self.mover.size // 8,
             num_refinements=_REFINEMENTS,
             smallest=_SMALLEST_JUMP,
         )
@@ -265,12 +260,11 @@ class _Probe:
             pose=self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else ""),
             varied=words,
             plain=plain,
-            smooth=continuous,
+            fine=shorter,
             jumps=jumps,
             changed=self._changed(state, controls, direction, jumps),
-            growth=np.median(onset.growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
-            num_diverged=sum(one.num_diverged for one in (onset, *others[:1])),
-            num_crowded=onset.num_crowded,
+            growth=np.median(own[0].growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
+            num_diverged=sum(one.num_diverged for one in (own[0], fine)),
         )
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
@@ -287,7 +281,7 @@ class _Probe:
     def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:
         """Estimate one derivative by both orders, all controls (or velocities of the start) being noisy."""
         state, controls = self._at(motion, begin)
-        size, steps, half = self.programs.size, self.lengths[-1], half_range(self.scene)
+        size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
         has_controls = self.scene.model.nu > 0
         still = np.zeros(state.qvel.size)
         wiggle = rng.normal(size=(1, still.size))
@@ -304,7 +298,7 @@ class _Probe:
         contact = None
         if stiffness is not None:
             contact = contact_of(Softness(stiffness=stiffness, damping_ratio=1.0).apply(self.scene.model))
-        found = self.programs.move("onset", states, noisy, direction, self.lengths, contact)
+        found = self.mover.move("slope", states, noisy, direction, self.lengths, contact)
         # An outcome depends on the noise of the steps before it alone.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]

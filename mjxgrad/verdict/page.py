@@ -21,7 +21,7 @@ h1 { font-size: 1.35rem; line-height: 1.3; margin: .2rem 0 1rem; overflow-wrap: 
 figure { margin: 0 0 1rem; } figcaption { color: var(--soft); font-size: .9rem; }
 svg { width: 100%; max-width: 34rem; height: auto; display: block; }
 svg text { font: 12px system-ui, sans-serif; fill: var(--ink); }
-svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); }
+svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); } svg .ink { fill: var(--ink); }
 svg .slope { stroke: var(--soft); fill: none; opacity: .6; } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
 table { border-collapse: collapse; font-size: .9rem; } td, th { padding: .2rem .7rem .2rem 0; text-align: right; }
 td:first-child, th:first-child { text-align: left; } .scroll { overflow-x: auto; } video { width: 100%; }
@@ -87,29 +87,31 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
         line = max(jumping, key=lambda one: float(one.jumps.sizes.max()))
         sizes = np.abs(line.jumps.after - line.jumps.before)[line.jumps.largest]
         return line, len(measured.times) - 1, int(sizes.argmax())
-    compared = [line.plain or line.smooth for line in measured.lines]
-    errors = [np.where(one.is_resolved(), one.relative_error[0], 0) for one in compared]
+    compared = [line.plain for line in measured.lines]
+    errors = [np.where(one.is_resolved(), one.relative_error[1], 0) for one in compared]
     number, time, outcome = np.unravel_index(int(np.argmax(errors)), np.shape(errors))
     return measured.lines[int(number)], int(time), int(outcome)
 
 
 def _drawing(line: Line, time: int, outcome: int) -> str:
     """Draw the outcome along the line, and below it its derivatives on the slope that they should have."""
-    shown = {style: one for style, one in (("plain", line.plain), ("smooth", line.smooth)) if one is not None}
-    x, values = line.smooth.parameters, [one.outcomes[:, time, outcome] for one in shown.values()]
-    derivatives = [one.derivatives[0, :, time, outcome] for one in shown.values()]
-    slope = np.gradient(values[-1], x)
+    x, fine = line.plain.parameters, line.fine.outcomes[:, time, outcome]
+    shown = dict(zip(("smooth", "plain"), line.plain.derivatives[:, :, time, outcome], strict=True))
+    slope = np.gradient(fine, x)
     across = lambda at: _LEFT + (at - x[0]) / (x[-1] - x[0]) * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
     marks = []
-    panels = (("outcome", values[-1], values), ("derivative", slope, derivatives))
+    panels = (
+        ("outcome", fine, {"ink": line.plain.outcomes[:, time, outcome]}),
+        ("derivative", slope, {"plain": shown["plain"], "smooth": shown["smooth"]}),
+    )
     for number, (label, curve, dots) in enumerate(panels):
         top = _TOP + number * (_PANEL + _GAP)
-        low, high = _range(curve if number else np.concatenate(dots))
+        low, high = _range(curve if number else np.concatenate([*dots.values(), curve]))
         up = lambda y, top=top, low=low, high=high: top + _PANEL * (1 - (np.clip(y, low, high) - low) / (high - low))  # noqa: E731
         marks.append(f'<path class="axis" fill="none" d="M{_LEFT} {top}v{_PANEL}H{_WIDTH - _RIGHT}"/>')
         marks += [f'<path class="jump" d="M{across(at):.1f} {top}v{_PANEL}"/>' for at in line.jumps.places]
         marks.append(f'<path class="slope" d="{_path(across(x), up(curve))}"/>')
-        for style, heights in zip(shown, dots, strict=True):
+        for style, heights in dots.items():
             marks += [
                 f'<circle class="{style}" cx="{a:.1f}" cy="{b:.1f}" r="1.9"/>'
                 for a, b in zip(across(x), up(heights), strict=True)
@@ -119,9 +121,10 @@ def _drawing(line: Line, time: int, outcome: int) -> str:
         for value in (low, high):
             marks.append(f'<text x="{_LEFT - 6}" y="{up(value) + 4:.1f}" text-anchor="end">{value:.{digits}g}</text>')
         marks.append(f'<text x="{_WIDTH - _RIGHT}" y="{top - 6}" text-anchor="end">{label}</text>')
-    if line.plain is not None:
-        marks.append(f'<text class="plain" x="{_LEFT}" y="14">MuJoCo\'s step</text>')
-    marks.append(f'<text class="smooth" x="{_LEFT + 92}" y="14">with an onset</text>')
+    marks.append(f'<text x="{_LEFT}" y="14">dots: MuJoCo; line: its limit of short time steps</text>')
+    label = _TOP + _PANEL + _GAP - 6
+    marks.append(f'<text class="plain" x="{_LEFT}" y="{label}">gradient="discrete"</text>')
+    marks.append(f'<text class="smooth" x="{_LEFT + 150}" y="{label}">gradient="slope"</text>')
     marks.append(f'<text x="{_LEFT}" y="{_HEIGHT - 6}">place on the line, −1 to 1</text>')
     return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'
 

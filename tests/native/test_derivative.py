@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.dynamics.kinematics import integrate_position
+from mjxgrad.native.engine import engine_of
 
 # MuJoCo's own tolerance would leave more in each difference than it is to be compared to.
 _SOLVER = 'tolerance="1e-14" iterations="200"'
@@ -190,3 +192,24 @@ def test_a_model_that_is_differentiated_is_left_as_it_was(pushed):
     jax.grad(end)(at)
     assert end(at) == before
     assert copy.deepcopy(at).keys() == at.keys()
+
+
+@pytest.mark.parametrize("gradient", ["discrete", "slope"])
+def test_a_change_that_is_followed_is_the_forward_derivative(gradient):
+    """Step by step in one direction, against the Jacobians of all coordinates."""
+    scene = mg.load_scene(SCENES["free box, pyramids"])
+    engine, rng = engine_of(scene.mj_model), np.random.default_rng(5)
+    start = {"time": np.zeros((1, 1)), "qpos": scene.mj_model.qpos0[None] + [0, 0, 0.02, 0, 0, 0, 0], "qvel": rng.normal(size=(1, 6))}
+    start |= {"act": np.zeros((1, 0))}
+    direction = rng.normal(size=12)
+    pushes = np.zeros((1, 60, 0))
+    found = engine.follow(gradient, {}, start, {"ctrl": pushes}, (direction[None], pushes))
+
+    def end(change):
+        qpos = integrate_position(scene.model, jnp.asarray(start["qpos"][0]), change[:6], 1.0)
+        state = mg.initial_state(scene, qpos, start["qvel"][0] + change[6:])
+        return mg.rollout(scene, state, horizon=60, engine="mujoco", gradient=gradient).qvel[1:]
+
+    qvel, change = jax.jvp(end, (jnp.zeros(12),), (jnp.asarray(direction),))
+    np.testing.assert_allclose(found["qvel"][0], qvel, atol=1e-9)
+    np.testing.assert_allclose(found["change"][0, :, 6:], change, atol=1e-5 * np.abs(change).max())
