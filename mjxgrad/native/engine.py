@@ -46,9 +46,10 @@ class Engine:
         self.data = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
         self.start = mujoco.MjData(mj_model)
         self.levers = levers_of(mj_model)
+        bits = {name: getattr(_STATE, f"mjSTATE_{name.upper()}").value for name in (*START, "warmstart", *INPUTS)}
+        begins = {name: mujoco.mj_stateSize(mj_model, _ALL & (bit - 1)) for name, bit in bits.items()}
         self.places = {
-            one: mujoco.mj_stateSize(mj_model, _ALL & (getattr(_STATE, f"mjSTATE_{one.upper()}").value - 1))
-            for one in (*START, "warmstart", *INPUTS)
+            name: slice(begins[name], begins[name] + mujoco.mj_stateSize(mj_model, bit)) for name, bit in bits.items()
         }
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
@@ -59,7 +60,7 @@ class Engine:
             full, user = (self._part(rows, spec) for spec in (_FULL, _USER))
             given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
             for name, value in inputs.items():
-                place = self.places[name] - self.places["ctrl"]
+                place = self.places[name].start - self.places["ctrl"].start
                 width = math.prod(value.shape[2:])
                 given[..., place : place + width] = value.reshape(*value.shape[:2], width)
             found = self.pool.rollout(models, self.data, full, given, control_spec=_USER)[0]
@@ -158,7 +159,7 @@ class Engine:
         mujoco.mj_getState(self.mj_model, self.start, template, _ALL)
         rows = np.tile(template, (len(start["time"]), 1))
         for name, value in start.items():
-            rows[:, self._place(name)] = value.reshape(len(rows), math.prod(value.shape[1:]))
+            rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
         return rows
 
     def _part(self, rows: np.ndarray, spec: int) -> np.ndarray:
@@ -168,18 +169,12 @@ class Engine:
             mujoco.mj_extractState(self.mj_model, row, _ALL, part, spec)
         return found
 
-    def _width(self, name: str) -> int:
-        return mujoco.mj_stateSize(self.mj_model, getattr(_STATE, f"mjSTATE_{name.upper()}").value)
-
-    def _place(self, name: str) -> slice:
-        return slice(self.places[name], self.places[name] + self._width(name))
-
 
 class _Linearisation:
     """The Jacobians of steps by one thread."""
 
     def __init__(self, engine: Engine, data: mujoco.MjData, gradient: Gradient):
-        self.engine, self.data, self.gradient = engine, data, gradient
+        self.engine, self.data, self.gradient, self.places = engine, data, gradient, engine.places
         self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
 
     def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: np.ndarray, found: dict) -> None:
@@ -205,12 +200,12 @@ class _Linearisation:
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
         plain, model = self.models
-        parts, row, change = [self.engine._place(name) for name in START[1:]], row.copy(), change.copy()
+        parts, row, change = [self.places[name] for name in START[1:]], row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
-                row[self.engine._place(name)] = value[t].reshape(-1)
+                row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
-            row[self.engine._place("warmstart")] = self.data.qacc_warmstart
+            row[self.places["warmstart"]] = self.data.qacc_warmstart
             events, clear = self._events(model, row, ends[1])
             size = max(np.abs(change).max(), np.abs(push).max(initial=0.0), 1e-30)
             nv, felt = model.nv, np.zeros(0)
@@ -222,13 +217,13 @@ class _Linearisation:
             sides = []
             for side in (_WIDTH / size, -_WIDTH / size):
                 sides.append(self._moved(model, clear, side * rest))
-                sides[-1][self.engine._place("ctrl")] += side * push
+                sides[-1][self.places["ctrl"]] += side * push
             change = self._difference(model, *sides) * size / (2 * _WIDTH)
             if events is not None:
                 change += self._spanned(model, row, events) @ felt
             for place, end in zip(parts, ends, strict=True):
                 row[place] = end
-            row[self.engine._place("time")] += model.opt.timestep
+            row[self.places["time"]] += model.opt.timestep
             for name, value in zip(START[1:], ends, strict=True):
                 found[name][t] = value
             found["change"][t] = change
@@ -237,7 +232,7 @@ class _Linearisation:
         _, after, _ = self._step(model, row)
         if not np.isfinite(after).all():
             return
-        row[self.engine._place("warmstart")] = self.data.qacc_warmstart
+        row[self.places["warmstart"]] = self.data.qacc_warmstart
         events, clear = self._events(model, row, after)
         self._small(model, clear, found)
         if events is not None:
@@ -250,7 +245,7 @@ class _Linearisation:
         if self.gradient != "slope" or not np.isfinite(after).all():
             return None, row
         mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
-        events = self.surfaces.events(self.far, row[self.engine._place("qvel")], after)
+        events = self.surfaces.events(self.far, row[self.places["qvel"]], after)
         if events is None:
             return None, row
         near = 4 * _WIDTH * np.abs(events.rows).max(axis=1)
@@ -282,7 +277,7 @@ class _Linearisation:
             for column in range(found[name].shape[1]):
                 ends = [row.copy(), row.copy()]
                 for end, side in zip(ends, (1, -1), strict=True):
-                    end[self.engine.places[name] + column] += side * _WIDTH
+                    end[self.places[name].start + column] += side * _WIDTH
                 found[name][:, column] = self._difference(model, *ends) / (2 * _WIDTH)
                 if name == "ctrl" and "D" in found:
                     found["D"][:, column] = self.sensed / (2 * _WIDTH)
@@ -332,10 +327,10 @@ class _Linearisation:
     def _moved(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state moved in tangent space: by its position, or by position, velocity and activation."""
         moved, nv = row.copy(), model.nv
-        mujoco.mj_integratePos(model, moved[self.engine._place("qpos")], change[:nv], 1.0)
+        mujoco.mj_integratePos(model, moved[self.places["qpos"]], change[:nv], 1.0)
         if len(change) > nv:
-            moved[self.engine._place("qvel")] += change[nv : 2 * nv]
-            moved[self.engine._place("act")] += change[2 * nv :]
+            moved[self.places["qvel"]] += change[nv : 2 * nv]
+            moved[self.places["act"]] += change[2 * nv :]
         return moved
 
 

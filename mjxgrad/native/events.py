@@ -104,8 +104,9 @@ class Surfaces:
         is_pyramid = (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL) & (dim > 1)
         # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
         other = first + is_pyramid
-        limits = np.flatnonzero(np.isin(data.efc_type, _LIMITS))
-        is_joint = data.efc_type[limits] == _LIMITS[0]
+        kinds = data.efc_type
+        limits = np.flatnonzero((kinds == _LIMITS[0]) | (kinds == _LIMITS[1]))
+        is_joint = kinds[limits] == _LIMITS[0]
         widths = [np.asarray(contact.solimp).reshape(-1, 5)[acts, 2]]
         for i, joint in zip(data.efc_id[limits].tolist(), is_joint.tolist(), strict=True):
             widths.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i, 2:3])
