@@ -193,10 +193,13 @@ def check(
         say(f"measuring derivatives by {'MJX, which compiles first' if engine == 'mjx' else 'C MuJoCo'}")
         measuring = time.perf_counter()
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
-        measured = measure(scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say)
-        found += measured_findings(measured) if measured.lines else ()
+        try:
+            measured = measure(scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say)
+        except TimeoutError:
+            measured = None
+        found += measured_findings(measured) if measured and measured.lines else ()
         spent["measuring"] = time.perf_counter() - measuring
-        found += left_out_findings(measured if measured.lines else None, budget)
+        found += left_out_findings(measured if measured and measured.lines else None, budget)
     advice = recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
         name=scene.name,

@@ -24,6 +24,7 @@ MANY_PAIRS = 1000
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
 _CLOSE = 0.05  # typical error of a derivative that is the slope
+_FEWEST_TEETH = 4
 _APART = 0.1  # by which share of it the slopes of two time steps are another
 
 _WORDS = {"slope": 'gradient="slope"', "discrete": 'gradient="discrete"'}
@@ -119,15 +120,13 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
     """Yield what lines and noise say."""
-    jumps = [line for line in measured.lines if len(line.jumps.places)]
+    jumps = [line for line in measured.lines if line.changed]
     if jumps:
-        line = max(jumps, key=lambda one: (bool(one.changed), float(one.jumps.sizes.max())))
+        line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
         text = (
             f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side of it alone."
         )
-        if not line.changed:
-            text = f"Along a change of {line.varied} the outcome rises within a 5000th of it, and no pair differs beside it."
-        yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", bool(line.changed))
+        yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", True)
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))
     if largest > LARGEST_GROWTH:
@@ -206,16 +205,21 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
         off, errors = [], []
         for line in measured.lines:
             comparison = line.plain
-            at, size = comparison.gradients.index(kind), np.abs(comparison.slope)
-            is_clear = (size > comparison.resolution) & (
-                comparison.slope_error <= np.maximum(_CLEAR * size, comparison.resolution)
-            )
-            is_scattered = comparison.mean_error[at] > np.maximum(_SCATTERED * size, comparison.resolution)
-            size = np.maximum(size, comparison.resolution)
+            at = comparison.gradients.index(kind)
+            # Outcomes that meet hardly a tooth of the time step have the slope of a tooth: then the shorter step's alone counts.
+            is_told = comparison.num_teeth >= _FEWEST_TEETH
+            truths = [line.fine.slope, np.where(is_told, comparison.slope, line.fine.slope)]
+            spread = np.where(is_told, np.maximum(comparison.slope_error, line.fine.slope_error), line.fine.slope_error)
+            size = np.abs(line.fine.slope)
+            is_clear = (size > line.fine.resolution) & (spread <= np.maximum(_CLEAR * size, line.fine.resolution))
+            mean, error = comparison.mean[at], comparison.mean_error[at]
+            off_by = np.maximum(0.0, np.maximum(np.min(truths, axis=0) - mean, mean - np.max(truths, axis=0)))
+            size = np.maximum(size, line.fine.resolution)
+            is_scattered = error > _SCATTERED * size
             # A derivative that scatters little is not worse for being seen to be a percent off.
-            is_far = comparison.is_off()[at] & (np.abs(comparison.error[at]) > _CLOSE * size)
+            is_far = (off_by > 2 * np.hypot(error, spread)) & (off_by > _CLOSE * size)
             off += (is_far | is_scattered)[is_clear].tolist()
-            errors += (np.abs(comparison.error[at]) / size)[is_clear].tolist()
+            errors += (off_by / size)[is_clear].tolist()
         found.append(Slope(kind, sum(off), len(off), float(np.median(errors)) if errors else math.nan))
     return tuple(found)
 
@@ -235,7 +239,7 @@ def recommend(
     is_better = discrete.num_readings > 0 and discrete.num_off < slope.num_off
     touches = bool(motions.touches or motions.touching)
     best = discrete if not touches or is_exact or is_better else slope
-    has_jumps = any(len(line.jumps.places) for line in measured.lines)
+    has_jumps = any(line.changed for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
     softer = [noise for noise in measured.noises if noise.stiffness is not None and noise.stddev == stddev]

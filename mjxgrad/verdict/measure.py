@@ -22,7 +22,7 @@ from mjxgrad.estimators.samples import Plan, Samples
 from mjxgrad.objective.base import unchanged
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.verdict.moving import KINDS, Direction, Kind, Moved, Mover, contact_of, moved
+from mjxgrad.verdict.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 
 _TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
 _SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
@@ -39,6 +39,7 @@ _LINE_BATCHES, _NOISE_BATCHES = 6, 1
 _SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
 _AT_REST = 1e-3  # of the largest variation at any time
 _UNFELT = 1e-6  # of the largest spread of all outcomes, or of 10⁻⁶: what varies by less is rounding
+_BESIDE = 0.05  # of half a line to either side of a jump: where to look for what touches
 _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
 
 
@@ -272,10 +273,10 @@ class _Probe:
         if jumps.largest < 0:
             return ()
         place, sides = jumps.places[jumps.largest], []
-        for x in (place - 0.01, place + 0.01):
+        for x in (place - _BESIDE, place + _BESIDE):
             qpos = jnp.asarray(moved(self.scene.mj_model, np.asarray(state.qpos)[None], direction.positions, x)[0])
             start = State(qpos, state.qvel + x * direction.velocities, state.act, state.time, state.warmstart)
-            sides.append(pairs_at(self.scene, start, controls + x * direction.controls))
+            sides.append(pairs_at(self.scene, start, controls + x * direction.controls, REFINED))
         return tuple(sorted(sides[0] ^ sides[1]))
 
     def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:

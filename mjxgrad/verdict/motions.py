@@ -191,9 +191,13 @@ def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
     return max(0.0, -float(data.efc_vel[contact.efc_address : contact.efc_address + num_rows].mean()))
 
 
-def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"]) -> frozenset[str]:
-    """Return what touches at any time of a motion by C MuJoCo."""
+def pairs_at(
+    scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1
+) -> frozenset[str]:
+    """Return what touches at any time of a motion by C MuJoCo, at a time step so many times shorter."""
     model = scene.to_mujoco()
+    model.opt.timestep /= refined
+    controls = np.repeat(controls, refined, axis=0)
     qpos, qvel, _, _ = _roll(model, tuple(np.asarray(x, float) for x in (state.qpos, state.qvel, state.act)), controls)
     touches, touching, _ = _touches(model, qpos[None], qvel[None])
     return frozenset([touch.pair for touch in touches]) | frozenset(touching)

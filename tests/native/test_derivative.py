@@ -199,7 +199,11 @@ def test_a_change_that_is_followed_is_the_forward_derivative(gradient):
     """Step by step in one direction, against the Jacobians of all coordinates."""
     scene = mg.load_scene(SCENES["free box, pyramids"])
     engine, rng = engine_of(scene.mj_model), np.random.default_rng(5)
-    start = {"time": np.zeros((1, 1)), "qpos": scene.mj_model.qpos0[None] + [0, 0, 0.02, 0, 0, 0, 0], "qvel": rng.normal(size=(1, 6))}
+    start = {
+        "time": np.zeros((1, 1)),
+        "qpos": scene.mj_model.qpos0[None] + [0, 0, 0.02, 0, 0, 0, 0],
+        "qvel": rng.normal(size=(1, 6)),
+    }
     start |= {"act": np.zeros((1, 0))}
     direction = rng.normal(size=12)
     pushes = np.zeros((1, 60, 0))
