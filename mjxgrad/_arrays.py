@@ -1,13 +1,33 @@
 """What is known of arrays while a program is traced, and roots whose derivatives exist where the usual ones have none."""
 
+import functools
 import operator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+_Function = TypeVar("_Function", bound=Callable)
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile a function of arrays, or of trees with arrays, once for each shape and structure of them.
+
+    Called with traced values it is part of a larger program and left to that, in which more of the values may be known. It must
+    depend on its arguments alone: what it reads besides is read once.
+    """
+    program = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return (function if is_traced else program)(*args, **kwargs)
+
+    return call  # pyright: ignore[reportReturnType]
 
 
 def as_float(value: Any) -> Any:

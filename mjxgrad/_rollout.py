@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import form, known, whole
+from mjxgrad._arrays import compiled, form, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._native import roll_out
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
@@ -222,6 +222,40 @@ def rollout(
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
     settings = {"onset": onset, "smoothing": smoothing}
+    # Functions may read what changes from call to call: they are traced anew in each, unless the caller compiles.
+    is_plain = policy is None and observe is None
+    return (_rolled_out_compiled if is_plain else _rolled_out)(
+        scene,
+        state,
+        inputs,
+        policy,
+        None if is_plain else params,
+        observe,
+        policy_sees,
+        checkpoint,
+        gradient,
+        settings,
+        velocity_limit,
+        measure_growth,
+    )
+
+
+def _rolled_out(
+    scene: Scene,
+    state: State,
+    inputs: tuple[Array, Array],
+    policy: Policy | None,
+    params: PyTree,
+    observe: Observe | None,
+    policy_sees: Sees,
+    checkpoint: bool,
+    gradient: Gradient,
+    settings: dict[str, Any],
+    velocity_limit: float | None,
+    measure_growth: bool,
+) -> Trajectory:
+    """Return what `rollout` does, once all of its arguments are known to be right."""
+    onset, smoothing, (horizon, nu) = settings["onset"], settings["smoothing"], inputs[0].shape
     has_stages = scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
     def look(state: State, ctrl: Array, stepped: mjx.Data | None = None) -> PyTree:
@@ -297,6 +331,9 @@ def rollout(
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
+
+
+_rolled_out_compiled = compiled(_rolled_out)
 
 
 def _check_scene(scene: Any) -> None:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import compiled
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State
 from mjxgrad.dynamics import Smoothing, step
@@ -154,23 +155,7 @@ class SceneSystem(System):
         return state[..., : self.scene.model.nq]
 
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
-        nq, nv = self.scene.model.nq, self.scene.model.nv
-        data = self.scene.data.replace(
-            qpos=state[:nq],
-            qvel=state[nq : nq + nv],
-            act=state[nq + nv :],
-            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
-            ctrl=control,
-        )
-
-        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            # Only what the next step needs is carried: the rest of Data would be copied in every turn.
-            moved = step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
-            names = ("qpos", "qvel", "act", "qacc_warmstart")
-            return data.replace(**{name: getattr(moved, name) for name in names}), None
-
-        data, _ = jax.lax.scan(advance, data, None, length=self.num_substeps)
-        return jnp.concatenate([data.qpos, data.qvel, data.act])
+        return _held(self, state, control)
 
     def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv
@@ -185,6 +170,28 @@ class SceneSystem(System):
     def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
         """Give the system with another smoothing; None takes it away."""
         return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
+
+
+@compiled
+def _held(system: SceneSystem, state: StateVector, control: ControlVector) -> StateVector:
+    """Return the state after the system's time steps under one control."""
+    nq, nv = system.scene.model.nq, system.scene.model.nv
+    data = system.scene.data.replace(
+        qpos=state[:nq],
+        qvel=state[nq : nq + nv],
+        act=state[nq + nv :],
+        qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
+        ctrl=control,
+    )
+
+    def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+        # Only what the next step needs is carried: the rest of Data would be copied in every turn.
+        moved = step(system.scene.model, data, gradient=system.gradient, smoothing=system.smoothing)
+        names = ("qpos", "qvel", "act", "qacc_warmstart")
+        return data.replace(**{name: getattr(moved, name) for name in names}), None
+
+    data, _ = jax.lax.scan(advance, data, None, length=system.num_substeps)
+    return jnp.concatenate([data.qpos, data.qvel, data.act])
 
 
 class Cost(eqx.Module):
@@ -221,7 +228,7 @@ class GoalCost(Cost):
     stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
-    resting: Float[ArrayLike, "..."] = 0.0
+    resting: Float[Array, "..."] = eqx.field(converter=jnp.asarray, default=0.0)
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
         distance, effort = system.difference(state, self.goal), control - self.resting

@@ -8,9 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad._arrays import known
+from mjxgrad._arrays import compiled, known
 from mjxgrad.planning.linear_model import LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, Cost, Quadratic, System, stage_model, terminal_model
+from mjxgrad.planning.system import (
+    ControlVector,
+    Cost,
+    Quadratic,
+    StateVector,
+    System,
+    stage_model,
+    terminal_model,
+)
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
@@ -203,6 +211,23 @@ def optimise_trajectory(
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
     _check(system, controls, factors, lower, upper)
+    return _improved(system, cost, start, controls, key, smoother, factors, lower, upper)
+
+
+# Its own program, whose data are arguments: a receding horizon plans again and again, and compiles once.
+@compiled
+def _improved(
+    system: System,
+    cost: Cost,
+    start: StateVector,
+    controls: _Controls,
+    key: PRNGKeyArray,
+    smoother: Smoother,
+    factors: Float[Array, " iterations"],
+    lower: ControlVector,
+    upper: ControlVector,
+) -> Plan:
+    """Return the plan, as `optimise_trajectory` does once it has looked at what it was given."""
     horizon = len(controls)
     problem = _Problem(system, cost, smoother, jax.random.split(key, horizon), lower, upper)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
