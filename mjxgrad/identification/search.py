@@ -7,10 +7,11 @@ point and chooses the next.
 """
 
 import dataclasses
+import functools
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,9 +21,10 @@ from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._rollout import DivergedError
 from mjxgrad.dynamics import Gradient, Onset
-from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
+from mjxgrad.identification.parameters import Coordinates, Parameter, Values, Write, Writer, unravelled, write_all
+from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
-from mjxgrad.identification.result import Identification, Stopped, on_host, statistics
+from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.scene import Scene
 
 Apply = Callable[[Scene, Values], Scene]
@@ -35,6 +37,8 @@ _FIRST_SIZE = 3.0  # with less a first step may go too far to come back
 _GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
 # Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_SIDE_BY_SIDE = 64  # points in one batch, for memory
+_DIVERGED = 1e30  # sum of squares of a motion that did
 _NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
 
 
@@ -47,14 +51,14 @@ class Experiment:
         recordings: to fit.
         held_out: to judge by.
         apply: from the scene, all parameters as a vector and what `prepare` returned to the scene with them.
-        prepare: computed outside of the program from the parameters' values, before each call of it.
+        prepare: computed outside of the program from the parameters' values, before each call of it; None for nothing.
     """
 
     scene: Scene
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
     apply: Callable[[Scene, Array, PyTree], Scene]
-    prepare: Callable[[np.ndarray], PyTree] = lambda values: None
+    prepare: Callable[[np.ndarray], PyTree] | None = None
 
 
 def identify(
@@ -66,9 +70,10 @@ def identify(
     apply: Apply | None = None,
     delay: str | None = None,
     free_start: bool = False,
-    onset: Onset | Literal["default"] | None = "default",
+    onset: Onset | None = None,
     gradient: Gradient = "discrete",
     max_steps: int = 100,
+    num_points: int = 256,
     log: Log | None = None,
 ) -> Identification:
     r"""Find parameters of a scene from recorded motions, through contact.
@@ -85,10 +90,13 @@ def identify(
         apply: called as `apply(scene, values)` after the parameters have written theirs, for what takes several of them.
         delay: name of the parameter, if any, by which controls act later than recorded (s).
         free_start: find the start of every recording, too, from where it says; for starts as noisy as the rest.
-        onset: as of `rollout`; by default `mg.Onset()`. Contacts then begin within the step, and the derivative is the slope of
-            the motion. With None the simulation is MuJoCo's to the bit, and a search through impacts may stall.
+        onset: as of `rollout`. None is MuJoCo's motion, which what MuJoCo has recorded needs: another is off by more than the
+            intervals. `mg.Onset()` is the smoother motion to search in, where real things were recorded.
         gradient: as of `rollout`.
         max_steps: simulations with derivatives at most.
+        num_points: if the descent leaves more than the noise that the recordings say, as where contacts chatter, so many points
+            between the bounds are narrowed down to what explains the recordings, moment by moment, and the descent begins again
+            at the best. 0 for no such search; there is none with `free_start`.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
@@ -110,15 +118,31 @@ def identify(
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     coordinates = Coordinates.of(parameters)
 
-    def put(scene: Scene, vector: Array, _: None) -> Scene:
-        values = coordinates.unravel(vector)
-        changed = write_all(scene, parameters, values)
-        return changed if apply is None else apply(changed, values)
-
+    # A program is kept for writers alone, which read their arguments alone: functions of one's own may read what has changed.
+    writes = tuple(
+        (name, write if isinstance(write, Writer) else functools.partial(write))
+        for name, parameter in parameters.items()
+        if (write := parameter.write) is not None
+    )
+    put = _Put(coordinates.shapes, writes, None if apply is None else functools.partial(apply))
     experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
     settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
     units = {name: parameter.unit for name, parameter in parameters.items()}
-    return search(experiments, coordinates, units, max_steps=max_steps, log=log, **settings)
+    return search(experiments, coordinates, units, max_steps=max_steps, num_points=num_points, log=log, **settings)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Put:
+    """Writes all parameters to a scene."""
+
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
+    writes: tuple[tuple[str, Write], ...]
+    apply: Apply | None
+
+    def __call__(self, scene: Scene, vector: Array, _: None) -> Scene:
+        values = unravelled(self.shapes, vector)
+        changed = write_all(scene, dict(self.writes), values)
+        return changed if self.apply is None else self.apply(changed, values)
 
 
 def search(
@@ -128,13 +152,11 @@ def search(
     *,
     max_steps: int,
     log: Log | None,
+    num_points: int = 0,
     free_start: bool,
-    onset: Onset | Literal["default"] | None,
     **settings: Any,
 ) -> Identification:
     """Run the search over experiments of any kind; see `identify`."""
-    # Not made with the signature: that would use a device when the package is imported.
-    settings["onset"] = Onset() if isinstance(onset, str) else onset
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     try:  # before anything is compiled
@@ -142,9 +164,20 @@ def search(
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     program = _Program(experiments, coordinates, free_start, **settings)
-    point, found, num_steps, ended, first, removable = _descend(optimistix, program, max_steps, log)
+    start = program.start()
+    point, found, num_steps, ended, first, removable = _descend(optimistix, program, start, max_steps, log)
+    numbers, has_noise = (
+        program.num_numbers,
+        all(set(r.noise) == set(r.measured) for e in experiments for r in e.recordings),
+    )
+    if num_points and has_noise and not free_start and exceeds_noise(_rms(program, found), numbers - len(start)):
+        begin = program.searched(num_points)
+        again = None if begin is None else _descend(optimistix, program, begin, max_steps, log)
+        if again is not None and _rms(program, again[1]) < _rms(program, found):
+            point, found, more, ended, _, removable = again
+            num_steps += more
     values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
-    numbers, explained = program.num_numbers, on_host(found)
+    explained = on_host(found)
     residual, slope, num_offsets = _without_offsets(explained)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
@@ -163,6 +196,7 @@ def search(
         inseparable=verdict.inseparable,
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(first, float(after / np.sqrt(numbers))),
+        has_noise=has_noise,
         held_out_rms=program.held_out_rms(nominal, values),
         offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
         correlation=_correlation(program.windows, explained),
@@ -176,46 +210,93 @@ def search(
     )
 
 
-class _Program:
-    """Residuals and their derivatives by values and offsets, compiled once."""
+class _Problem(eqx.Module):
+    """All that residuals depend on but the numbers looked for: arguments of programs that other data of the same shapes share."""
 
-    def __init__(
-        self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
-    ):
-        self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
-        self._delay, self._settings = delay, settings
-        self.windows = [stack(one.scene, one.recordings) for one in experiments]
-        self.num_numbers = sum(int((np.asarray(w) > 0).sum()) for one in self.windows for w in one.weight.values())
-        self._evaluate = jax.jit(self._traced)
+    scenes: tuple[Scene, ...]
+    windows: tuple[Windows, ...]
+    coordinates: Coordinates
+    onset: Onset | None
+    applies: tuple[Callable[[Scene, Array, PyTree], Scene], ...] = eqx.field(static=True)
+    delay: str | None = eqx.field(static=True)
+    gradient: Gradient = eqx.field(static=True)
 
-    def _residuals(
-        self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
-    ) -> Array:
-        scene = experiment.apply(experiment.scene, vector, prepared)
-        delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
-        residual, diverged = residuals(scene, window, offset, delay, **self._settings)
+    def residuals(self, i: int, vector: Array, offset: Array | None, window: Windows, prepared: PyTree) -> Array:
+        """Return the residuals of one window of the scene number i; infinite if its motion diverged."""
+        scene = self.applies[i](self.scenes[i], vector, prepared)
+        delay = None if self.delay is None else self.coordinates.unravel(vector)[self.delay]
+        residual, diverged = residuals(scene, window, offset, delay, onset=self.onset, gradient=self.gradient)
         return jnp.where(diverged, jnp.inf, residual)
 
-    def _traced(self, vector: Array, offsets: list[Array], prepared: list[PyTree]) -> list[tuple[Array, ...]]:
-        found = []
-        for i, experiment in enumerate(self.experiments):
 
-            def one(window: Windows, offset: Array | None, experiment=experiment, prepared=prepared[i]):
-                def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                    residual = self._residuals(experiment, vector, offset, window, prepared)
-                    return residual, residual
+@eqx.filter_jit
+def _linearised(
+    problem: _Problem, vector: Array, offsets: list[Array] | None, prepared: list[PyTree]
+) -> list[tuple[Array, ...]]:
+    """Return residuals of all windows of each scene, their derivative by the numbers, and by the offsets of starts if any."""
+    found = []
+    for i, windows in enumerate(problem.windows):
 
-                argnums = (0, 1) if self.free_start else (0,)
-                slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
-                return residual, *slopes
+        def one(window: Windows, offset: Array | None, i=i):
+            def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
+                residual = problem.residuals(i, vector, offset, window, prepared[i])
+                return residual, residual
 
-            found.append(jax.vmap(one)(self.windows[i], offsets[i] if self.free_start else None))
-        return found
+            argnums = (0,) if offsets is None else (0, 1)
+            slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
+            return residual, *slopes
+
+        found.append(jax.vmap(one)(windows, None if offsets is None else offsets[i]))
+    return found
+
+
+@eqx.filter_jit
+def _sums(
+    problem: _Problem, vectors: Float[Array, "points dim"], prepared: list[PyTree]
+) -> Float[Array, "points rows"]:
+    """Return for each vector the sum of squares over all windows, up to each of their rows."""
+    num_rows = max(windows.index.shape[1] for windows in problem.windows)
+
+    def of_window(i: int, vector: Array, window: Windows) -> Array:
+        squares = problem.residuals(i, vector, None, window, prepared[i]) ** 2
+        ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
+        of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
+        return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
+
+    def of_one(vector: Array) -> Array:
+        parts = [
+            jax.vmap(functools.partial(of_window, i, vector))(windows).sum(axis=0)
+            for i, windows in enumerate(problem.windows)
+        ]
+        return jnp.cumsum(sum(parts))
+
+    return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
+
+
+class _Program:
+    """Residuals and their derivatives by values and offsets."""
+
+    def __init__(self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, **settings: Any):
+        self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
+        self._settings = settings
+        self.problem = self._problem(experiments, [one.recordings for one in experiments])
+        self.windows = self.problem.windows
+        self.num_numbers = _num_numbers(self.windows)
+
+    def _problem(self, experiments: Sequence[Experiment], recordings: Sequence[Sequence[Recording]]) -> _Problem:
+        scenes = tuple(one.scene for one in experiments)
+        windows = tuple(map(stack, scenes, recordings))
+        applies = tuple(one.apply for one in experiments)
+        return _Problem(scenes, windows, self.coordinates, applies=applies, **self._settings)
 
     def __call__(self, point: Array) -> list[tuple[Array, ...]]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
-        prepared = [one.prepare(np.asarray(vector, float)) for one in self.experiments]
-        return self._evaluate(vector, self.offsets(point), prepared)
+        offsets = self.offsets(point) if self.free_start else None
+        return _linearised(self.problem, vector, offsets, self._prepared(self.experiments, np.asarray(vector, float)))
+
+    def _prepared(self, experiments: Sequence[Experiment], values: np.ndarray) -> list[PyTree]:
+        found = [None if one.prepare is None else one.prepare(values) for one in experiments]
+        return jax.tree.map(jnp.asarray, found)
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
@@ -230,6 +311,23 @@ class _Program:
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
+    def searched(self, num_points: int) -> Array | None:
+        """Return the best of many points between the bounds, found as `particles` does; None if none explains the recordings."""
+        dtype, nothing = self.coordinates.nominal.dtype, [None] * len(self.experiments)
+        weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
+        counts = np.zeros(max(there.shape[1] for there in weights))
+        for there in weights:
+            counts[: there.shape[1]] += there.sum(axis=(0, 2))
+        low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
+
+        def sums_at(points: np.ndarray) -> np.ndarray:
+            vectors = self.coordinates.values(jnp.asarray(points, dtype))
+            found = np.asarray(_sums(self.problem, vectors, nothing), float)
+            return np.where(np.isfinite(found), found, _DIVERGED)
+
+        best = best_point(sums_at, low, high, np.cumsum(counts), num_points)
+        return None if best is None else jnp.asarray(best, dtype)
+
     def offsets(self, point: Array) -> list[Array]:
         """Return the part of a point that moves the starts, one array for each experiment."""
         found, first = [], len(self.coordinates.names)
@@ -242,43 +340,43 @@ class _Program:
     def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
         """Return the experiments' scenes with these values."""
         vector = jnp.asarray(values, self.coordinates.nominal.dtype)
-        return tuple(one.apply(one.scene, vector, one.prepare(values)) for one in self.experiments)
+        prepared = self._prepared(self.experiments, values)
+        return tuple(one.apply(one.scene, vector, part) for one, part in zip(self.experiments, prepared, strict=True))
 
     def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
         """Return what is left of the recordings that were held out, at each point; None without any."""
-        judged = [(one, stack(one.scene, one.held_out)) for one in self.experiments if one.held_out]
+        judged = [one for one in self.experiments if one.held_out]
         if not judged:
             return None
-
-        @jax.jit
-        def of_all(vector: Array, prepared: list[PyTree]) -> Array:
-            parts = [
-                jax.vmap(lambda w, e=e, f=f: self._residuals(e, vector, None, w, f))(w).ravel()
-                for (e, w), f in zip(judged, prepared, strict=True)
-            ]
-            return jnp.linalg.norm(jnp.concatenate(parts))
-
-        count = sum(int((np.asarray(w) > 0).sum()) for _, one in judged for w in one.weight.values())
-        dtype = self.coordinates.nominal.dtype
-        found = [of_all(jnp.asarray(p, dtype), [one.prepare(p) for one, _ in judged]) for p in points]
-        first, last = (float(x) / math.sqrt(count) for x in found)
+        problem = self._problem(judged, [one.held_out for one in judged])
+        vectors = jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
+        sums = [_sums(problem, v[None], self._prepared(judged, p))[0, -1] for v, p in zip(vectors, points, strict=True)]
+        first, last = (math.sqrt(float(x) / _num_numbers(problem.windows)) for x in sums)
         return first, last
 
 
-def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None):
+def _rms(program: _Program, found: list[tuple[Array, ...]]) -> float:
+    return math.sqrt(sum(float(jnp.sum(one[0] ** 2)) for one in found) / program.num_numbers)
+
+
+def _num_numbers(windows: Sequence[Windows]) -> int:
+    return sum(int((np.asarray(w) > 0).sum()) for one in windows for w in one.weight.values())
+
+
+def _descend(optimistix: Any, program: _Program, point: Array, max_steps: int, log: Log | None):
     """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
-    point, (lower, upper) = program.start(), program.box()
+    lower, upper = program.box()
     found = best = program(point)
-    length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
-    if not np.isfinite(length):
+    first = _rms(program, found)
+    if not np.isfinite(first):
         reason = "got one that diverged: begin elsewhere"
         raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
-    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
+    size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
-    state, step = _levenberg_marquardt(optimistix, point, linear)
+    solver, state = _levenberg_marquardt(optimistix, point, linear)
     refusals, slow, removable, total = 0, 0, 1.0, math.inf
     for count in range(1, max_steps + 1):
-        point, state, _ = step(point, state, linear)
+        point, state, _ = _step(solver, point, state, linear)
         is_accepted = int(state.num_steps_since_acceptance) == 0
         if is_accepted:
             fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
@@ -298,14 +396,19 @@ def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None
     return point, best, max_steps, False, first, removable
 
 
-def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
-    """Return optimistix's state at the start and its step, which sees linear models alone."""
+def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Any]:
+    """Return optimistix's solver and its state at the start; it sees linear models alone."""
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
     struct = jax.eval_shape(lambda: linear[1])
-    state = solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
-    return state, eqx.filter_jit(lambda y, state, linear: solver.step(_predict, y, linear, {}, state, frozenset()))
+    return solver, solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
+
+
+@eqx.filter_jit
+def _step(solver: Any, point: Array, state: Any, linear: tuple[Array, Array, Array]) -> tuple[Array, Any, Any]:
+    """Return the next point, the state there, and what optimistix says besides."""
+    return solver.step(_predict, point, linear, {}, state, frozenset())
 
 
 def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:

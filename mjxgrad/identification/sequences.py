@@ -9,8 +9,9 @@ Principal moments and axes of inertia are differenced as the pseudo-inertia: the
 """
 
 import copy
+import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -47,7 +48,7 @@ def identify_sequences(
     sensor_weights: dict[str, float] | None = None,
     held_out: Sequence[str] = (),
     free_start: bool = False,
-    onset: Onset | Literal["default"] | None = "default",
+    onset: Onset | None = None,
     gradient: Gradient = "discrete",
     max_steps: int = 100,
     log: Log | None = None,
@@ -65,7 +66,7 @@ def identify_sequences(
         sensor_weights: by name of a sensor.
         held_out: names of sequences that are only judged by.
         free_start: as of `identify`.
-        onset: as of `identify`; None for the same motion as `mujoco.sysid`'s.
+        onset: as of `identify`; None is the motion of `mujoco.sysid`.
         gradient: as of `identify`.
         max_steps: as of `identify`.
         log: as of `identify`.
@@ -115,7 +116,7 @@ def _experiment(
         (judged if name in held_out else kept).extend(_recordings(scene, name, rollout, weights))
     if not kept:
         raise ValueError(f"held_out must leave a sequence of {sequence.name}, got all of {sequence.sequence_name}")
-    return Experiment(scene, kept, judged, fields.put, fields.at)
+    return Experiment(scene, kept, judged, _Put(tuple(fields.bodies.tolist())), fields.at)
 
 
 class _CompiledFields:
@@ -131,7 +132,7 @@ class _CompiledFields:
         self.inside = self._compile(low + np.random.default_rng(0).uniform(0.4, 0.6, start.shape) * (high - low))
         self._refuse_structure()
         self._names: list[str] = []
-        self._bodies = np.zeros(0, int)
+        self.bodies = np.zeros(0, int)
 
     def _compile(self, vector: np.ndarray) -> mujoco.MjModel:
         self._parameters.update_from_vector(np.asarray(vector, float))
@@ -149,7 +150,7 @@ class _CompiledFields:
             if name in changed
         ]
         if moved:
-            self._bodies = np.flatnonzero(np.concatenate(moved, axis=1).any(axis=1))
+            self.bodies = np.flatnonzero(np.concatenate(moved, axis=1).any(axis=1))
         self._names = [name for name in changed if name not in (*_BODY, *derived)]
 
     def _refuse_structure(self) -> None:
@@ -172,8 +173,8 @@ class _CompiledFields:
     def _numbers(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         model = self._compile(vector)
         found = {name: np.array(_read(model, name)) for name in self._names}
-        if self._bodies.size:
-            parts = [getattr(model, name)[self._bodies] for name in _BODY]
+        if self.bodies.size:
+            parts = [getattr(model, name)[self.bodies] for name in _BODY]
             found["pseudo"] = np.stack([second_moments(*one) for one in zip(*parts, strict=True)])
         return found
 
@@ -190,7 +191,14 @@ class _CompiledFields:
                 slopes.setdefault(name, []).append((above[name] - below[name]) / (ends[1] - ends[0]))
         return {name: (value, np.stack(slopes[name], axis=-1)) for name, value in self._numbers(vector).items()}
 
-    def put(self, scene: Scene, vector: Array, numbers: dict[str, Any]) -> Scene:
+
+@dataclasses.dataclass(frozen=True)
+class _Put:
+    """Writes numbers of a compiled model to a scene, and those of its bodies as pseudo-inertias."""
+
+    bodies: tuple[int, ...]
+
+    def __call__(self, scene: Scene, vector: Array, numbers: dict[str, Any]) -> Scene:
         """Return the scene with numbers whose values and derivatives by the parameters are these."""
         change = vector - jax.lax.stop_gradient(vector)  # zero, but for its derivative
         dtype = vector.dtype
@@ -198,7 +206,7 @@ class _CompiledFields:
         pseudo = found.pop("pseudo", None)
         if pseudo is not None:
             for name, part in jax.vmap(body_fields)(pseudo).items():
-                found[name] = getattr(scene.model, name).at[self._bodies].set(part)
+                found[name] = getattr(scene.model, name).at[np.array(self.bodies)].set(part)
         options: dict[str, Any] = {name: found.pop(name) for name in list(found) if name.startswith("opt.")}
         changed = scene.with_model(**found) if found else scene
         return eqx.tree_at(lambda s: s.model, changed, changed.model.tree_replace(options)) if options else changed
