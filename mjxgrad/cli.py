@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import mjxgrad as mg
 import optax
 
+mg.keep_compiled()  # on disk, so that the next run starts at once
 HORIZON, STEPS_PER_KNOT = {horizon}, {per_knot}  # time steps
 scene = mg.load_scene({path!r}{settings})
 
@@ -344,7 +345,9 @@ def _library() -> Any:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    return importlib.import_module("mjxgrad")
+    library = importlib.import_module("mjxgrad")
+    library.keep_compiled()
+    return library
 
 
 def _existing(path: str) -> str:

@@ -1,4 +1,4 @@
-"""A batch split over devices, each of which works on its part alone.
+"""A batch split over devices, each of which works on its part alone; and compiled programs kept from one process to the next.
 
 XLA runs one small operation after another, and a processor's second core idles most of that time. As two devices
 (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
@@ -7,7 +7,13 @@ them all.
 """
 
 import functools
+import hashlib
+import importlib.metadata
+import os
+import platform
+import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -65,3 +71,53 @@ def over_devices(
         return jax.shard_map(of_part, mesh=mesh, in_specs=(specs,), out_specs=part, check_vma=False)(given)
 
     return wrapped
+
+
+def keep_compiled(folder: str | Path | None = None) -> Path | None:
+    """Keep compiled programs on disk, so that the next process need not compile them again. Call it before anything is computed.
+
+    It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
+    so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
+
+    Args:
+        folder: where; None is `mjxgrad` in the user's folder of caches.
+
+    Returns:
+        The folder in use; None if it cannot be written, and nothing is kept.
+    """
+    if present := jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        return Path(present)
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjxgrad"
+        place = Path(folder or caches).absolute() / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
+        place.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # read-only, or there is no home
+        return None
+    if not os.access(place, os.W_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    show, told = warnings.showwarning, []
+
+    def show_once(message: Any, *args: Any, **kwargs: Any) -> None:
+        # JAX warns of every program that cannot be read or written: dozens of lines with one cause.
+        if "persistent compilation cache" in str(message):
+            told.append(message)
+            message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
+            if len(told) > 1:
+                return
+        show(message, *args, **kwargs)
+
+    warnings.showwarning = show_once
+    return place
+
+
+def _processor() -> str:
+    """Return a short name of what programs are compiled for: the processor with all that it can do."""
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
+    kinds = sorted(
+        {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))} or lines[:1]
+    )
+    return f"{platform.machine()}-{hashlib.sha256(''.join(kinds).encode()).hexdigest()[:8]}"

@@ -103,7 +103,7 @@ def identify(
         The values, their intervals, and what the recordings cannot tell; `print(result.summary())`.
 
     Raises:
-        ValueError: if there are no parameters or recordings, or shapes do not fit the scene.
+        ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
         ImportError: if optimistix is not installed.
     """
@@ -282,6 +282,8 @@ class _Program:
         self.problem = self._problem(experiments, [one.recordings for one in experiments])
         self.windows = self.problem.windows
         self.num_numbers = _num_numbers(self.windows)
+        if not self.num_numbers:
+            raise ValueError("recordings must hold something that was measured, got NaN alone")
 
     def _problem(self, experiments: Sequence[Experiment], recordings: Sequence[Sequence[Recording]]) -> _Problem:
         scenes = tuple(one.scene for one in experiments)

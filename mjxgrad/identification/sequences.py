@@ -116,7 +116,7 @@ def _experiment(
         (judged if name in held_out else kept).extend(_recordings(scene, name, rollout, weights))
     if not kept:
         raise ValueError(f"held_out must leave a sequence of {sequence.name}, got all of {sequence.sequence_name}")
-    return Experiment(scene, kept, judged, _Put(tuple(fields.bodies.tolist())), fields.at)
+    return Experiment(scene, kept, judged, fields.put, fields.at)
 
 
 class _CompiledFields:
@@ -190,6 +190,11 @@ class _CompiledFields:
             for name in below:
                 slopes.setdefault(name, []).append((above[name] - below[name]) / (ends[1] - ends[0]))
         return {name: (value, np.stack(slopes[name], axis=-1)) for name, value in self._numbers(vector).items()}
+
+    @property
+    def put(self) -> "_Put":
+        """What writes such numbers to a scene; equal for other data, so that a program serves them, too."""
+        return _Put(tuple(self.bodies.tolist()))
 
 
 @dataclasses.dataclass(frozen=True)

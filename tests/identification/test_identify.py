@@ -231,3 +231,38 @@ def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     assert abs(right.values["gear"] - 3.0) < right.half_width["gear"]
     assert abs(right.correlation) < 0.47
     assert right.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "said"),
+    [
+        (_course()[1:], {}, "41 rows for 40 controls, one at each state"),
+        (_course(), {"noise": {"place": 0.0}}, "noise of place of the recording must be positive"),
+        (np.full(41, np.nan), {}, "got NaN alone"),
+    ],
+)
+def test_what_a_recording_lacks_is_said(cart, measured, given, said):
+    with pytest.raises(ValueError, match=said):
+        mg.identify(
+            cart,
+            {"gear": identification.gear(cart, "motor")},
+            [Recording({"place": measured}, _DRIVE[:, None], **given)],
+        )
+
+
+def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart):
+    """The second cart is pulled by 0.2 N that the scene does not know: no gear explains its motion, and chi-square sees it."""
+    compilations = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compilations.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    results = []
+    for pull in (0.0, 0.2, 0.2):
+        before = len(compilations)
+        place = _course(gear=3.3) + pull / 4 * (_STEP * np.arange(_STEPS + 1)) ** 2
+        place += 1e-4 * np.random.default_rng(0).normal(size=place.shape)
+        recording = Recording({"place": place}, _DRIVE[:, None], noise={"place": 1e-4})
+        results.append(mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], num_points=32))
+    assert len(compilations) == before
+    assert not results[0].warnings()
+    assert f"{results[2].rms[1]:.3g} times the noise" in results[2].summary()
