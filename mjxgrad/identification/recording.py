@@ -51,13 +51,12 @@ class Recording:
             raise ValueError(
                 f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
             )
-        if self.controls is not None and self.times is None and self.control_times is None:
-            rows, count = max(lengths), len(self.controls)
-            if rows != count + 1:
-                raise ValueError(
-                    f"measured of {self.name} must have {count + 1} rows for {count} controls, one at each state, the first and last "
-                    f"included, got {rows}: add what is missing, as NaN if need be, or give times"
-                )
+        count = len(self.controls) if self.controls is not None else None
+        if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
+            raise ValueError(
+                f"measured of {self.name} must have {count + 1} rows for {count} controls, one at each state, the first and "
+                f"last included, got {max(lengths)}: add what is missing, as NaN if need be, or give times"
+            )
         for name in ("times", "control_times"):
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
