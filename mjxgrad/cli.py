@@ -36,7 +36,7 @@ def cost(trajectory):  # yours: here how far the first coordinate comes (m or ra
 
 
 low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-task = mg.SceneTask(scene, mg.initial_state(scene), cost, HORIZON, onset=mg.Onset())
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON, onset=mg.Onset())
 
 
 def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
@@ -228,10 +228,12 @@ def new(
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+    key = importlib.import_module("mjxgrad.verdict.motions").first_keyframe(verdict.scene.mj_model)
     text = TEMPLATE.format(
         name=Path(scene).name,
         path=str(Path(scene)),
         settings=settings,
+        keyframe="" if key is None else f", keyframe={key!r}",
         horizon=min(300, max(50, round(0.5 / (advice.timestep or timestep)))),
         per_knot=max(1, round(0.05 / (advice.timestep or timestep))),
         estimator=advice.estimator,

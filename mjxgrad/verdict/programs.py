@@ -153,7 +153,7 @@ class Programs:
 
     def _shapes(self) -> tuple:
         batch = lambda leaf: jax.ShapeDtypeStruct((self.size, *leaf.shape), leaf.dtype)  # noqa: E731
-        state = jax.tree.map(batch, initial_state(self.scene))
+        state = jax.tree.map(batch, jax.eval_shape(initial_state, self.scene))
         controls = batch(jax.ShapeDtypeStruct((CHUNK, self.scene.model.nu), self.scene.data.qpos.dtype))
         return self.contact, state, state, controls, controls
 

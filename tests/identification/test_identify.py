@@ -188,11 +188,11 @@ def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
         ),
         (lambda cart: Recording({"place": np.zeros(9)}).cut(0.1, 0.01), "must have measured qpos and qvel to be cut"),
         (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)))]),
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)), _STEP * np.arange(5))]),
             "controls of the recording must have a row for each of 4",
         ),
         (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((9, 2)))]),
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((4, 2)))]),
             "must have 1 columns in this scene",
         ),
         (
