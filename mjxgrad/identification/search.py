@@ -160,19 +160,19 @@ def search(
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     try:  # before anything is compiled
-        optimistix = importlib.import_module("optimistix")
+        importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     program = _Program(experiments, coordinates, free_start, **settings)
     start = program.start()
-    point, found, num_steps, ended, first, removable = _descend(optimistix, program, start, max_steps, log)
+    point, found, num_steps, ended, first, removable = _descend(program, start, max_steps, log)
     numbers, has_noise = (
         program.num_numbers,
         all(set(r.noise) == set(r.measured) for e in experiments for r in e.recordings),
     )
     if num_points and has_noise and not free_start and exceeds_noise(_rms(program, found), numbers - len(start)):
         begin = program.searched(num_points)
-        again = None if begin is None else _descend(optimistix, program, begin, max_steps, log)
+        again = None if begin is None else _descend(program, begin, max_steps, log)
         if again is not None and _rms(program, again[1]) < _rms(program, found):
             point, found, more, ended, _, removable = again
             num_steps += more
@@ -365,7 +365,7 @@ def _num_numbers(windows: Sequence[Windows]) -> int:
     return sum(int((np.asarray(w) > 0).sum()) for one in windows for w in one.weight.values())
 
 
-def _descend(optimistix: Any, program: _Program, point: Array, max_steps: int, log: Log | None):
+def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
     """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
     lower, upper = program.box()
     found = best = program(point)
@@ -375,7 +375,8 @@ def _descend(optimistix: Any, program: _Program, point: Array, max_steps: int, l
         raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
     size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
-    solver, state = _levenberg_marquardt(optimistix, point, linear)
+    solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)
+    state = eqx.tree_at(lambda s: s.y_eval, state, point)
     refusals, slow, removable, total = 0, 0, 1.0, math.inf
     for count in range(1, max_steps + 1):
         point, state, _ = _step(solver, point, state, linear)
@@ -398,12 +399,18 @@ def _descend(optimistix: Any, program: _Program, point: Array, max_steps: int, l
     return point, best, max_steps, False, first, removable
 
 
-def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Any]:
-    """Return optimistix's solver and its state at the start; it sees linear models alone."""
-    tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
+@functools.lru_cache(maxsize=32)
+def _levenberg_marquardt(numbers: int, unknowns: int, dtype: Any) -> tuple[Any, Any]:
+    """Return optimistix's solver and its state at zero; it sees linear models alone.
+
+    The state holds functions made with it, so that a step with another state of the same shape would be compiled again.
+    """
+    optimistix, tolerance = importlib.import_module("optimistix"), float(np.sqrt(jnp.finfo(dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
-    struct = jax.eval_shape(lambda: linear[1])
+    point, residual = jnp.zeros(unknowns, dtype), jnp.zeros(numbers, dtype)
+    linear = (point, residual, jnp.zeros((numbers, unknowns), dtype))
+    struct = jax.eval_shape(lambda: residual)
     return solver, solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
 
 

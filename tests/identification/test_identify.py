@@ -250,12 +250,8 @@ def test_what_a_recording_lacks_is_said(cart, measured, given, said):
         )
 
 
-def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart):
+def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, compilations):
     """The second cart is pulled by 0.2 N that the scene does not know: no gear explains its motion, and chi-square sees it."""
-    compilations = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, *_, **__: compilations.append(event) if event.endswith("backend_compile_duration") else None
-    )
     results = []
     for pull in (0.0, 0.2, 0.2):
         before = len(compilations)
