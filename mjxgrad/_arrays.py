@@ -1,6 +1,8 @@
 """What is known of arrays while a program is traced, and roots whose derivatives exist where the usual ones have none."""
 
+import collections
 import functools
+import hashlib
 import operator
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -28,6 +30,28 @@ def compiled(function: _Function) -> _Function:
         return (function if is_traced else program)(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+_KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()
+_MOST_KEPT = 64
+
+
+def compile_once(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compile a program, or return what was compiled of the same text: a function that was traced anew need not be.
+
+    The text has every number in it that is no argument, but not what a callback calls.
+    """
+    text = lowered.as_text()
+    if "callback" in text:
+        return lowered.compile()
+    shapes = str(jax.tree.leaves(lowered.args_info))
+    key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
+    if key not in _KEPT:
+        _KEPT[key] = lowered.compile()
+    _KEPT.move_to_end(key)
+    if len(_KEPT) > _MOST_KEPT:
+        _KEPT.popitem(last=False)
+    return _KEPT[key]
 
 
 def as_float(value: Any) -> Any:
