@@ -243,37 +243,28 @@ def rollout(
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
     settings = {"onset": onset, "smoothing": smoothing}
+    how = {"policy_sees": policy_sees, "checkpoint": checkpoint, "gradient": gradient, "settings": settings}
+    how |= {"velocity_limit": velocity_limit, "measure_growth": measure_growth}
     # Functions may read what changes from call to call: they are traced anew in each, unless the caller compiles.
     is_plain = policy is None and observe is None
-    return (_rolled_out_compiled if is_plain else _rolled_out)(
-        scene,
-        state,
-        inputs,
-        policy,
-        None if is_plain else params,
-        observe,
-        policy_sees,
-        checkpoint,
-        gradient,
-        settings,
-        velocity_limit,
-        measure_growth,
-    )
+    run = _rolled_out_compiled if is_plain else _rolled_out
+    return run(scene, state, inputs, policy, None if is_plain else params, observe, **how)
 
 
 def _rolled_out(
-    scene: Scene,
-    state: State,
-    inputs: tuple[Array, Array],
-    policy: Policy | None,
-    params: PyTree,
-    observe: Observe | None,
-    policy_sees: Sees,
-    checkpoint: bool,
-    gradient: Gradient,
-    settings: dict[str, Any],
-    velocity_limit: float | None,
-    measure_growth: bool,
+    scene,
+    state,
+    inputs,
+    policy,
+    params,
+    observe,
+    *,
+    policy_sees,
+    checkpoint,
+    gradient,
+    settings,
+    velocity_limit,
+    measure_growth,
 ) -> Trajectory:
     """Return what `rollout` does, once all of its arguments are known to be right."""
     onset, smoothing, (horizon, nu) = settings["onset"], settings["smoothing"], inputs[0].shape

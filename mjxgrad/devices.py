@@ -73,14 +73,11 @@ def over_devices(
     return wrapped
 
 
-def keep_compiled(folder: str | Path | None = None) -> Path | None:
-    """Keep compiled programs on disk, so that the next process need not compile them again. Call it before anything is computed.
+def keep_compiled() -> Path | None:
+    """Keep compiled programs in the user's folder of caches, for the next process. Call it before anything is computed.
 
     It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
     so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
-
-    Args:
-        folder: where; None is `mjxgrad` in the user's folder of caches.
 
     Returns:
         The folder in use; None if it cannot be written, and nothing is kept.
@@ -88,29 +85,27 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     if present := jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         return Path(present)
     try:
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjxgrad"
-        place = Path(folder or caches).absolute() / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute()
+        place = caches / "mjxgrad" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
         place.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # read-only, or there is no home
         return None
     if not os.access(place, os.W_OK):
         return None
-    jax.config.update("jax_compilation_cache_dir", str(place))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    show, told = warnings.showwarning, []
-
-    def show_once(message: Any, *args: Any, **kwargs: Any) -> None:
-        # JAX warns of every program that cannot be read or written: dozens of lines with one cause.
-        if "persistent compilation cache" in str(message):
-            told.append(message)
-            message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
-            if len(told) > 1:
-                return
-        show(message, *args, **kwargs)
-
-    warnings.showwarning = show_once
+    found = {"compilation_cache_dir": str(place), "persistent_cache_min_compile_time_secs": 0.0}
+    for name, value in (found | {"persistent_cache_min_entry_size_bytes": -1}).items():
+        jax.config.update(f"jax_{name}", value)
+    warnings.showwarning = functools.partial(_show, warnings.showwarning, place, [])
     return place
+
+
+def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any, *args: Any, **kwargs: Any) -> None:
+    """Show a warning; of JAX's for each program that cannot be read or written, dozens with one cause, one in their place."""
+    if "persistent compilation cache" in str(message):
+        told.append(message)
+        message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
+    if len(told) < 2 or not str(message).startswith("programs in"):
+        show(message, *args, **kwargs)
 
 
 def _processor() -> str:
