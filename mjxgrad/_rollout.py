@@ -243,30 +243,16 @@ def rollout(
     base = resting if sequence is None else sequence
     inputs = (base, jnp.zeros_like(base) if noise is None else noise)
     settings = {"onset": onset, "smoothing": smoothing}
-    how = {"policy_sees": policy_sees, "checkpoint": checkpoint, "gradient": gradient, "settings": settings}
-    how |= {"velocity_limit": velocity_limit, "measure_growth": measure_growth}
+    how = (policy_sees, checkpoint, gradient, settings, velocity_limit, measure_growth)
     # Functions may read what changes from call to call: they are traced anew in each, unless the caller compiles.
-    is_plain = policy is None and observe is None
-    run = _rolled_out_compiled if is_plain else _rolled_out
-    return run(scene, state, inputs, policy, None if is_plain else params, observe, **how)
+    if policy is None and observe is None:
+        return _rolled_out_compiled(scene, state, inputs, None, None, None, how)
+    return _rolled_out(scene, state, inputs, policy, params, observe, how)
 
 
-def _rolled_out(
-    scene,
-    state,
-    inputs,
-    policy,
-    params,
-    observe,
-    *,
-    policy_sees,
-    checkpoint,
-    gradient,
-    settings,
-    velocity_limit,
-    measure_growth,
-) -> Trajectory:
+def _rolled_out(scene, state, inputs, policy, params, observe, how) -> Trajectory:
     """Return what `rollout` does, once all of its arguments are known to be right."""
+    policy_sees, checkpoint, gradient, settings, velocity_limit, measure_growth = how
     onset, smoothing, (horizon, nu) = settings["onset"], settings["smoothing"], inputs[0].shape
     has_stages = scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
@@ -470,18 +456,21 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
     units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
     has_limits = not model.opt.disableflags & _NO_LIMITS
     for joint, (kind, first) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
-        name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
         value, (low, high) = pose[first], ranges[joint]
+        quaternion = pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4]
         slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
-        if kind not in units:
-            quaternion = pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4]
-            if not quaternion.any():
-                raise ValueError(
-                    f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
-                )
-        elif has_limits and model.jnt_limited[joint] and not low - slack <= value <= high + slack:
-            unit = units[int(kind)]
-            yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
+        is_within = (
+            kind not in units or not has_limits or not model.jnt_limited[joint] or low - slack <= value <= high + slack
+        )
+        if is_within and (kind in units or quaternion.any()):
+            continue
+        name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+        if is_within:
+            raise ValueError(
+                f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
+            )
+        unit = units[int(kind)]
+        yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
     if of_file is None:
         return
     data = mujoco.MjData(of_file)

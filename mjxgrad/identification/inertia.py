@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.dynamics.rows import index_of
-from mjxgrad.identification.parameters import Parameter, Writer
+from mjxgrad.identification.parameters import Parameter
 from mjxgrad.scene import Scene
 
 # As `mujoco.sysid` bounds them: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre of mass by 0.5 m.
@@ -40,18 +40,21 @@ def inertia(scene: Scene, body: str) -> Parameter:
     Raises:
         ValueError: if there is no such body, or it is flat, so that a logarithm has no value.
     """
-    model, index = scene.model, index_of(scene.model, mujoco.mjtObj.mjOBJ_BODY, body)
+
+    def place(model: mjx.Model) -> int:
+        return index_of(model, mujoco.mjtObj.mjOBJ_BODY, body)
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = place(model)
+        parts = body_fields(pseudo_inertia(value))
+        return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
+
+    model, index = scene.model, place(scene.model)
     fields = [np.asarray(getattr(model, f"body_{name}"), float)[index] for name in ("mass", "ipos", "inertia", "iquat")]
     nominal = logarithms(second_moments(*fields))
     if not np.isfinite(nominal).all():
         raise ValueError(f"inertia needs a body with mass and extent in all directions, got {body!r}")
-    return Parameter(nominal, nominal - _REACH, nominal + _REACH, write=Writer(_write, (body,)))
-
-
-def _write(model: mjx.Model, value: Array, body: str) -> dict[str, Array]:
-    index = index_of(model, mujoco.mjtObj.mjOBJ_BODY, body)
-    parts = body_fields(pseudo_inertia(value))
-    return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
+    return Parameter(nominal, nominal - _REACH, nominal + _REACH, write=write)
 
 
 def pseudo_inertia(numbers: Float[Array, "10"]) -> Float[Array, "4 4"]:

@@ -57,17 +57,6 @@ class Parameter:
             raise ValueError(f"lower, nominal and upper must increase, nominal within them, got {given}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Writer:
-    """A function that writes, with what it is given besides: equal to another of the same, so that both share a program."""
-
-    function: Callable[..., dict[str, Array]]
-    given: tuple
-
-    def __call__(self, model: mjx.Model, value: Array) -> dict[str, Array]:
-        return self.function(model, value, *self.given)
-
-
 class Coordinates(eqx.Module):
     """All parameters as one vector, and points of the search, in which each is measured by its range.
 
@@ -101,7 +90,12 @@ class Coordinates(eqx.Module):
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""
-        return unravelled(self.shapes, vector)
+        found, start = {}, 0
+        for name, shape in self.shapes:
+            size = int(np.prod(shape))
+            found[name] = vector[start : start + size].reshape(shape)  # pyright: ignore[reportIndexIssue]
+            start += size
+        return found
 
     @property
     def scale(self) -> Float[Array, " dim"]:
@@ -125,21 +119,13 @@ class Coordinates(eqx.Module):
         return values - self.lower < near, self.upper - values < near
 
 
-def unravelled(shapes: tuple[tuple[str, tuple[int, ...]], ...], vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
-    """Return what a vector holds, by name."""
-    ends = np.cumsum([int(np.prod(shape)) for _, shape in shapes])
-    return {
-        name: vector[end - int(np.prod(shape)) : end].reshape(shape)  # pyright: ignore[reportIndexIssue]
-        for (name, shape), end in zip(shapes, ends, strict=True)
-    }
-
-
-def write_all(scene: Scene, writes: Mapping[str, Write], values: Mapping[str, Array]) -> Scene:
+def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:
     """Return the scene in which each parameter has written its value, in their order; traceable."""
     model, changed = scene.model, {}
-    for name, write in writes.items():
-        fields = write(model, values[name])
-        model, changed = model.replace(**fields), changed | fields
+    for name, parameter in parameters.items():
+        if parameter.write is not None:
+            fields = parameter.write(model, values[name])
+            model, changed = model.replace(**fields), changed | fields
     return scene.with_model(**changed) if changed else scene
 
 
@@ -154,15 +140,15 @@ def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) 
     Raises:
         ValueError: if there is no such body.
     """
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = np.array([index_of(model, _Object.mjOBJ_BODY, body) for body in bodies])
+        factor = (value / model.body_mass[index])[:, None]
+        inertia = model.body_inertia.at[index].set(factor * model.body_inertia[index])
+        return {"body_mass": model.body_mass.at[index].set(value), "body_inertia": inertia}
+
     nominal = float(scene.model.body_mass[index_of(scene.model, _Object.mjOBJ_BODY, bodies[0])])
-    return _positive(nominal, bounds, Writer(_write_mass, bodies), "kg", "mass")
-
-
-def _write_mass(model: mjx.Model, value: Array, *bodies: str) -> dict[str, Array]:
-    index = np.array([index_of(model, _Object.mjOBJ_BODY, body) for body in bodies])
-    factor = (value / model.body_mass[index])[:, None]
-    inertia = model.body_inertia.at[index].set(factor * model.body_inertia[index])
-    return {"body_mass": model.body_mass.at[index].set(value), "body_inertia": inertia}
+    return _positive(nominal, bounds, write, "kg", "mass")
 
 
 def friction(
@@ -184,20 +170,20 @@ def friction(
         ValueError: if a name is unknown or can touch nothing.
     """
     named = Softness(pairs=pairs, **subset)
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        chosen = named.selected(model)
+        explicit = np.array([p.explicit for p in chosen if p.explicit >= 0], int)
+        geoms = np.array(sorted({g for p in chosen if p.explicit < 0 for g in deciding_geoms(model, p)}), int)
+        found = {}
+        if explicit.size:
+            found["pair_friction"] = model.pair_friction.at[explicit, :2].set(value)
+        if geoms.size:
+            found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
+        return found
+
     present = contact_parameters(scene.model, named.selected(scene.model)).friction
-    return Parameter(np.clip(float(present[0, 0]), *bounds), *bounds, write=Writer(_write_friction, (named,)))
-
-
-def _write_friction(model: mjx.Model, value: Array, named: Softness) -> dict[str, Array]:
-    chosen = named.selected(model)
-    explicit = np.array([p.explicit for p in chosen if p.explicit >= 0], int)
-    geoms = np.array(sorted({g for p in chosen if p.explicit < 0 for g in deciding_geoms(model, p)}), int)
-    found = {}
-    if explicit.size:
-        found["pair_friction"] = model.pair_friction.at[explicit, :2].set(value)
-    if geoms.size:
-        found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
-    return found
+    return Parameter(np.clip(float(present[0, 0]), *bounds), *bounds, write=write)
 
 
 def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
@@ -215,17 +201,14 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
     units = {"stiffness": "1/s²", "damping_ratio": "", "width": "m"}
     if part not in units:
         raise ValueError(f"part must be one of {', '.join(units)}, got {part!r}")
-    named = Softness(**subset)
-    present = contact_parameters(scene.model, named.selected(scene.model))
-    return _positive(
-        float(getattr(present, part)[0]), bounds, Writer(_write_softness, (part, named)), units[part], part
-    )
 
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        after = Softness(**{part: value}, **subset).apply(model)
+        fields = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
+        return {name: new for name in fields if (new := getattr(after, name)) is not getattr(model, name)}
 
-def _write_softness(model: mjx.Model, value: Array, part: str, named: Softness) -> dict[str, Array]:
-    after = dataclasses.replace(named, **{part: value}).apply(model)
-    fields = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
-    return {name: new for name in fields if (new := getattr(after, name)) is not getattr(model, name)}
+    present = contact_parameters(scene.model, Softness(**subset).selected(scene.model))
+    return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
 
 
 def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
@@ -245,13 +228,13 @@ def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None
 
 def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
     """Return the first number of the gear of an actuator, or one for several actuators alike; as `mass` otherwise."""
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
+        return {"actuator_gear": model.actuator_gear.at[index, 0].set(value)}
+
     first = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuators[0])
-    return _positive(float(scene.model.actuator_gear[first, 0]), bounds, Writer(_write_gear, actuators), "", "gear")
-
-
-def _write_gear(model: mjx.Model, value: Array, *actuators: str) -> dict[str, Array]:
-    index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
-    return {"actuator_gear": model.actuator_gear.at[index, 0].set(value)}
+    return _positive(float(scene.model.actuator_gear[first, 0]), bounds, write, "", "gear")
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
@@ -266,27 +249,25 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
         ValueError: if there is no such actuator, or a gain is zero and no bounds are given.
     """
     index = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuator)
-    nominal = -np.asarray(scene.model.actuator_biasprm)[index, 1:3]
-    return _positive(nominal, bounds, Writer(_write_gains, (actuator,)), "", "gains")
 
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index = index_of(model, _Object.mjOBJ_ACTUATOR, actuator)
+        bias = model.actuator_biasprm.at[index, 1:3].set(-value)
+        return {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0]), "actuator_biasprm": bias}
 
-def _write_gains(model: mjx.Model, value: Array, actuator: str) -> dict[str, Array]:
-    index = index_of(model, _Object.mjOBJ_ACTUATOR, actuator)
-    bias = model.actuator_biasprm.at[index, 1:3].set(-value)
-    return {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0]), "actuator_biasprm": bias}
+    return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
 
 
 def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[float, float] | None) -> Parameter:
-    nominal = float(getattr(scene.model, field)[_dofs(scene.model, joints)[0]])
-    return _positive(nominal, bounds, Writer(_write_dofs, (field, joints)), "", field.removeprefix("dof_"))
+    def dofs(model: mjx.Model) -> np.ndarray:
+        index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
+        return np.flatnonzero(np.isin(model.dof_jntid, index))
 
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        return {field: getattr(model, field).at[dofs(model)].set(value)}
 
-def _dofs(model: mjx.Model, joints: tuple[str, ...]) -> np.ndarray:
-    return np.flatnonzero(np.isin(model.dof_jntid, [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]))
-
-
-def _write_dofs(model: mjx.Model, value: Array, field: str, joints: tuple[str, ...]) -> dict[str, Array]:
-    return {field: getattr(model, field).at[_dofs(model, joints)].set(value)}
+    nominal = float(getattr(scene.model, field)[dofs(scene.model)[0]])
+    return _positive(nominal, bounds, write, "", field.removeprefix("dof_"))
 
 
 def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: str, name: str) -> Parameter:

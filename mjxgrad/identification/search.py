@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from mjxgrad._arrays import compile_once
 from mjxgrad._rollout import DivergedError
 from mjxgrad.dynamics import Gradient, Onset
-from mjxgrad.identification.parameters import Coordinates, Parameter, Values, Write, Writer, unravelled, write_all
+from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
 from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
@@ -51,14 +52,14 @@ class Experiment:
         recordings: to fit.
         held_out: to judge by.
         apply: from the scene, all parameters as a vector and what `prepare` returned to the scene with them.
-        prepare: computed outside of the program from the parameters' values, before each call of it; None for nothing.
+        prepare: computed outside of the program from the parameters' values, before each call of it.
     """
 
     scene: Scene
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
     apply: Callable[[Scene, Array, PyTree], Scene]
-    prepare: Callable[[np.ndarray], PyTree] | None = None
+    prepare: Callable[[np.ndarray], PyTree] = lambda values: None
 
 
 def identify(
@@ -118,31 +119,15 @@ def identify(
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     coordinates = Coordinates.of(parameters)
 
-    # A program is kept for writers alone, which read their arguments alone: functions of one's own may read what has changed.
-    writes = tuple(
-        (name, write if isinstance(write, Writer) else functools.partial(write))
-        for name, parameter in parameters.items()
-        if (write := parameter.write) is not None
-    )
-    put = _Put(coordinates.shapes, writes, None if apply is None else functools.partial(apply))
+    def put(scene: Scene, vector: Array, _: None) -> Scene:
+        values = coordinates.unravel(vector)
+        changed = write_all(scene, parameters, values)
+        return changed if apply is None else apply(changed, values)
+
     experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
     settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
     units = {name: parameter.unit for name, parameter in parameters.items()}
     return search(experiments, coordinates, units, max_steps=max_steps, num_points=num_points, log=log, **settings)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Put:
-    """Writes all parameters to a scene."""
-
-    shapes: tuple[tuple[str, tuple[int, ...]], ...]
-    writes: tuple[tuple[str, Write], ...]
-    apply: Apply | None
-
-    def __call__(self, scene: Scene, vector: Array, _: None) -> Scene:
-        values = unravelled(self.shapes, vector)
-        changed = write_all(scene, dict(self.writes), values)
-        return changed if self.apply is None else self.apply(changed, values)
 
 
 def search(
@@ -166,10 +151,8 @@ def search(
     program = _Program(experiments, coordinates, free_start, **settings)
     start = program.start()
     point, found, num_steps, ended, first, removable = _descend(program, start, max_steps, log)
-    numbers, has_noise = (
-        program.num_numbers,
-        all(set(r.noise) == set(r.measured) for e in experiments for r in e.recordings),
-    )
+    has_noise = all(set(one.noise) == set(one.measured) for each in experiments for one in each.recordings)
+    numbers = program.num_numbers
     if num_points and has_noise and not free_start and exceeds_noise(_rms(program, found), numbers - len(start)):
         begin = program.searched(num_points)
         again = None if begin is None else _descend(program, begin, max_steps, log)
@@ -210,95 +193,74 @@ def search(
     )
 
 
-class _Problem(eqx.Module):
-    """All that residuals depend on but the numbers looked for: arguments of programs that other data of the same shapes share."""
-
-    scenes: tuple[Scene, ...]
-    windows: tuple[Windows, ...]
-    coordinates: Coordinates
-    onset: Onset | None
-    applies: tuple[Callable[[Scene, Array, PyTree], Scene], ...] = eqx.field(static=True)
-    delay: str | None = eqx.field(static=True)
-    gradient: Gradient = eqx.field(static=True)
-
-    def residuals(self, i: int, vector: Array, offset: Array | None, window: Windows, prepared: PyTree) -> Array:
-        """Return the residuals of one window of the scene number i; infinite if its motion diverged."""
-        scene = self.applies[i](self.scenes[i], vector, prepared)
-        delay = None if self.delay is None else self.coordinates.unravel(vector)[self.delay]
-        residual, diverged = residuals(scene, window, offset, delay, onset=self.onset, gradient=self.gradient)
-        return jnp.where(diverged, jnp.inf, residual)
-
-
-@eqx.filter_jit
-def _linearised(
-    problem: _Problem, vector: Array, offsets: list[Array] | None, prepared: list[PyTree]
-) -> list[tuple[Array, ...]]:
-    """Return residuals of all windows of each scene, their derivative by the numbers, and by the offsets of starts if any."""
-    found = []
-    for i, windows in enumerate(problem.windows):
-
-        def one(window: Windows, offset: Array | None, i=i):
-            def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                residual = problem.residuals(i, vector, offset, window, prepared[i])
-                return residual, residual
-
-            argnums = (0,) if offsets is None else (0, 1)
-            slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
-            return residual, *slopes
-
-        found.append(jax.vmap(one)(windows, None if offsets is None else offsets[i]))
-    return found
-
-
-@eqx.filter_jit
-def _sums(
-    problem: _Problem, vectors: Float[Array, "points dim"], prepared: list[PyTree]
-) -> Float[Array, "points rows"]:
-    """Return for each vector the sum of squares over all windows, up to each of their rows."""
-    num_rows = max(windows.index.shape[1] for windows in problem.windows)
-
-    def of_window(i: int, vector: Array, window: Windows) -> Array:
-        squares = problem.residuals(i, vector, None, window, prepared[i]) ** 2
-        ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
-        of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
-        return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
-
-    def of_one(vector: Array) -> Array:
-        parts = [
-            jax.vmap(functools.partial(of_window, i, vector))(windows).sum(axis=0)
-            for i, windows in enumerate(problem.windows)
-        ]
-        return jnp.cumsum(sum(parts))
-
-    return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
-
-
 class _Program:
-    """Residuals and their derivatives by values and offsets."""
+    """Residuals and their derivatives by values and offsets. What was measured is an argument: other data compile nothing."""
 
-    def __init__(self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, **settings: Any):
+    def __init__(
+        self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
+    ):
         self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
-        self._settings = settings
-        self.problem = self._problem(experiments, [one.recordings for one in experiments])
-        self.windows = self.problem.windows
+        self._delay, self._settings = delay, settings
+        self.windows = [stack(one.scene, one.recordings) for one in experiments]
         self.num_numbers = _num_numbers(self.windows)
         if not self.num_numbers:
             raise ValueError("recordings must hold something that was measured, got NaN alone")
+        self._compiled: dict[Callable, jax.stages.Compiled] = {}
 
-    def _problem(self, experiments: Sequence[Experiment], recordings: Sequence[Sequence[Recording]]) -> _Problem:
-        scenes = tuple(one.scene for one in experiments)
-        windows = tuple(map(stack, scenes, recordings))
-        applies = tuple(one.apply for one in experiments)
-        return _Problem(scenes, windows, self.coordinates, applies=applies, **self._settings)
+    def _run(self, function: Callable, *arguments: Any) -> Any:
+        if function not in self._compiled:
+            self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
+        return self._compiled[function](*arguments)
+
+    def _residuals(
+        self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
+    ) -> Array:
+        scene = experiment.apply(experiment.scene, vector, prepared)
+        delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
+        residual, diverged = residuals(scene, window, offset, delay, **self._settings)
+        return jnp.where(diverged, jnp.inf, residual)
+
+    def _traced(
+        self, of_all: list[Windows], vector: Array, offsets: list[Array], prepared: list[PyTree]
+    ) -> list[tuple[Array, ...]]:
+        found = []
+        for i, experiment in enumerate(self.experiments):
+
+            def one(window: Windows, offset: Array | None, experiment=experiment, prepared=prepared[i]):
+                def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
+                    residual = self._residuals(experiment, vector, offset, window, prepared)
+                    return residual, residual
+
+                argnums = (0, 1) if self.free_start else (0,)
+                slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
+                return residual, *slopes
+
+            found.append(jax.vmap(one)(of_all[i], offsets[i] if self.free_start else None))
+        return found
+
+    def _sums(
+        self, of_all: list[Windows | None], vectors: Array, prepared: list[PyTree]
+    ) -> Float[Array, "points rows"]:
+        """Return for each vector the sum of squares over all windows, up to each of their rows."""
+        there = [(e, w, p) for e, w, p in zip(self.experiments, of_all, prepared, strict=True) if w is not None]
+        num_rows = max(windows.index.shape[1] for _, windows, _ in there)
+
+        def of_window(experiment: Experiment, prepared: PyTree, vector: Array, window: Windows) -> Array:
+            squares = self._residuals(experiment, vector, None, window, prepared) ** 2
+            ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
+            of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
+            return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
+
+        def of_one(vector: Array) -> Array:
+            parts = [jax.vmap(functools.partial(of_window, e, p, vector))(w).sum(axis=0) for e, w, p in there]
+            return jnp.cumsum(sum(parts))
+
+        return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
     def __call__(self, point: Array) -> list[tuple[Array, ...]]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
-        offsets = self.offsets(point) if self.free_start else None
-        return _linearised(self.problem, vector, offsets, self._prepared(self.experiments, np.asarray(vector, float)))
-
-    def _prepared(self, experiments: Sequence[Experiment], values: np.ndarray) -> list[PyTree]:
-        found = [None if one.prepare is None else one.prepare(values) for one in experiments]
-        return jax.tree.map(jnp.asarray, found)
+        prepared = [one.prepare(np.asarray(vector, float)) for one in self.experiments]
+        return self._run(self._traced, self.windows, vector, self.offsets(point), prepared)
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
@@ -315,7 +277,7 @@ class _Program:
 
     def searched(self, num_points: int) -> Array | None:
         """Return the best of many points between the bounds, found as `particles` does; None if none explains the recordings."""
-        dtype, nothing = self.coordinates.nominal.dtype, [None] * len(self.experiments)
+        dtype, nothing = self.coordinates.nominal.dtype, [None for _ in self.experiments]
         weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
         counts = np.zeros(max(there.shape[1] for there in weights))
         for there in weights:
@@ -324,7 +286,7 @@ class _Program:
 
         def sums_at(points: np.ndarray) -> np.ndarray:
             vectors = self.coordinates.values(jnp.asarray(points, dtype))
-            found = np.asarray(_sums(self.problem, vectors, nothing), float)
+            found = np.asarray(self._run(self._sums, self.windows, vectors, nothing), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
         best = best_point(sums_at, low, high, np.cumsum(counts), num_points)
@@ -342,18 +304,19 @@ class _Program:
     def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
         """Return the experiments' scenes with these values."""
         vector = jnp.asarray(values, self.coordinates.nominal.dtype)
-        prepared = self._prepared(self.experiments, values)
-        return tuple(one.apply(one.scene, vector, part) for one, part in zip(self.experiments, prepared, strict=True))
+        return tuple(one.apply(one.scene, vector, one.prepare(values)) for one in self.experiments)
 
     def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
         """Return what is left of the recordings that were held out, at each point; None without any."""
-        judged = [one for one in self.experiments if one.held_out]
-        if not judged:
+        judged = [stack(one.scene, one.held_out) if one.held_out else None for one in self.experiments]
+        if not any(judged):
             return None
-        problem = self._problem(judged, [one.held_out for one in judged])
-        vectors = jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
-        sums = [_sums(problem, v[None], self._prepared(judged, p))[0, -1] for v, p in zip(vectors, points, strict=True)]
-        first, last = (math.sqrt(float(x) / _num_numbers(problem.windows)) for x in sums)
+        program, sums = jax.jit(self._sums), []
+        for point in points:
+            vector = jnp.asarray(point, self.coordinates.nominal.dtype)
+            given = (judged, vector[None], [one.prepare(point) for one in self.experiments])
+            sums.append(compile_once(program.lower(*given))(*given)[0, -1])
+        first, last = (math.sqrt(float(x) / _num_numbers([one for one in judged if one is not None])) for x in sums)
         return first, last
 
 

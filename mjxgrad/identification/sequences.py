@@ -9,7 +9,6 @@ Principal moments and axes of inertia are differenced as the pseudo-inertia: the
 """
 
 import copy
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -132,7 +131,7 @@ class _CompiledFields:
         self.inside = self._compile(low + np.random.default_rng(0).uniform(0.4, 0.6, start.shape) * (high - low))
         self._refuse_structure()
         self._names: list[str] = []
-        self.bodies = np.zeros(0, int)
+        self._bodies = np.zeros(0, int)
 
     def _compile(self, vector: np.ndarray) -> mujoco.MjModel:
         self._parameters.update_from_vector(np.asarray(vector, float))
@@ -150,7 +149,7 @@ class _CompiledFields:
             if name in changed
         ]
         if moved:
-            self.bodies = np.flatnonzero(np.concatenate(moved, axis=1).any(axis=1))
+            self._bodies = np.flatnonzero(np.concatenate(moved, axis=1).any(axis=1))
         self._names = [name for name in changed if name not in (*_BODY, *derived)]
 
     def _refuse_structure(self) -> None:
@@ -173,8 +172,8 @@ class _CompiledFields:
     def _numbers(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         model = self._compile(vector)
         found = {name: np.array(_read(model, name)) for name in self._names}
-        if self.bodies.size:
-            parts = [getattr(model, name)[self.bodies] for name in _BODY]
+        if self._bodies.size:
+            parts = [getattr(model, name)[self._bodies] for name in _BODY]
             found["pseudo"] = np.stack([second_moments(*one) for one in zip(*parts, strict=True)])
         return found
 
@@ -191,19 +190,7 @@ class _CompiledFields:
                 slopes.setdefault(name, []).append((above[name] - below[name]) / (ends[1] - ends[0]))
         return {name: (value, np.stack(slopes[name], axis=-1)) for name, value in self._numbers(vector).items()}
 
-    @property
-    def put(self) -> "_Put":
-        """What writes such numbers to a scene; equal for other data, so that a program serves them, too."""
-        return _Put(tuple(self.bodies.tolist()))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Put:
-    """Writes numbers of a compiled model to a scene, and those of its bodies as pseudo-inertias."""
-
-    bodies: tuple[int, ...]
-
-    def __call__(self, scene: Scene, vector: Array, numbers: dict[str, Any]) -> Scene:
+    def put(self, scene: Scene, vector: Array, numbers: dict[str, Any]) -> Scene:
         """Return the scene with numbers whose values and derivatives by the parameters are these."""
         change = vector - jax.lax.stop_gradient(vector)  # zero, but for its derivative
         dtype = vector.dtype
@@ -211,7 +198,7 @@ class _Put:
         pseudo = found.pop("pseudo", None)
         if pseudo is not None:
             for name, part in jax.vmap(body_fields)(pseudo).items():
-                found[name] = getattr(scene.model, name).at[np.array(self.bodies)].set(part)
+                found[name] = getattr(scene.model, name).at[self._bodies].set(part)
         options: dict[str, Any] = {name: found.pop(name) for name in list(found) if name.startswith("opt.")}
         changed = scene.with_model(**found) if found else scene
         return eqx.tree_at(lambda s: s.model, changed, changed.model.tree_replace(options)) if options else changed

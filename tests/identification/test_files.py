@@ -101,7 +101,7 @@ def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
     given = ["inertia:cart", "mass:ball", "friction", "damping:x", "armature:x=0..1", "friction_loss:x=0..1", "gear:x"]
     wanted = files.parameters(scene, [*given, "gains:servo", "damping_ratio", "stiffness", "width"])
     values = {name: jnp.asarray(0.1 + 0.9 * one.nominal) for name, one in wanted.items()}
-    found = write_all(scene, {name: one.write for name, one in wanted.items()}, values)
+    found = write_all(scene, wanted, values)
     (tmp_path / "out").mkdir()
     files.write_xml(scene, found, source, tmp_path / "out" / "found.xml")
     again, expected = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "found.xml")), found.to_mujoco()

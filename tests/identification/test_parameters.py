@@ -54,11 +54,7 @@ def test_makers_write_what_they_say(scene):
     expected = {"mass": 2.0, "friction": 1.0, "damping": 2.0, "armature": 0.3, "gear": 3.0, "gains": [50.0, 4.0]}
     for name, value in expected.items():
         np.testing.assert_allclose(made[name].nominal, value, err_msg=name)
-    changed = write_all(
-        scene,
-        {name: one.write for name, one in made.items()},
-        {name: jnp.asarray(2 * one.nominal) for name, one in made.items()},
-    )
+    changed = write_all(scene, made, {name: jnp.asarray(2 * one.nominal) for name, one in made.items()})
     before, after = scene.model, changed.model
     np.testing.assert_allclose(after.body_mass, [0, 0.5, 4])
     np.testing.assert_allclose(after.body_inertia[2], 2 * before.body_inertia[2])
@@ -77,7 +73,7 @@ def test_makers_write_what_they_say(scene):
 def test_what_follows_from_a_mass_follows_as_when_recompiled(scene):
     """The inverse weights of contact rows, against MuJoCo's own compiler."""
     mass = identification.mass(scene, "ball")
-    found = write_all(scene, {"mass": mass.write}, {"mass": jnp.asarray(5.0)}).model
+    found = write_all(scene, {"mass": mass}, {"mass": jnp.asarray(5.0)}).model
     recompiled = mujoco.MjModel.from_xml_string(_SCENE.replace('mass="2"', 'mass="5"'))
     for name in ("body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"):
         np.testing.assert_allclose(getattr(found, name), getattr(recompiled, name), rtol=1e-9, err_msg=name)
@@ -129,7 +125,7 @@ def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
 def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
     """The motion is that of the scene, to the share by which principal moments are kept apart (1.5e-8)."""
     parameter = identification.inertia(scene, "ball")
-    changed = write_all(scene, {"ball": parameter.write}, {"ball": jnp.asarray(parameter.nominal)})
+    changed = write_all(scene, {"ball": parameter}, {"ball": jnp.asarray(parameter.nominal)})
     for name in ("body_mass", "body_ipos", "body_inertia", "dof_M0"):
         np.testing.assert_allclose(
             getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
