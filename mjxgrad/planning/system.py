@@ -154,8 +154,25 @@ class SceneSystem(System):
         """Return the qpos of states."""
         return state[..., : self.scene.model.nq]
 
+    @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
-        return _held(self, state, control)
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        data = self.scene.data.replace(
+            qpos=state[:nq],
+            qvel=state[nq : nq + nv],
+            act=state[nq + nv :],
+            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
+            ctrl=control,
+        )
+
+        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            # Only what the next step needs is carried: the rest of Data would be copied in every turn.
+            moved = step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
+            names = ("qpos", "qvel", "act", "qacc_warmstart")
+            return data.replace(**{name: getattr(moved, name) for name in names}), None
+
+        data, _ = jax.lax.scan(advance, data, None, length=self.num_substeps)
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
 
     def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv
@@ -170,28 +187,6 @@ class SceneSystem(System):
     def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
         """Give the system with another smoothing; None takes it away."""
         return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
-
-
-@compiled
-def _held(system: SceneSystem, state: StateVector, control: ControlVector) -> StateVector:
-    """Return the state after the system's time steps under one control."""
-    nq, nv = system.scene.model.nq, system.scene.model.nv
-    data = system.scene.data.replace(
-        qpos=state[:nq],
-        qvel=state[nq : nq + nv],
-        act=state[nq + nv :],
-        qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
-        ctrl=control,
-    )
-
-    def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-        # Only what the next step needs is carried: the rest of Data would be copied in every turn.
-        moved = step(system.scene.model, data, gradient=system.gradient, smoothing=system.smoothing)
-        names = ("qpos", "qvel", "act", "qacc_warmstart")
-        return data.replace(**{name: getattr(moved, name) for name in names}), None
-
-    data, _ = jax.lax.scan(advance, data, None, length=system.num_substeps)
-    return jnp.concatenate([data.qpos, data.qvel, data.act])
 
 
 class Cost(eqx.Module):
