@@ -26,8 +26,11 @@ def compiled(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return (function if is_traced else program)(*args, **kwargs)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return function(*args, **kwargs)
+        # Whether a type is weak is part of a program: results that go in again would be compiled for a second time.
+        strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
+        return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
 
     return call  # pyright: ignore[reportReturnType]
 

@@ -288,10 +288,11 @@ def test_to_plan_again_compiles_nothing(compilations):
         "<mujoco><worldbody><body><joint type='slide' name='x'/><geom size='.1'/></body></worldbody>"
         "<actuator><motor joint='x'/></actuator></mujoco>"
     )
+    given = jnp.zeros((HORIZON, 2))
     for i in range(3):
         before = len(compilations)
         system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL + i, STAGE, TERMINAL, CONTROL + i, resting=0.1 * i)
-        smoother, given = Sampled(0.1 + i, 0.1, num_samples=4, order="first"), jnp.zeros((HORIZON, 2))
+        smoother = Sampled(0.1 + i, 0.1, num_samples=4, order="first")
         plan = optimise_trajectory(
             system,
             cost,
@@ -302,7 +303,7 @@ def test_to_plan_again_compiles_nothing(compilations):
             schedule=np.array([1.0, 0.5 - 0.1 * i]),
             upper=3.0 + i,
         )
-        shifted(plan)
+        given = shifted(plan)
         sampling = Sampling(-jnp.ones(2), jnp.ones(2), 0.1 * jnp.ones(2), batch=2, max_extension=2)
         limits = {"lower": -1.0 - i, "upper": 1.0, "capacity": 20, "max_turns": 2}
         search(
@@ -317,7 +318,7 @@ def test_to_plan_again_compiles_nothing(compilations):
         )
         state = SceneSystem(scene, num_substeps=2).step(jnp.array([0.1 * i, 0.0]), jnp.ones(1))
         mg.rollout(scene, mg.initial_state(scene, state[:1], state[1:]), float(i) * jnp.ones((3, 1)), onset=mg.Onset())
-    assert len(compilations) == before
+        assert i == 0 or len(compilations) == before
 
 
 def test_a_smoother_scales_all_that_has_a_length():
