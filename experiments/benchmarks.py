@@ -101,6 +101,7 @@ class Row(NamedTuple):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark that the command line names, and print its tables."""
+    mg.keep_compiled()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     bench = commands.add_parser("bench", help="speed and memory against mjx.step")

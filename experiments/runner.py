@@ -3,7 +3,6 @@
 import hashlib
 import importlib.metadata
 import json
-import os
 import platform
 import re
 import shlex
@@ -225,9 +224,7 @@ def _set_up_jax(precision: str) -> None:
     import jax
 
     jax.config.update("jax_enable_x64", precision == "float64")
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    importlib.import_module("mjxgrad").keep_compiled()
 
 
 def _folder_name(varied: dict[str, Any]) -> str:

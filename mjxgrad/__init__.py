@@ -21,7 +21,7 @@ from mjxgrad._rollout import (
     rollout,
 )
 from mjxgrad.contact import Softness
-from mjxgrad.devices import over_devices
+from mjxgrad.devices import keep_compiled, over_devices
 from mjxgrad.diagnostics import check_omissions, check_stability
 from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.identification import identify
@@ -77,6 +77,7 @@ __all__ = [
     "identify",
     "initial_state",
     "integration",
+    "keep_compiled",
     "learning",
     "linear_policy",
     "linearise",

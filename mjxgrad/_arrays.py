@@ -1,13 +1,60 @@
 """What is known of arrays while a program is traced, and roots whose derivatives exist where the usual ones have none."""
 
+import collections
+import functools
+import hashlib
 import operator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+_Function = TypeVar("_Function", bound=Callable)
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile a function of arrays, or of trees with arrays, once for each shape and structure of them.
+
+    Called with traced values it is part of a larger program and left to that, in which more of the values may be known. It must
+    depend on its arguments alone: what it reads besides is read once.
+    """
+    program = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return function(*args, **kwargs)
+        # Whether a type is weak is part of a program: results that go in again would be compiled for a second time.
+        strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
+        return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+_KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()
+_MOST_KEPT = 64
+
+
+def compile_once(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compile a program, or return what was compiled of the same text: a function that was traced anew need not be.
+
+    The text has every number in it that is no argument, but not what a callback calls.
+    """
+    text = lowered.as_text()
+    if "callback" in text:
+        return lowered.compile()
+    shapes = str(jax.tree.leaves(lowered.args_info))
+    key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
+    if key not in _KEPT:
+        _KEPT[key] = lowered.compile()
+    _KEPT.move_to_end(key)
+    if len(_KEPT) > _MOST_KEPT:
+        _KEPT.popitem(last=False)
+    return _KEPT[key]
 
 
 def as_float(value: Any) -> Any:

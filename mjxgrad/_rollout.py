@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import form, known, whole
+from mjxgrad._arrays import compiled, form, is_known, known, whole
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.parameters import geom_name
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
 from mjxgrad.dynamics.cholesky import SOLUTION
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
@@ -27,6 +28,7 @@ Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """From model and data to anything made of arrays."""
 Sees = Literal["state", "observations"]
 Engine = Literal["mjx", "mujoco"]
+_DEEP = 0.02  # m, that a pose may have a geom inside another
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
@@ -105,31 +107,50 @@ def initial_state(
     qpos: Float[ArrayLike, " nq"] | None = None,
     qvel: Float[ArrayLike, " nv"] | None = None,
     act: Float[ArrayLike, " na"] | None = None,
+    *,
+    keyframe: str | int | None = None,
 ) -> State:
-    """Return the state at the scene's reference pose, at rest, with the given parts replaced.
+    """Return the state at the scene's reference pose, at rest, or at one of its key frames, with the given parts replaced.
 
-    It warns of a joint that begins beyond its limits, where values are known: the limit would push it back from the first step.
+    Where values are known it warns of a joint that begins beyond its limits, which would push it back from the first step, and
+    of a pose of the file that is deep inside something.
 
     Args:
         scene: where it lives.
         qpos: generalised positions (m, rad, unit quaternions).
         qvel: generalised velocities (m/s, rad/s).
         act: actuator activations.
+        keyframe: name or number of a key frame of the file, for its positions, velocities and activations.
 
     Raises:
-        ValueError: if a part does not have the shape that the scene gives it.
+        ValueError: if a part does not have the shape that the scene gives it, is not finite, has a quaternion of zeros, or there
+            is no such key frame.
     """
     _check_scene(scene)
-    data, parts = scene.data, []
-    for message in [] if qpos is None else _beyond_limits(scene.model, qpos):
-        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
+    data, keys, parts = scene.data, {}, []
+    if keyframe is not None:
+        key = _keyframe(scene.mj_model, keyframe)
+        keys = {name: getattr(scene.mj_model, f"key_{name}")[key] for name in ("qpos", "qvel", "act")}
     for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
         template = getattr(data, name)
-        part = template if given is None else jnp.asarray(given, template.dtype)
+        part = jnp.asarray(keys.get(name, template) if given is None else given, template.dtype)
         if part.shape != template.shape:
             raise ValueError(f"{name} must have shape {template.shape} in this scene, got {part.shape}")
+        if is_known(part) and not np.isfinite(part).all():
+            raise ValueError(f"{name} must be finite, got {np.asarray(part).tolist()}")
         parts.append(part)
+    for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
+        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     return State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+
+
+def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
+    names = [model.key(i).name or i for i in range(model.nkey)]
+    if keyframe in names:
+        return names.index(keyframe)
+    if isinstance(keyframe, int) and 0 <= keyframe < model.nkey:
+        return keyframe
+    raise ValueError(f"keyframe must be one of {names or 'none'} in this scene, got {keyframe!r}")
 
 
 def rollout(
@@ -235,6 +256,18 @@ def rollout(
     base = resting if sequence is None else sequence
     rows = (base, jnp.zeros_like(base) if noise is None else noise, applied)
     settings = {"onset": onset, "smoothing": smoothing}
+    how = (policy_sees, checkpoint, gradient, settings, velocity_limit, measure_growth)
+    # Functions may read what changes from call to call: they are traced anew in each, unless the caller compiles.
+    if policy is None and observe is None:
+        return _rolled_out_compiled(scene, state, rows, None, None, None, how)
+    return _rolled_out(scene, state, rows, policy, params, observe, how)
+
+
+def _rolled_out(scene, state, rows, policy, params, observe, how) -> Trajectory:
+    """Return what `rollout` does, once all of its arguments are known to be right."""
+    policy_sees, checkpoint, gradient, settings, velocity_limit, measure_growth = how
+    onset, smoothing, (horizon, nu) = settings["onset"], settings["smoothing"], rows[0].shape
+    applied = rows[2]
     has_stages = scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
     def look(state: State, ctrl: Array, forces: dict, stepped: mjx.Data | None = None) -> PyTree:
@@ -310,6 +343,9 @@ def rollout(
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
+
+
+_rolled_out_compiled = compiled(_rolled_out)
 
 
 def _check_scene(scene: Any) -> None:
@@ -486,21 +522,42 @@ def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
 
 
-def _beyond_limits(model: mjx.Model, qpos: ArrayLike) -> Iterator[str]:
-    """Say which limited hinges and slides a pose holds beyond their range, where both are known."""
+def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayLike) -> Iterator[str]:
+    """Say what is wrong with a known pose: joints beyond their limits and, of one that a file has, geoms deep in others.
+
+    Raises:
+        ValueError: if a quaternion is zero.
+    """
     pose, ranges = known(qpos), known(model.jnt_range)
     if pose is None or ranges is None or pose.shape != (model.nq,) or ranges.shape != (model.njnt, 2):
         return
-    if model.opt.disableflags & _NO_LIMITS:
-        return
     units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
-    for joint in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, list(units))).tolist():
-        value, (low, high) = pose[model.jnt_qposadr[joint]], ranges[joint]
+    has_limits = not model.opt.disableflags & _NO_LIMITS
+    for joint, (kind, first) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
+        value, (low, high) = pose[first], ranges[joint]
+        quaternion = pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4]
         slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
-        if not low - slack <= value <= high + slack:
-            name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
-            unit = units[int(model.jnt_type[joint])]
-            yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
+        is_within = (
+            kind not in units or not has_limits or not model.jnt_limited[joint] or low - slack <= value <= high + slack
+        )
+        if is_within and (kind in units or quaternion.any()):
+            continue
+        name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+        if is_within:
+            raise ValueError(
+                f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
+            )
+        unit = units[int(kind)]
+        yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
+    if of_file is None:
+        return
+    data = mujoco.MjData(of_file)
+    data.qpos[:] = pose
+    mujoco.mj_fwdPosition(of_file, data)
+    deepest = min(data.contact, key=lambda contact: contact.dist, default=None)
+    if deepest is not None and deepest.dist < -_DEEP:
+        names = " in ".join(geom_name(of_file, geom) for geom in deepest.geom[::-1].tolist())
+        yield f"{names} begins {-1e3 * deepest.dist:.3g} mm deep: give qpos or keyframe"
 
 
 def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import mjxgrad as mg
 import optax
 
+mg.keep_compiled()  # on disk, so that the next run starts at once
 HORIZON, STEPS_PER_KNOT = {horizon}, {per_knot}  # time steps
 scene = mg.load_scene({path!r}{settings})
 
@@ -35,7 +36,7 @@ def cost(trajectory):  # yours: here how far the first coordinate comes (m or ra
 
 
 low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-task = mg.SceneTask(scene, mg.initial_state(scene), cost, HORIZON, onset=mg.Onset())
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON, onset=mg.Onset())
 
 
 def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
@@ -126,6 +127,7 @@ def check(
         budget: how long it may take in s, once the scene is loaded; what does not fit is left out by name.
         seed: of what is random.
     """
+    _writable(html)
     mg, started = _library(), time.monotonic()
 
     def log(text: str) -> None:
@@ -133,10 +135,10 @@ def check(
 
     function = None if cost is None else _function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
+    print(verdict.as_json() if as_json else verdict.summary(), flush=True)
     if html is not None:
         html.write_text(verdict.as_html(), encoding="utf-8")
         log(f"wrote {html}")
-    print(verdict.as_json() if as_json else verdict.summary())
     return 1 if verdict.faults else 0
 
 
@@ -169,6 +171,7 @@ def identify(
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """
+    _writable(output / "report.html", makes_folder=True)
     mg, started = _library(), time.monotonic()
     files, page = (
         importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "verdict.identified")
@@ -199,12 +202,12 @@ def identify(
         log=lambda step, metrics: log(f"step {step}: error {100 * metrics['rms']:.3g} % of the motion"),
     )
     found = page.Identified(Path(scene).name, loaded, result, fitted, judged, time.monotonic() - started)
+    print(found.as_json() if as_json else f"{found.headline}\n\n{result.summary()}", flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
     (output / "report.html").write_text(found.as_html(), encoding="utf-8")
     log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
-    print(found.as_json() if as_json else f"{found.headline}\n\n{result.summary()}")
     return 0 if found.is_sound else 1
 
 
@@ -221,16 +224,19 @@ def new(
     """
     if output.exists() and not force:
         raise CommandError(f"{output} is there already; name another --output, or replace it with --force")
+    _writable(output)
     verdict = _library().check(_existing(scene), derivatives=False)
     advice, timestep = verdict.recommendation, verdict.motions.timestep
     if not verdict.scene.model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+    key = importlib.import_module("mjxgrad.verdict.motions").first_keyframe(verdict.scene.mj_model)
     text = TEMPLATE.format(
-        name=Path(scene).name,
+        name=repr(Path(scene).name)[1:-1].replace('"', "'"),  # within a docstring
         path=str(Path(scene)),
         settings=settings,
+        keyframe="" if key is None else f", keyframe={key!r}",
         horizon=min(300, max(50, round(0.5 / (advice.timestep or timestep)))),
         per_knot=max(1, round(0.05 / (advice.timestep or timestep))),
         estimator=advice.estimator,
@@ -344,13 +350,34 @@ def _library() -> Any:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    return importlib.import_module("mjxgrad")
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError) as error:  # an assertion, where JAX_PLATFORMS names what is not there
+        raise CommandError(
+            f"JAX finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: unset it {error}".rstrip()
+        ) from error
+    library = importlib.import_module("mjxgrad")
+    library.keep_compiled()
+    return library
 
 
 def _existing(path: str) -> str:
     if not Path(path).is_file():
         raise CommandError(f"there is no file {path}")
     return path
+
+
+def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
+    """Refuse, before any work, a file that could not be written after it."""
+    if path is None:
+        return
+    there = (
+        next(folder for folder in path.absolute().parents if folder.exists())
+        if makes_folder
+        else path.absolute().parent
+    )
+    if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
+        raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
 
 
 def _function(name: str) -> Callable:

@@ -1,4 +1,4 @@
-"""A batch split over devices, each of which works on its part alone.
+"""A batch split over devices, each of which works on its part alone; and compiled programs kept from one process to the next.
 
 XLA runs one small operation after another, and a processor's second core idles most of that time. As two devices
 (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
@@ -7,7 +7,13 @@ them all.
 """
 
 import functools
+import hashlib
+import importlib.metadata
+import os
+import platform
+import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -65,3 +71,48 @@ def over_devices(
         return jax.shard_map(of_part, mesh=mesh, in_specs=(specs,), out_specs=part, check_vma=False)(given)
 
     return wrapped
+
+
+def keep_compiled() -> Path | None:
+    """Keep compiled programs in the user's folder of caches, for the next process. Call it before anything is computed.
+
+    It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
+    so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
+
+    Returns:
+        The folder in use; None if it cannot be written, and nothing is kept.
+    """
+    if present := jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        return Path(present)
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute()
+        place = caches / "mjxgrad" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
+        place.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # read-only, or there is no home
+        return None
+    if not os.access(place, os.W_OK):
+        return None
+    found = {"compilation_cache_dir": str(place), "persistent_cache_min_compile_time_secs": 0.0}
+    for name, value in (found | {"persistent_cache_min_entry_size_bytes": -1}).items():
+        jax.config.update(f"jax_{name}", value)
+    warnings.showwarning = functools.partial(_show, warnings.showwarning, place, [])
+    return place
+
+
+def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any, *args: Any, **kwargs: Any) -> None:
+    """Show a warning; of JAX's for each program that cannot be read or written, dozens with one cause, one in their place."""
+    if "persistent compilation cache" in str(message):
+        told.append(message)
+        message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
+    if len(told) < 2 or not str(message).startswith("programs in"):
+        show(message, *args, **kwargs)
+
+
+def _processor() -> str:
+    """Return a short name of what programs are compiled for: the processor with all that it can do."""
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
+    kinds = sorted(
+        {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))} or lines[:1]
+    )
+    return f"{platform.machine()}-{hashlib.sha256(''.join(kinds).encode()).hexdigest()[:8]}"

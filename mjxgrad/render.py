@@ -161,9 +161,9 @@ def _choose_opengl() -> None:
             return
 
 
-def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    _choose_opengl()
+def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Renderer":
     try:
+        _choose_opengl()
         with warnings.catch_warnings():
             # glfw warns of what it is about to raise.
             warnings.simplefilter("ignore")

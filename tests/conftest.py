@@ -30,3 +30,13 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture
 def key():
     return jax.random.key(7)
+
+
+@pytest.fixture
+def compilations():
+    """What has been compiled since the test began, one entry for each program."""
+    found = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: found.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    return found

@@ -1,6 +1,7 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -141,3 +142,40 @@ def test_a_new_program_moves_the_scene_and_films_it(scene):
     _, reached, _, before = ran.stdout.splitlines()[-1].split()
     assert float(reached) < float(before)
     assert Path("task.mp4").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["check", "scene.xml", "--html", "nowhere/page.html"],
+        ["new", "scene.xml", "--output", "nowhere/task.py"],
+        ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball", "--output", "scene.xml"],
+    ],
+)
+def test_what_could_not_be_written_is_refused_before_the_work(scene, capsys, monkeypatch, arguments):
+    monkeypatch.setattr(cli, "_library", lambda: pytest.fail("the work was begun"))
+    assert cli.main(arguments) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_program_starts_at_the_key_frame_and_holds_no_code_of_a_file_name(scene, monkeypatch):
+    name = 'q""" + stop + """.xml'
+    keyed = SCENE.format(gear=1).replace("</mujoco>", '<keyframe><key name="home" qpos=".1"/></keyframe></mujoco>')
+    Path(name).write_text(keyed)
+    assert cli.main(["new", name]) == 0
+    program = Path("task.py").read_text()
+    compile(program, "task.py", "exec")
+    assert "stop" not in compile(program, "task.py", "exec").co_names
+    assert "mg.initial_state(scene, keyframe='home')" in program
+
+
+def test_a_platform_that_is_not_there_is_said_in_one_line(scene):
+    done = subprocess.run(
+        [sys.executable, "-m", "mjxgrad", "check", scene, "--quick"],
+        env={**os.environ, "JAX_PLATFORMS": "cuda", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode != 2:
+        pytest.skip("there is a GPU")
+    assert done.stderr.splitlines()[-1] == "JAX finds no device of JAX_PLATFORMS=cuda: unset it"

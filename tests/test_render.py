@@ -139,3 +139,33 @@ def test_a_choice_of_opengl_that_fails_is_named(model, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "egl")
     with pytest.raises(RenderingUnavailableError, match=r"libosmesa6 .* MUJOCO_GL=egl was tried alone: unset it"):
         frames(model, np.zeros((1, model.nq)))
+
+
+_WITHOUT_OPENGL = """
+import sys
+
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("OpenGL", "glfw"):
+            raise ImportError(f"there is no {name}")
+
+
+sys.meta_path.insert(0, Missing())
+import mujoco
+
+if hasattr(mujoco, "Renderer"):
+    del mujoco.Renderer
+import mjxgrad as mg
+
+scene = mg.load_scene("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+try:
+    mg.render.frames(scene, scene.data.qpos[None])
+except mg.render.RenderingUnavailableError as error:
+    print(error)
+"""
+
+
+def test_all_but_drawing_works_where_there_is_no_opengl():
+    done = subprocess.run([sys.executable, "-c", _WITHOUT_OPENGL], capture_output=True, text=True)
+    assert "rendering needs an OpenGL" in done.stdout, done.stderr

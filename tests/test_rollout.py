@@ -1,5 +1,7 @@
 """Rollouts: what is kept, what is flagged, what is refused."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.scene import SceneWarning
 
 PUSHED = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><geom type="plane" size="1 1 1"/>
   <body pos="0 0 1"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
@@ -190,3 +193,41 @@ def test_a_contact_without_a_stiffness_is_flagged_where_only_the_program_knows_i
 
     assert bool(land(stiffness).diverged)
     assert not bool(land(1e3).diverged)
+
+
+_POSED = """<mujoco><compiler angle="radian"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+  <body pos="0 0 {height}"><freejoint name="root"/><geom name="trunk" size=".1"/>
+    <body><joint name="calf" axis="0 1 0" range="-2.7 -.6" limited="true"/><geom size=".02" pos="0 0 .2"/></body></body>
+  </worldbody>
+  <keyframe><key name="home" qpos="0 0 .3 1 0 0 0 -1" qvel="1 0 0 0 0 0 0"/><key qpos="0 0 .4 1 0 0 0 -1"/></keyframe></mujoco>"""
+
+
+def test_a_pose_of_the_file_that_is_no_start_is_said_and_its_key_frames_are_taken():
+    """The ball of 0.1 m begins at 0.02 m above the floor: 80 mm deep. The calf is at 0 rad, beyond its range."""
+    scene = mg.load_scene(_POSED.format(height=0.02))
+    with pytest.warns(SceneWarning) as said:
+        mg.initial_state(scene)
+    texts = [str(one.message) for one in said]
+    assert any("calf begins at 0 rad" in text for text in texts)
+    assert any("trunk in floor begins 80 mm deep" in text for text in texts)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        home, second = mg.initial_state(scene, keyframe="home"), mg.initial_state(scene, keyframe=1)
+        mg.initial_state(scene, qvel=jnp.zeros(7), keyframe="home")
+    assert (home.qpos[2], home.qvel[0], second.qpos[2]) == (0.3, 1.0, 0.4)
+    for asked, said in (("hom", r"one of \['home', 1\] in this scene, got 'hom'"), (2, "got 2")):
+        with pytest.raises(ValueError, match=said):
+            mg.initial_state(scene, keyframe=asked)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"qpos": [0.0, 0, 1, 0, 0, 0, 0, -1]}, "quaternion that is not zero, got zeros for root"),
+        ({"qpos": [0.0, 0, np.nan, 1, 0, 0, 0, -1]}, "qpos must be finite"),
+        ({"qvel": [np.inf] + 6 * [0.0]}, "qvel must be finite"),
+    ],
+)
+def test_a_start_that_is_none_is_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        mg.initial_state(mg.load_scene(_POSED.format(height=0.3)), **{k: jnp.asarray(v) for k, v in given.items()})

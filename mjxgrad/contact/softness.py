@@ -97,6 +97,9 @@ class Softness(eqx.Module):
         given = [name for name in _SUBSETS if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"Softness takes either geoms or pairs, bodies or groups, got {' and '.join(given)}")
+        for name in given:
+            if isinstance(value := getattr(self, name), str):
+                raise ValueError(f"{name} must be a tuple of names, got {value!r}; write ({value!r},)")
         if self.rest_acceleration is not None and self.margin is None:
             raise ValueError("rest_acceleration must come with a margin, got none; give Softness a margin, too")
         for name, (is_valid, requirement) in _REQUIREMENTS.items():

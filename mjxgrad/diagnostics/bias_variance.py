@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import compile_once, whole
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
@@ -197,7 +197,7 @@ def bias_variance(
 
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     # Compiled here, for a thread does not see what a `with` has set, such as the precision.
-    compiled = measure.lower(each[0], params, key).compile()
+    compiled = compile_once(measure.lower(each[0], params, key))
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
         measured, samples = jax.block_until_ready(compiled(one, params, key))

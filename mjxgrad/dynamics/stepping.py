@@ -60,7 +60,9 @@ def check_gradient(gradient: str, onset: Onset | None = None, smoothing: Smoothi
     """
     if gradient not in get_args(Gradient):
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
-    for settings in (smoothing, onset):
+    for name, kind, settings in (("smoothing", Smoothing, smoothing), ("onset", Onset, onset)):
+        if settings is not None and not isinstance(settings, kind):
+            raise ValueError(f"{name} must be an mg.{kind.__name__}() or None, got {settings!r}")
         if settings is not None:
             settings.check(gradient)
 

@@ -50,7 +50,7 @@ class Walker(_Remembers):
 
     def start(self, key: PRNGKeyArray) -> State:
         place, axis, angle, joints, speeds = jax.random.split(key, 5)
-        rest = initial_state(self.scene)
+        rest = self.scene.data
         where = rest.qpos[:3] + jax.random.uniform(place, (3,), minval=-0.1, maxval=0.1)
         direction = jax.random.uniform(axis, (3,), minval=-1, maxval=1)
         direction = direction / jnp.linalg.norm(direction)
@@ -95,7 +95,7 @@ class Planar(Environment):
 
     def start(self, key: PRNGKeyArray) -> State:
         place, tilt, joints, speeds = jax.random.split(key, 4)
-        rest = initial_state(self.scene)
+        rest = self.scene.data
         change = jnp.concatenate(
             [
                 jax.random.uniform(place, (2,), minval=-0.05, maxval=0.05),

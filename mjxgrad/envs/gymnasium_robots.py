@@ -54,7 +54,7 @@ class Robot(Environment):
 
     def start(self, key: PRNGKeyArray) -> State:
         pose, speed = jax.random.split(key)
-        rest = initial_state(self.scene)
+        rest = self.scene.data
         shape, dtype = rest.qvel.shape, rest.qvel.dtype
         draw = jax.random.normal if self.is_normal else _uniform
         qpos = rest.qpos + self.noise * _uniform(pose, rest.qpos.shape, dtype)

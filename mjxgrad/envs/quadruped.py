@@ -33,7 +33,7 @@ class Quadruped(Environment):
 
     def start(self, key: PRNGKeyArray) -> State:
         joints, speeds = jax.random.split(key)
-        rest = initial_state(self.scene)
+        rest = self.scene.data
         posture = rest.qpos[7:] + jax.random.uniform(joints, (12,), minval=-0.1, maxval=0.1)
         speed = jax.random.uniform(speeds, rest.qvel.shape, minval=-0.1, maxval=0.1)
         return initial_state(self.scene, jnp.concatenate([rest.qpos[:7], posture]), speed)

@@ -341,25 +341,18 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     Path(path).write_text(spec.to_xml(), encoding="utf-8")
 
 
-def simulated(scene: Scene, windows: Windows, delay: Float[Array, ""] | float, onset: Any) -> dict[str, Array]:
+def simulated(scene: Scene, windows: Windows, delay: Float[Array, ""] | float) -> dict[str, Array]:
     """Return all signals as a scene has them at its own steps, and its positions as `qpos`; traceable.
 
     Args:
         scene: with the parameters in it.
         windows: of one recording, by `stack`.
         delay: by how much the controls act later than recorded (s).
-        onset: as of `rollout`.
     """
     names = [name for name in windows.measured if name not in ("qpos", "qvel", "act")]
     (controls,), state = windows.controls, jax.tree.map(lambda leaf: leaf[0], windows.state)
     at = jnp.arange(len(controls), dtype=controls.dtype)
     late = jax.vmap(lambda u: jnp.interp(at - delay / scene.model.opt.timestep, at, u), 1, 1)(controls)
-    course = rollout(
-        scene,
-        state,
-        late,
-        checkpoint=False,
-        onset=onset,
-        observe=lambda m, d: {name: sensor(m, d, name) for name in names},
-    )
+    observe = lambda m, d: {name: sensor(m, d, name) for name in names}  # noqa: E731
+    course = rollout(scene, state, late, checkpoint=False, observe=observe)
     return {"qpos": course.qpos, "qvel": course.qvel, "act": course.act} | dict(course.observations or {})

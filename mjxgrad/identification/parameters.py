@@ -105,7 +105,7 @@ class Coordinates(eqx.Module):
         width = self.upper - self.lower
         return jnp.where(jnp.isfinite(width), width, jnp.where(reach > 0, reach, 1.0))
 
-    def values(self, free: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    def values(self, free: Float[Array, "*points dim"]) -> Float[Array, "*points dim"]:
         """Return the numbers at a point of the search, which begins at zero; beyond a bound it means the bound."""
         return jnp.clip(self.nominal + self.scale * free, self.lower, self.upper)
 

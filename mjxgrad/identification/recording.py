@@ -51,6 +51,12 @@ class Recording:
             raise ValueError(
                 f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
             )
+        count = len(self.controls) if self.controls is not None else None
+        if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
+            raise ValueError(
+                f"measured of {self.name} must have {count + 1} rows for {count} controls, one at each state, the first and "
+                f"last included, got {max(lengths)}: add what is missing, as NaN if need be, or give times"
+            )
         for name in ("times", "control_times"):
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
@@ -59,6 +65,11 @@ class Recording:
                 )
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
+        for name, value in self.noise.items():
+            if not ((np.asarray(value) > 0) & np.isfinite(value)).all():
+                raise ValueError(
+                    f"noise of {name} of {self.name} must be positive and finite, got {np.asarray(value).tolist()}"
+                )
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of this duration, each of which begins at a measured state; what is left at the end is dropped.

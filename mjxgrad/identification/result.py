@@ -29,6 +29,7 @@ _NOT_TOLD_APART = 1e-6  # of the clearest direction: the data would have to be a
 _RELATED = 0.5  # of the correlation of residuals: intervals are then too narrow by √3
 _REMOVED = 1e-3  # of the residuals at the start: what is left is that of numbers computed in another way
 _ENOUGH = 30  # numbers: among fewer, noise alone is as correlated once in a hundred times
+_CHANCE = 1e-4  # that residuals as large are noise
 _NO_PART = 1e-4  # of a direction that is not determined: what has no more is determined all the same
 
 
@@ -67,6 +68,7 @@ class Identification:
             relative to their values, without any effect.
         at_bounds: names that ended at a bound: the data ask for more, and their intervals mean little.
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
+        has_noise: whether the recordings say the noise of every signal.
         held_out_rms: the same of the recordings that were held out; None without any.
         offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
         correlation: of residuals with those of the same signal one time later. About 0 if all that is left is independent noise.
@@ -90,6 +92,7 @@ class Identification:
     inseparable: tuple[dict[str, float], ...]
     at_bounds: tuple[str, ...]
     rms: tuple[float, float]
+    has_noise: bool
     held_out_rms: tuple[float, float] | None
     offsets: tuple[np.ndarray, ...] | None
     correlation: float
@@ -149,6 +152,12 @@ class Identification:
             found.append(
                 f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step helps. "
                 "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
+            )
+        if self.has_noise and exceeds_noise(self.rms[1], self.num_numbers - len(self.names)):
+            found.append(
+                f"Residuals are {self.rms[1]:.3g} times the noise that was said, which is more than chance: the motion of the "
+                "scene is not the recorded one, and values may be off by more than their intervals. Try free_start=True, shorter "
+                "windows (recording.cut), more parameters or num_points, or say the noise as it is."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
@@ -227,6 +236,11 @@ def statistics(
         tuple(name for name, felt in zip(coordinates.names, is_felt, strict=True) if not felt),
         _combinations(blurred / lengths[is_felt], values[is_felt], np.array(coordinates.names)[is_felt]),
     )
+
+
+def exceeds_noise(rms: float, freedom: int) -> bool:
+    """Return whether residuals are larger than the noise, in units of which they are, by more than chance (chi-square)."""
+    return bool(scipy.special.chdtrc(max(freedom, 1), rms**2 * max(freedom, 1)) < _CHANCE)
 
 
 def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:

@@ -7,10 +7,11 @@ point and chooses the next.
 """
 
 import dataclasses
+import functools
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,11 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from mjxgrad._arrays import compile_once
 from mjxgrad._rollout import DivergedError
 from mjxgrad.dynamics import Gradient, Onset
 from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
+from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
-from mjxgrad.identification.result import Identification, Stopped, on_host, statistics
+from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.scene import Scene
 
 Apply = Callable[[Scene, Values], Scene]
@@ -35,6 +38,8 @@ _FIRST_SIZE = 3.0  # with less a first step may go too far to come back
 _GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
 # Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_SIDE_BY_SIDE = 64  # points in one batch, for memory
+_DIVERGED = 1e30  # sum of squares of a motion that did
 _NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
 
 
@@ -66,9 +71,10 @@ def identify(
     apply: Apply | None = None,
     delay: str | None = None,
     free_start: bool = False,
-    onset: Onset | Literal["default"] | None = "default",
+    onset: Onset | None = None,
     gradient: Gradient = "discrete",
     max_steps: int = 100,
+    num_points: int = 256,
     log: Log | None = None,
 ) -> Identification:
     r"""Find parameters of a scene from recorded motions, through contact.
@@ -85,17 +91,20 @@ def identify(
         apply: called as `apply(scene, values)` after the parameters have written theirs, for what takes several of them.
         delay: name of the parameter, if any, by which controls act later than recorded (s).
         free_start: find the start of every recording, too, from where it says; for starts as noisy as the rest.
-        onset: as of `rollout`; by default `mg.Onset()`. Contacts then begin within the step, and the derivative is the slope of
-            the motion. With None the simulation is MuJoCo's to the bit, and a search through impacts may stall.
+        onset: as of `rollout`. None is MuJoCo's motion, which what MuJoCo has recorded needs: another is off by more than the
+            intervals. `mg.Onset()` is the smoother motion to search in, where real things were recorded.
         gradient: as of `rollout`.
         max_steps: simulations with derivatives at most.
+        num_points: if the descent leaves more than the noise that the recordings say, as where contacts chatter, so many points
+            between the bounds are narrowed down to what explains the recordings, moment by moment, and the descent begins again
+            at the best. 0 for no such search; there is none with `free_start`.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
         The values, their intervals, and what the recordings cannot tell; `print(result.summary())`.
 
     Raises:
-        ValueError: if there are no parameters or recordings, or shapes do not fit the scene.
+        ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
         ImportError: if optimistix is not installed.
     """
@@ -118,7 +127,7 @@ def identify(
     experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
     settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
     units = {name: parameter.unit for name, parameter in parameters.items()}
-    return search(experiments, coordinates, units, max_steps=max_steps, log=log, **settings)
+    return search(experiments, coordinates, units, max_steps=max_steps, num_points=num_points, log=log, **settings)
 
 
 def search(
@@ -128,23 +137,30 @@ def search(
     *,
     max_steps: int,
     log: Log | None,
+    num_points: int = 0,
     free_start: bool,
-    onset: Onset | Literal["default"] | None,
     **settings: Any,
 ) -> Identification:
     """Run the search over experiments of any kind; see `identify`."""
-    # Not made with the signature: that would use a device when the package is imported.
-    settings["onset"] = Onset() if isinstance(onset, str) else onset
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     try:  # before anything is compiled
-        optimistix = importlib.import_module("optimistix")
+        importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     program = _Program(experiments, coordinates, free_start, **settings)
-    point, found, num_steps, ended, first, removable = _descend(optimistix, program, max_steps, log)
+    start = program.start()
+    point, found, num_steps, ended, first, removable = _descend(program, start, max_steps, log)
+    has_noise = all(set(one.noise) == set(one.measured) for each in experiments for one in each.recordings)
+    numbers = program.num_numbers
+    if num_points and has_noise and not free_start and exceeds_noise(_rms(program, found), numbers - len(start)):
+        begin = program.searched(num_points)
+        again = None if begin is None else _descend(program, begin, max_steps, log)
+        if again is not None and _rms(program, again[1]) < _rms(program, found):
+            point, found, more, ended, _, removable = again
+            num_steps += more
     values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
-    numbers, explained = program.num_numbers, on_host(found)
+    explained = on_host(found)
     residual, slope, num_offsets = _without_offsets(explained)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
@@ -163,6 +179,7 @@ def search(
         inseparable=verdict.inseparable,
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(first, float(after / np.sqrt(numbers))),
+        has_noise=has_noise,
         held_out_rms=program.held_out_rms(nominal, values),
         offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
         correlation=_correlation(program.windows, explained),
@@ -177,7 +194,7 @@ def search(
 
 
 class _Program:
-    """Residuals and their derivatives by values and offsets, compiled once."""
+    """Residuals and their derivatives by values and offsets. What was measured is an argument: other data compile nothing."""
 
     def __init__(
         self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
@@ -185,8 +202,15 @@ class _Program:
         self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
         self._delay, self._settings = delay, settings
         self.windows = [stack(one.scene, one.recordings) for one in experiments]
-        self.num_numbers = sum(int((np.asarray(w) > 0).sum()) for one in self.windows for w in one.weight.values())
-        self._evaluate = jax.jit(self._traced)
+        self.num_numbers = _num_numbers(self.windows)
+        if not self.num_numbers:
+            raise ValueError("recordings must hold something that was measured, got NaN alone")
+        self._compiled: dict[Callable, jax.stages.Compiled] = {}
+
+    def _run(self, function: Callable, *arguments: Any) -> Any:
+        if function not in self._compiled:
+            self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
+        return self._compiled[function](*arguments)
 
     def _residuals(
         self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
@@ -196,7 +220,9 @@ class _Program:
         residual, diverged = residuals(scene, window, offset, delay, **self._settings)
         return jnp.where(diverged, jnp.inf, residual)
 
-    def _traced(self, vector: Array, offsets: list[Array], prepared: list[PyTree]) -> list[tuple[Array, ...]]:
+    def _traced(
+        self, of_all: list[Windows], vector: Array, offsets: list[Array], prepared: list[PyTree]
+    ) -> list[tuple[Array, ...]]:
         found = []
         for i, experiment in enumerate(self.experiments):
 
@@ -209,13 +235,32 @@ class _Program:
                 slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
                 return residual, *slopes
 
-            found.append(jax.vmap(one)(self.windows[i], offsets[i] if self.free_start else None))
+            found.append(jax.vmap(one)(of_all[i], offsets[i] if self.free_start else None))
         return found
+
+    def _sums(
+        self, of_all: list[Windows | None], vectors: Array, prepared: list[PyTree]
+    ) -> Float[Array, "points rows"]:
+        """Return for each vector the sum of squares over all windows, up to each of their rows."""
+        there = [(e, w, p) for e, w, p in zip(self.experiments, of_all, prepared, strict=True) if w is not None]
+        num_rows = max(windows.index.shape[1] for _, windows, _ in there)
+
+        def of_window(experiment: Experiment, prepared: PyTree, vector: Array, window: Windows) -> Array:
+            squares = self._residuals(experiment, vector, None, window, prepared) ** 2
+            ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
+            of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
+            return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
+
+        def of_one(vector: Array) -> Array:
+            parts = [jax.vmap(functools.partial(of_window, e, p, vector))(w).sum(axis=0) for e, w, p in there]
+            return jnp.cumsum(sum(parts))
+
+        return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
     def __call__(self, point: Array) -> list[tuple[Array, ...]]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
         prepared = [one.prepare(np.asarray(vector, float)) for one in self.experiments]
-        return self._evaluate(vector, self.offsets(point), prepared)
+        return self._run(self._traced, self.windows, vector, self.offsets(point), prepared)
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
@@ -229,6 +274,23 @@ class _Program:
         free = jnp.full(len(self.start()) - len(self.coordinates.names), jnp.inf)
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
+
+    def searched(self, num_points: int) -> Array | None:
+        """Return the best of many points between the bounds, found as `particles` does; None if none explains the recordings."""
+        dtype, nothing = self.coordinates.nominal.dtype, [None for _ in self.experiments]
+        weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
+        counts = np.zeros(max(there.shape[1] for there in weights))
+        for there in weights:
+            counts[: there.shape[1]] += there.sum(axis=(0, 2))
+        low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
+
+        def sums_at(points: np.ndarray) -> np.ndarray:
+            vectors = self.coordinates.values(jnp.asarray(points, dtype))
+            found = np.asarray(self._run(self._sums, self.windows, vectors, nothing), float)
+            return np.where(np.isfinite(found), found, _DIVERGED)
+
+        best = best_point(sums_at, low, high, np.cumsum(counts), num_points)
+        return None if best is None else jnp.asarray(best, dtype)
 
     def offsets(self, point: Array) -> list[Array]:
         """Return the part of a point that moves the starts, one array for each experiment."""
@@ -246,39 +308,41 @@ class _Program:
 
     def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
         """Return what is left of the recordings that were held out, at each point; None without any."""
-        judged = [(one, stack(one.scene, one.held_out)) for one in self.experiments if one.held_out]
-        if not judged:
+        judged = [stack(one.scene, one.held_out) if one.held_out else None for one in self.experiments]
+        if not any(judged):
             return None
-
-        @jax.jit
-        def of_all(vector: Array, prepared: list[PyTree]) -> Array:
-            parts = [
-                jax.vmap(lambda w, e=e, f=f: self._residuals(e, vector, None, w, f))(w).ravel()
-                for (e, w), f in zip(judged, prepared, strict=True)
-            ]
-            return jnp.linalg.norm(jnp.concatenate(parts))
-
-        count = sum(int((np.asarray(w) > 0).sum()) for _, one in judged for w in one.weight.values())
-        dtype = self.coordinates.nominal.dtype
-        found = [of_all(jnp.asarray(p, dtype), [one.prepare(p) for one, _ in judged]) for p in points]
-        first, last = (float(x) / math.sqrt(count) for x in found)
+        program, sums = jax.jit(self._sums), []
+        for point in points:
+            vector = jnp.asarray(point, self.coordinates.nominal.dtype)
+            given = (judged, vector[None], [one.prepare(point) for one in self.experiments])
+            sums.append(compile_once(program.lower(*given))(*given)[0, -1])
+        first, last = (math.sqrt(float(x) / _num_numbers([one for one in judged if one is not None])) for x in sums)
         return first, last
 
 
-def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None):
+def _rms(program: _Program, found: list[tuple[Array, ...]]) -> float:
+    return math.sqrt(sum(float(jnp.sum(one[0] ** 2)) for one in found) / program.num_numbers)
+
+
+def _num_numbers(windows: Sequence[Windows]) -> int:
+    return sum(int((np.asarray(w) > 0).sum()) for one in windows for w in one.weight.values())
+
+
+def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
     """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
-    point, (lower, upper) = program.start(), program.box()
+    lower, upper = program.box()
     found = best = program(point)
-    length = float(jnp.sqrt(sum(jnp.sum(one[0] ** 2) for one in found)))
-    if not np.isfinite(length):
+    first = _rms(program, found)
+    if not np.isfinite(first):
         reason = "got one that diverged: begin elsewhere"
         raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
-    first, size = length / math.sqrt(program.num_numbers), (length or 1.0) / _FIRST_SIZE
+    size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
-    state, step = _levenberg_marquardt(optimistix, point, linear)
+    solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)
+    state = eqx.tree_at(lambda s: s.y_eval, state, point)
     refusals, slow, removable, total = 0, 0, 1.0, math.inf
     for count in range(1, max_steps + 1):
-        point, state, _ = step(point, state, linear)
+        point, state, _ = _step(solver, point, state, linear)
         is_accepted = int(state.num_steps_since_acceptance) == 0
         if is_accepted:
             fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
@@ -298,14 +362,25 @@ def _descend(optimistix: Any, program: _Program, max_steps: int, log: Log | None
     return point, best, max_steps, False, first, removable
 
 
-def _levenberg_marquardt(optimistix: Any, point: Array, linear: tuple[Array, Array, Array]) -> tuple[Any, Callable]:
-    """Return optimistix's state at the start and its step, which sees linear models alone."""
-    tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
+@functools.lru_cache(maxsize=32)
+def _levenberg_marquardt(numbers: int, unknowns: int, dtype: Any) -> tuple[Any, Any]:
+    """Return optimistix's solver and its state at zero; it sees linear models alone.
+
+    The state holds functions made with it, so that a step with another state of the same shape would be compiled again.
+    """
+    optimistix, tolerance = importlib.import_module("optimistix"), float(np.sqrt(jnp.finfo(dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
-    struct = jax.eval_shape(lambda: linear[1])
-    state = solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
-    return state, eqx.filter_jit(lambda y, state, linear: solver.step(_predict, y, linear, {}, state, frozenset()))
+    point, residual = jnp.zeros(unknowns, dtype), jnp.zeros(numbers, dtype)
+    linear = (point, residual, jnp.zeros((numbers, unknowns), dtype))
+    struct = jax.eval_shape(lambda: residual)
+    return solver, solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
+
+
+@eqx.filter_jit
+def _step(solver: Any, point: Array, state: Any, linear: tuple[Array, Array, Array]) -> tuple[Array, Any, Any]:
+    """Return the next point, the state there, and what optimistix says besides."""
+    return solver.step(_predict, point, linear, {}, state, frozenset())
 
 
 def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:

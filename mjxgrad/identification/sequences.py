@@ -10,7 +10,7 @@ Principal moments and axes of inertia are differenced as the pseudo-inertia: the
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ def identify_sequences(
     sensor_weights: dict[str, float] | None = None,
     held_out: Sequence[str] = (),
     free_start: bool = False,
-    onset: Onset | Literal["default"] | None = "default",
+    onset: Onset | None = None,
     gradient: Gradient = "discrete",
     max_steps: int = 100,
     log: Log | None = None,
@@ -65,7 +65,7 @@ def identify_sequences(
         sensor_weights: by name of a sensor.
         held_out: names of sequences that are only judged by.
         free_start: as of `identify`.
-        onset: as of `identify`; None for the same motion as `mujoco.sysid`'s.
+        onset: as of `identify`; None is the motion of `mujoco.sysid`.
         gradient: as of `identify`.
         max_steps: as of `identify`.
         log: as of `identify`.

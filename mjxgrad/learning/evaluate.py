@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from mjxgrad._arrays import compile_once
 from mjxgrad._rollout import Engine
 from mjxgrad.envs import Environment, EnvState
 
@@ -72,4 +73,5 @@ def evaluate(
         terms = {name: value / length for name, value in totals.items()}
         return Evaluation(total, length, final.terminated, jnp.concatenate([start.physics.qpos[None], qpos]), terms)
 
-    return jax.jit(jax.vmap(one))(jax.random.split(key, num_episodes))
+    keys = jax.random.split(key, num_episodes)
+    return compile_once(jax.jit(jax.vmap(one)).lower(keys))(keys)

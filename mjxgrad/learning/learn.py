@@ -31,6 +31,7 @@ import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Float, Key, UInt32
 
+from mjxgrad._arrays import compile_once
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import Learner, Policy, Settings, begin
 from mjxgrad.learning.logs import Log
@@ -119,7 +120,7 @@ def learn(
     numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
     numbers = np.broadcast_to(numbers, (*shape, *numbers.shape[key.ndim :]))
     start = jit(lambda arrays, numbers: of_each(begin, arrays)(jax.random.wrap_key_data(numbers, impl=kind)))
-    learner = start(arrays, numbers)
+    learner = compile_once(start.lower(arrays, numbers))(arrays, numbers)
     found = jax.eval_shape(lambda arrays, learner: of_each(update, arrays)(learner)[1], arrays, learner)
     found["seconds"] = jax.ShapeDtypeStruct(shape, np.float64)
     history = {name: np.zeros((0, *x.shape), x.dtype) for name, x in found.items()}
@@ -134,7 +135,7 @@ def learn(
         def run(arrays: Any, learner: Learner) -> tuple[Learner, dict[str, Array]]:
             return jax.lax.scan(lambda now, _: of_each(update, arrays)(now), learner, length=count)
 
-        return jit(run).lower(arrays, learner).compile()
+        return compile_once(jit(run).lower(arrays, learner))
 
     is_first = jax.process_index() == 0
     while (done := int(learner.num_updates.max())) < num_updates:

@@ -16,7 +16,7 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import compile_once, whole
 from mjxgrad.estimators.estimate import Estimator, Reason
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.parameters import Restored
@@ -228,14 +228,18 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
         )
     params, key = _matched(params, key)
     arrays, static = eqx.partition((method, options), eqx.is_array)
+    # Structures name functions: a list of numbers is that of any run of the same program.
+    numbers, structure = jax.tree.flatten(arrays)
 
     def over_seeds(function: Callable, *in_axes: int | None) -> Any:
-        function = functools.partial(function, static)
-        return jax.jit(jax.vmap(function, in_axes) if key.ndim else function)
+        def of_numbers(numbers: list[Array], *rest: Any) -> Any:
+            return function(static, jax.tree.unflatten(structure, numbers), *rest)
 
-    carry = over_seeds(_start, None, 0)(arrays, params)
+        return jax.jit(jax.vmap(of_numbers, in_axes) if key.ndim else of_numbers)
+
+    carry = compile_once(over_seeds(_start, None, 0).lower(numbers, params))(numbers, params)
     began = time.perf_counter()
-    lowered = over_seeds(_segment, None, 0, 0, None).lower(arrays, key, carry, jnp.zeros((), jnp.int32))
+    lowered = over_seeds(_segment, None, 0, 0, None).lower(numbers, key, carry, jnp.zeros((), jnp.int32))
     program = _Program(lowered, time.perf_counter() - began)
     nothing = Record.blank(params.dtype), jnp.zeros((), params.dtype)
     saved = Saved(carry, jax.tree.map(lambda x: np.zeros((*key.shape, 0), x.dtype), nothing), np.zeros(0))
@@ -245,8 +249,9 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
         if options.checkpoint.exists():
             saved = checkpoint.load(options.checkpoint, saved, fingerprint)
 
-    saved, stopped = _loop(functools.partial(program.advance, arrays, key), saved, options, fingerprint)
-    final_cost, best = over_seeds(_finish, None, 0)(arrays, saved.carry)
+    saved, stopped = _loop(functools.partial(program.advance, numbers, key), saved, options, fingerprint)
+    finish = compile_once(over_seeds(_finish, None, 0).lower(numbers, saved.carry))
+    final_cost, best = finish(numbers, saved.carry)
     history = saved.history()
     return Optimisation(
         params=saved.carry.params,
@@ -295,14 +300,14 @@ class _Program:
     def __init__(self, lowered: Any, seconds: float):
         self.lowered, self.compiled, self.compile_seconds = lowered, None, seconds
 
-    def advance(self, arrays: PyTree, key: Key[Array, "..."], saved: Saved) -> Saved:
+    def advance(self, numbers: list[Array], key: Key[Array, "..."], saved: Saved) -> Saved:
         began = time.perf_counter()
         if self.compiled is None:
-            self.compiled = self.lowered.compile()
+            self.compiled = compile_once(self.lowered)
             self.compile_seconds += time.perf_counter() - began
             began = time.perf_counter()
         start = jnp.asarray(saved.seconds.size, jnp.int32)
-        carry, trace = jax.block_until_ready(self.compiled(arrays, key, saved.carry, start))
+        carry, trace = jax.block_until_ready(self.compiled(numbers, key, saved.carry, start))
         seconds = time.perf_counter() - began
         done = int(np.max(carry.num_steps)) - int(np.max(saved.carry.num_steps))
         joined = jax.tree.map(lambda old, new: np.concatenate([old, np.asarray(new)], axis=-1), saved.trace, trace)

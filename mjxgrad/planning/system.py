@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import compiled
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State
 from mjxgrad.dynamics import Smoothing, step
@@ -153,6 +154,7 @@ class SceneSystem(System):
         """Return the qpos of states."""
         return state[..., : self.scene.model.nq]
 
+    @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv
         data = self.scene.data.replace(
@@ -221,7 +223,7 @@ class GoalCost(Cost):
     stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
-    resting: Float[ArrayLike, "..."] = 0.0
+    resting: Float[Array, "..."] = eqx.field(converter=jnp.asarray, default=0.0)
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
         distance, effort = system.difference(state, self.goal), control - self.resting

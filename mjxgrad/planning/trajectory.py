@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad._arrays import known
+from mjxgrad._arrays import compiled, known
 from mjxgrad.planning.linear_model import LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, Cost, Quadratic, System, stage_model, terminal_model
+from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
@@ -203,14 +203,20 @@ def optimise_trajectory(
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
     _check(system, controls, factors, lower, upper)
-    horizon = len(controls)
-    problem = _Problem(system, cost, smoother, jax.random.split(key, horizon), lower, upper)
+    problem = _Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper)
+    return _improved(problem, start, controls, factors)
+
+
+@compiled
+def _improved(problem: _Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
+    """Return the plan; its data are arguments, so that a receding horizon plans again without compiling."""
+    system, smoother, horizon = problem.system, problem.smoother, len(controls)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
     zero, m = jnp.zeros((), start.dtype), system.num_controls
     no_gain = jnp.zeros((horizon, m, system.num_changes), start.dtype)
     rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, zero, jnp.asarray(True))
     at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
-    given = _Course(at_start, jnp.clip(controls, lower, upper), jnp.asarray(jnp.inf, start.dtype))
+    given = _Course(at_start, jnp.clip(controls, problem.lower, problem.upper), jnp.asarray(jnp.inf, start.dtype))
 
     def iterate(carry, inputs):
         course, best, regularisation, *_ = carry

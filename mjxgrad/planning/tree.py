@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import known
+from mjxgrad._arrays import compiled, known
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, StateVector, System
 from mjxgrad.task import optional_pytree
@@ -215,22 +215,7 @@ def search(
     weight = 1 / sampling.resolution**2
     weights = jnp.stack([jnp.where(matters, weight, 0.0), weight])
     grower = _Grower(system, smoother, sampling, start, goal, jnp.asarray(tolerance), weights, low, high)
-    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x), grower.root())
-    root = eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
-
-    def may_go_on(carry: tuple) -> Bool[Array, ""]:
-        nodes, _, turn, _ = carry
-        has_room = nodes.size + sampling.batch * sampling.max_extension <= capacity
-        return has_room & (turn < max_turns) & (nodes.errors[nodes.best] > 1)
-
-    def go_on(carry: tuple) -> tuple:
-        nodes, key, turn, num_steps = carry
-        key, now = jax.random.split(key)
-        nodes, tried = grower.grow(nodes, now)
-        return nodes, key, turn + 1, num_steps + tried
-
-    nodes, _, _, num_steps = jax.lax.while_loop(may_go_on, go_on, (root, key, jnp.asarray(0), jnp.asarray(0)))
-    return Search(nodes, nodes.errors[nodes.best] <= 1, num_steps)
+    return _grown(grower, key, max_turns, capacity)
 
 
 def path(found: Search) -> Path:
@@ -347,6 +332,27 @@ class _Grower(eqx.Module):
         at = jax.tree.map(lambda x: x[nearest], (nodes.states, nodes.reaches))
         _, (new, is_valid) = jax.lax.scan(advance, (*at, jnp.asarray(True)), jnp.arange(most))
         return new, is_valid
+
+
+@compiled
+def _grown(grower: _Grower, key: PRNGKeyArray, max_turns: int, capacity: int) -> Search:
+    """Return the tree, grown until it meets the goal, is full, or has had its turns."""
+    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype).at[0].set(x), grower.root())
+    root = eqx.tree_at(lambda nodes: nodes.size, rows, jnp.asarray(1))
+
+    def may_go_on(carry: tuple) -> Bool[Array, ""]:
+        nodes, _, turn, _ = carry
+        has_room = nodes.size + grower.sampling.batch * grower.sampling.max_extension <= capacity
+        return has_room & (turn < max_turns) & (nodes.errors[nodes.best] > 1)
+
+    def go_on(carry: tuple) -> tuple:
+        nodes, key, turn, num_steps = carry
+        key, now = jax.random.split(key)
+        nodes, tried = grower.grow(nodes, now)
+        return nodes, key, turn + 1, num_steps + tried
+
+    nodes, _, _, num_steps = jax.lax.while_loop(may_go_on, go_on, (root, key, jnp.asarray(0), jnp.asarray(0)))
+    return Search(nodes, nodes.errors[nodes.best] <= 1, num_steps)
 
 
 def _check(

@@ -86,6 +86,8 @@ def load_scene(
     """
     if keep_everything and leave_out is not None:
         raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
+    if softness is not None and not isinstance(softness, Softness):
+        raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with _listening() as told:

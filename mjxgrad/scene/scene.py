@@ -23,9 +23,11 @@ from mjxgrad.dynamics import constants
 from mjxgrad.dynamics.collision import candidates
 from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene.conversions import Conversion
-from mjxgrad.scene.omissions import Omission
+from mjxgrad.scene.omissions import Omission, has_medium
 
 _WIDTH = 118  # characters; what a laptop's terminal shows
+_OPTIONS = ("timestep", "gravity", "wind")
+_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "dof_armature", "timestep"}
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
@@ -103,25 +105,26 @@ class Scene(eqx.Module):
         return scene
 
     def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
-        """Replace numbers of the MJX model, such as `geom_friction`, `body_mass` or `dof_damping`.
+        """Replace numbers of the MJX model, such as `geom_friction` or `body_mass`, or `timestep`, `gravity` and `wind`.
 
         Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo computes
         from masses, inertias, lengths and sizes when it compiles a model follows, unless it is given, too; see `mg.set_const`.
 
         Args:
-            **fields: new values of the model's floating-point arrays, each of the shape that it has.
+            **fields: new values of the model's floating-point arrays, each of the shape that it has; of its options the time
+                step (s), gravity (m/s²) and wind (m/s), which acts in a medium alone.
 
         Returns:
             The scene with these values.
 
         Raises:
-            ValueError: if there is no such field, it is not an array of numbers, the shape is another, or a value is NaN
-                (where values are known; inside `jax.jit` a rollout is flagged as diverged).
+            ValueError: if there is no such field, it is not an array of numbers, the shape is another, or a value is NaN, or a
+                mass, inertia, size or time step negative (where values are known; inside `jax.jit` a rollout with NaN is
+                flagged as diverged).
         """
-        present = {field.name: getattr(self.model, field.name) for field in self.model.fields()}
-        arrays = {
-            k: v for k, v in present.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)
-        }
+        every = numbers_of(self.model)
+        options = {name: every[f"opt.{name}"] for name in _OPTIONS}
+        arrays = {name: value for name, value in every.items() if "." not in name} | options
         for name, value in fields.items():
             if name not in arrays:
                 near = difflib.get_close_matches(name, arrays, n=3)
@@ -133,10 +136,18 @@ class Scene(eqx.Module):
         for name, value in changed.items():
             if is_known(value) and np.isnan(value).any():
                 raise ValueError(f"{name} must hold numbers, got NaN")
+            if is_known(value) and (
+                (name in _NOT_NEGATIVE and (value < 0).any()) or (name == "timestep" and value == 0)
+            ):
+                requirement = "be positive" if name == "timestep" else "not be negative"
+                raise ValueError(f"{name} must {requirement}, got {np.asarray(value).min():g}")
+        if "wind" in fields and not has_medium(self.mj_model):
+            _warn(self, "wind acts on nothing without a medium: set density or viscosity in <option>")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
-        model, derived = self.model.replace(**changed), {}
+        chosen = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
+        model, derived = self.model.replace(**changed).tree_replace(chosen), {}
         if constants.CAUSES & fields.keys():
             # These alone: what else is known of the model stays so while it is traced.
             derived = jax.jit(constants.constants_of)(model)

@@ -35,7 +35,7 @@ from mjxgrad.verdict.findings import (
     touch_speed,
 )
 from mjxgrad.verdict.measure import Measured, measure
-from mjxgrad.verdict.motions import Motions, half_range, random_motions
+from mjxgrad.verdict.motions import Motions, first_keyframe, half_range, random_motions
 from mjxgrad.verdict.moving import Mover, Outcomes
 from mjxgrad.verdict.page import page
 
@@ -315,10 +315,12 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     step = f'gradient="{advice.gradient}"'
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
+    key = first_keyframe(scene.mj_model)
+    keyframe = "" if key is None else f", keyframe={key!r}"
     if scene.model.nu:
         objective, start = f"mg.open_loop(task, stddev={noise})", "jnp.zeros(objective.dim)"
     else:
-        run = "task.run(None, start=mg.initial_state(scene, qvel=velocity)).cost"
+        run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{keyframe})).cost"
         objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise})"
         start = f"jnp.zeros({scene.model.nv})"
     return f"""\
@@ -328,7 +330,7 @@ import mjxgrad as mg
 
 scene = mg.load_scene({path!r}{settings})
 cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
-task = mg.SceneTask(scene, mg.initial_state(scene), cost, horizon={advice.horizon}, {step})
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {step})
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from mjxgrad import render
-from mjxgrad.dynamics import Onset
 from mjxgrad.identification import Identification, Recording, Stopped
 from mjxgrad.identification.files import simulated
 from mjxgrad.identification.recording import stack
@@ -130,7 +129,7 @@ class Identified:
     @cached_property
     def _courses(self) -> tuple[dict[str, np.ndarray], ...]:
         windows, found = stack(self.scene, [self._shown]), self.result
-        run = jax.jit(lambda scene, delay: simulated(scene, windows, delay, Onset()))
+        run = jax.jit(lambda scene, delay: simulated(scene, windows, delay))
         courses = [run(s, v.get("delay", 0.0)) for s, v in ((self.scene, found.start), (found.scene, found.values))]
         return tuple(jax.tree.map(np.asarray, course) for course in courses)
 

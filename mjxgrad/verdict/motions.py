@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjxgrad._rollout import State, Trajectory
+from mjxgrad._rollout import State, Trajectory, pose_warnings
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
@@ -103,13 +103,13 @@ def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: 
 
 
 def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
-    """Move a scene from its reference pose and its key frames, under random controls that are smooth in time."""
+    """Move a scene from its key frames and its reference pose, under random controls that are smooth in time."""
     model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
     low, high = np.asarray(scene.ctrlrange, float).T
     middle, half = np.where(np.isfinite(low + high), (low + high) / 2, 0.0), half_range(scene)
-    starts = list(_starts(model))
+    starts = list(_starts(scene, model))
     chosen = [starts[i % len(starts)] for i in range(_NUM_MOTIONS)]
     wiggles = [smooth(rng, num_steps, model.nu, num_steps * timestep) for _ in chosen]
     controls = np.array([middle + _REACH * half * one for one in wiggles])
@@ -135,11 +135,18 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     )
 
 
-def _starts(model: mujoco.MjModel) -> Iterator[_Start]:
-    yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
+def first_keyframe(model: mujoco.MjModel) -> str | int | None:
+    """Return the name, or else the number, of a scene's first key frame; None if it has none."""
+    return (model.key(0).name or 0) if model.nkey else None
+
+
+def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[_Start]:
+    """Give the key frames, and the reference pose where it is one to start from or the only one."""
     for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or str(i)
         yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
+    if not model.nkey or not any(pose_warnings(scene.model, model, model.qpos0)):
+        yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
 
 
 def _roll(model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray) -> tuple:

@@ -10,6 +10,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad import identification
 from mjxgrad.identification import Parameter, Recording, Stopped
+from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import residuals, stack
 
 _STEP, _STEPS = 0.01, 40
@@ -188,11 +189,11 @@ def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
         ),
         (lambda cart: Recording({"place": np.zeros(9)}).cut(0.1, 0.01), "must have measured qpos and qvel to be cut"),
         (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)))]),
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)), _STEP * np.arange(5))]),
             "controls of the recording must have a row for each of 4",
         ),
         (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((9, 2)))]),
+            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((4, 2)))]),
             "must have 1 columns in this scene",
         ),
         (
@@ -231,3 +232,52 @@ def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     assert abs(right.values["gear"] - 3.0) < right.half_width["gear"]
     assert abs(right.correlation) < 0.47
     assert right.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "said"),
+    [
+        (_course()[1:], {}, "41 rows for 40 controls, one at each state"),
+        (_course(), {"noise": {"place": 0.0}}, "noise of place of the recording must be positive"),
+        (np.full(41, np.nan), {}, "got NaN alone"),
+    ],
+)
+def test_what_a_recording_lacks_is_said(cart, measured, given, said):
+    with pytest.raises(ValueError, match=said):
+        mg.identify(
+            cart,
+            {"gear": identification.gear(cart, "motor")},
+            [Recording({"place": measured}, _DRIVE[:, None], **given)],
+        )
+
+
+def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, compilations):
+    """The second cart is pulled by 0.2 N that the scene does not know: no gear explains its motion, and chi-square sees it."""
+    results = []
+    for pull in (0.0, 0.2, 0.2):
+        before = len(compilations)
+        place = _course(gear=3.3) + pull / 4 * (_STEP * np.arange(_STEPS + 1)) ** 2
+        place += 1e-4 * np.random.default_rng(0).normal(size=place.shape)
+        recording = Recording({"place": place}, _DRIVE[:, None], noise={"place": 1e-4})
+        results.append(mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], num_points=32))
+    assert len(compilations) == before
+    assert not results[0].warnings()
+    assert f"{results[2].rms[1]:.3g} times the noise" in results[2].summary()
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.0])
+def test_points_find_what_only_jumps_tell_and_say_where_nothing_explains_what_was_measured(offset):
+    """Row t has binary digit t of both numbers, and is 5 standard deviations off where one is wrong: no slope is not zero."""
+    true, digits = np.array([0.3141, 0.7182]), 2.0 ** np.arange(1, 11)
+
+    def sums_at(points):
+        return np.cumsum(
+            25 * (np.floor(points[..., None] * digits) % 2 != np.floor(true[:, None] * digits) % 2).sum(1) + offset,
+            axis=1,
+        )
+
+    found = best_point(sums_at, np.zeros(2), np.ones(2), 0.5 * np.arange(1, 11), 256)
+    if offset:  # 4 a row, where noise has 0.5
+        assert found is None
+    else:
+        np.testing.assert_array_equal(np.floor(found * 1024), np.floor(true * 1024))

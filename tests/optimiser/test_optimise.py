@@ -1,6 +1,7 @@
 """What a run does step by step, against closed forms and against the same steps taken by hand."""
 
 import dataclasses
+import functools
 import time
 
 import jax
@@ -228,3 +229,21 @@ def test_starts_that_do_not_fit_are_refused(key, params, num_keys, sentence):
 def test_a_function_that_is_no_objective_is_refused(key):
     with pytest.raises(ValueError, match="objective must be an Objective, got function; wrap a function by"):
         mg.optimise(problems.bowl, START, key, estimator=problems.exact, optimiser=SGD, num_steps=1)
+
+
+def test_a_run_of_the_same_program_compiles_nothing_and_what_functions_read_is_read_again(key, compilations):
+    """Everything is made anew: the cost, its noise, the estimator and the optimiser. A target that has changed counts."""
+    target = {"place": 1.0}
+
+    def again(start):
+        objective = mg.parameter_noise(lambda x: jnp.sum((x - target["place"]) ** 2), stddev=0.1)
+        estimator = functools.partial(mg.estimators.first_order, num_samples=4)
+        settings = {"estimator": estimator, "optimiser": optax.sgd(0.2), "num_steps": 40}
+        return mg.optimise(objective, start, key, **settings).params
+
+    again(jnp.array([0.0]))
+    before = len(compilations)
+    np.testing.assert_allclose(again(jnp.array([0.5])), 1.0, atol=0.2)
+    assert len(compilations) == before
+    target["place"] = 3.0
+    np.testing.assert_allclose(again(jnp.array([0.5])), 3.0, atol=0.2)

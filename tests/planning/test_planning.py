@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+import mjxgrad as mg
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import (
     Analytic,
@@ -16,6 +17,7 @@ from mjxgrad.planning import (
     GoalCost,
     Sampled,
     Sampling,
+    SceneSystem,
     optimise_trajectory,
     path,
     search,
@@ -278,6 +280,45 @@ def test_a_search_that_cannot_be_is_refused_in_a_sentence(settings, sentence):
     settings = {"tolerance": np.ones(2), "lower": -1.0, "upper": 1.0, "sampling": sampling} | settings
     with pytest.raises(ValueError, match=sentence):
         search(FunctionSystem(affine, 2, 2), START, GOAL, key=jax.random.key(0), smoother=Exact(), **settings)
+
+
+def test_to_plan_again_compiles_nothing(compilations):
+    """Nor to search, to step a scene or to roll it out: from elsewhere, to elsewhere, with other weights and limits."""
+    scene = mg.load_scene(
+        "<mujoco><worldbody><body><joint type='slide' name='x'/><geom size='.1'/></body></worldbody>"
+        "<actuator><motor joint='x'/></actuator></mujoco>"
+    )
+    given = jnp.zeros((HORIZON, 2))
+    for i in range(3):
+        before = len(compilations)
+        system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL + i, STAGE, TERMINAL, CONTROL + i, resting=0.1 * i)
+        smoother = Sampled(0.1 + i, 0.1, num_samples=4, order="first")
+        plan = optimise_trajectory(
+            system,
+            cost,
+            START + i,
+            given,
+            jax.random.key(i),
+            smoother=smoother,
+            schedule=np.array([1.0, 0.5 - 0.1 * i]),
+            upper=3.0 + i,
+        )
+        given = shifted(plan)
+        sampling = Sampling(-jnp.ones(2), jnp.ones(2), 0.1 * jnp.ones(2), batch=2, max_extension=2)
+        limits = {"lower": -1.0 - i, "upper": 1.0, "capacity": 20, "max_turns": 2}
+        search(
+            system,
+            START,
+            GOAL,
+            np.array([0.1, np.inf]),
+            jax.random.key(i),
+            smoother=smoother,
+            sampling=sampling,
+            **limits,
+        )
+        state = SceneSystem(scene, num_substeps=2).step(jnp.array([0.1 * i, 0.0]), jnp.ones(1))
+        mg.rollout(scene, mg.initial_state(scene, state[:1], state[1:]), float(i) * jnp.ones((3, 1)), onset=mg.Onset())
+        assert i == 0 or len(compilations) == before
 
 
 def test_a_smoother_scales_all_that_has_a_length():

@@ -131,3 +131,47 @@ def test_c_mujoco_finds_contacts_of_geoms_that_have_moved_and_grown():
         mujoco.mj_forward(model, data)
         counts.append(data.ncon)
     assert counts == [3, 3]
+
+
+FALLING = """<mujoco><option timestep="0.01" gravity="0 0 -1" density="{density}" viscosity="1e-5"/><worldbody>
+  <body><freejoint/><geom size=".1" mass="2"/></body></worldbody></mujoco>"""
+
+
+def test_time_step_and_gravity_are_replaced_under_grad_and_vmap():
+    """Ten steps h of semi-implicit Euler under g fall g h² (1 + ... + 10) = 55 g h², without a medium."""
+    scene = mg.load_scene(FALLING.format(density=0).replace('viscosity="1e-5"', ""))
+
+    def height(h, g):
+        moved = scene.with_model(timestep=h, gravity=jnp.stack([0.0, 0.0, g]))
+        return mg.rollout(moved, mg.initial_state(moved), horizon=10).qpos[-1, 2]
+
+    steps, pulls = jnp.array([0.01, 0.02]), jnp.array([-9.81, 0.0])
+    values, slopes = jax.vmap(jax.value_and_grad(height, (0, 1)))(steps, pulls)
+    np.testing.assert_allclose(values, 55 * pulls * steps**2, atol=1e-15)
+    np.testing.assert_allclose(slopes[0], 110 * pulls * steps, atol=1e-13)
+    np.testing.assert_allclose(slopes[1], 55 * steps**2, rtol=1e-12)
+
+
+def test_wind_blows_as_in_c_mujoco_and_says_where_there_is_nothing_to_blow():
+    scene = mg.load_scene(FALLING.format(density=1.2)).with_model(wind=jnp.array([10.0, 0, 0]))
+    model = scene.to_mujoco()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 10)
+    found = mg.rollout(scene, mg.initial_state(scene), horizon=10).qvel[-1]
+    assert data.qvel[0] > 0.05
+    np.testing.assert_allclose(found, data.qvel, rtol=1e-9, atol=1e-12)
+    with pytest.warns(SceneWarning, match="without a medium"):
+        mg.load_scene(SLIDER).with_model(wind=jnp.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"body_mass": [0.0, -1]}, "body_mass must not be negative, got -1"),
+        ({"geom_size": [[-0.1, 0, 0]]}, "geom_size must not be negative, got -0.1"),
+        ({"timestep": 0.0}, "timestep must be positive, got 0"),
+    ],
+)
+def test_what_cannot_be_negative_is_refused(scene, fields, said):
+    with pytest.raises(ValueError, match=said):
+        scene.with_model(**{name: jnp.asarray(value) for name, value in fields.items()})
