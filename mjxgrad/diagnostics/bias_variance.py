@@ -11,6 +11,9 @@ unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included
 at a jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
 """
 
+import dataclasses
+import textwrap
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
@@ -19,20 +22,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
+from mjxgrad.contact import Softness
+from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
-from mjxgrad.estimators.estimate import GradientEstimate
+from mjxgrad.estimators.estimate import GradientEstimate, Reason
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
+from mjxgrad.estimators.mixture import both_parts, weigh
+from mjxgrad.estimators.moments import Moments
+from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
 from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
 from mjxgrad.objective.base import unchanged
+from mjxgrad.scene import SceneWarning
 
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
 REACH = 6.0
 # XLA keeps 1.3 of two cores busy with one such program.
 _WORKERS = 2
+ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
+"""What is measured, by the name of its field, in words."""
+TOO_STIFF = "without gaining energy"
+"""In what a scene says of a contact that its time step cannot follow."""
 
 
 class Landscape(eqx.Module):
@@ -97,16 +111,22 @@ class BiasVariance(eqx.Module):
         params: the points.
         first: the first-order estimates.
         zeroth: the zeroth-order estimates, of the same rollouts.
+        alpha_order: the mean of α-order estimates from `alpha_samples` rollouts each, the same ones in batches, their variance
+            per rollout and their mean α; None for fewer than two batches, random starts, or an objective that does not know
+            its noise.
         cost: without noise.
         reference: the gradient of the smoothed cost, from rollouts of its own.
         reference_error: its standard error.
-        reference_method: "landscape" (see `Landscape`) or "zeroth_order" (a long run).
+        reference_method: "landscape" (see `Landscape`), or a long run of what is unbiased however wrong derivatives are:
+            "control_variate" or, for random starts and where the noise is not known, "zeroth_order".
         bias: first order less reference.
         bias_error: its standard error, from both.
         first_interval: of the mean of the first-order estimate; the other intervals likewise of what they are named for.
         first_variance_interval: of the variance of one first-order sample.
         zeroth_variance_interval: of the variance of one zeroth-order sample.
+        alpha_order_variance_interval: of the variance of α-order, per rollout.
         landscape: the cost along the parameter at every softness, if there is only one parameter, with noise on it.
+        warnings: what the scene says of each softness, such as that the time step cannot follow it; often nothing.
         confidence: of every interval.
     """
 
@@ -114,6 +134,7 @@ class BiasVariance(eqx.Module):
     params: Float[Array, "points dim"]
     first: GradientEstimate
     zeroth: GradientEstimate
+    alpha_order: GradientEstimate | None
     cost: Float[Array, "softness points"]
     reference: Float[Array, "softness points dim"]
     reference_error: Float[Array, "softness points dim"]
@@ -125,9 +146,134 @@ class BiasVariance(eqx.Module):
     bias_interval: Float[np.ndarray, "2 softness points dim"]
     first_variance_interval: Float[np.ndarray, "2 softness points"]
     zeroth_variance_interval: Float[np.ndarray, "2 softness points"]
+    alpha_order_variance_interval: Float[np.ndarray, "2 softness points"] | None
     landscape: Landscape | None
-    reference_method: Literal["landscape", "zeroth_order"] = eqx.field(static=True)
+    reference_method: Literal["landscape", "control_variate", "zeroth_order"] = eqx.field(static=True)
+    warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
+
+    @property
+    def values(self) -> tuple[Float[np.ndarray, " softness"], str]:
+        """What was swept as one number each, and its name: the stiffness, a plain array, or else its place in the list."""
+        leaves, is_stiffness = jax.tree.leaves(self.softness), isinstance(self.softness, Softness)
+        if is_stiffness and self.softness.stiffness is not None:
+            return np.asarray(self.softness.stiffness, float), "stiffness, 1/s²"
+        is_plain = len(leaves) == 1 and leaves[0].ndim == 1 and not is_stiffness
+        return (np.asarray(leaves[0], float), "softness") if is_plain else (np.arange(len(self.cost)) + 1.0, "number")
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return plain numbers, a row per softness and point: the truth, and of each estimate bias and variance with intervals.
+
+        Of several parameters they are norms, with an interval on the safe side (see `BiasConstrained`). `_is_biased` is beyond
+        chance over all rows together.
+        """
+        names = [name for name in ESTIMATES if getattr(self, name) is not None]
+        truth = self._sized(self.reference, self.reference_error, np.array(10**6))
+        columns: dict[str, np.ndarray] = dict(zip(("truth", "truth_low", "truth_high"), truth, strict=True))
+        for name in names:
+            one, ends = getattr(self, name), getattr(self, f"{name}_variance_interval")
+            error = np.hypot(one.standard_error, self.reference_error)
+            found = self._sized(one.value - self.reference, error, one.num_finite)
+            columns |= {f"{name}_bias{end}": x for end, x in zip(("", "_low", "_high"), found, strict=True)}
+            columns |= {
+                f"{name}_variance{end}": x for end, x in zip(("", "_low", "_high"), (one.variance, *ends), strict=True)
+            }
+            low, high = self._sized(one.value - self.reference, error, one.num_finite, over_all=True)[1:]
+            columns[f"{name}_is_biased"] = (low > 0) | (high < 0)
+        if self.alpha_order is not None:
+            columns["alpha"] = self.alpha_order.alpha
+        columns["finite_share"] = self.first.finite_fraction
+        every = {name: np.asarray(column) for name, column in columns.items()}
+        values, params = self.values[0], np.asarray(self.params)
+        return [
+            {"softness": float(values[i]), "params": params[j].tolist()} | {k: x[i, j].item() for k, x in every.items()}
+            for i, j in np.ndindex(self.cost.shape)
+        ]
+
+    def _sized(self, value: Array, error: ArrayLike, count: Array, *, over_all: bool = False) -> tuple[np.ndarray, ...]:
+        """Give numbers, norms for several parameters, with the ends of their intervals."""
+        tail = (1 - self.confidence) / (self.cost.size if over_all else 1)
+        half = mean_interval(0.0, np.linalg.norm(error, axis=-1), count, 1 - tail)[1]
+        size = np.asarray(value)[..., 0] if value.shape[-1] == 1 else np.linalg.norm(value, axis=-1)
+        return size, size - half if value.shape[-1] == 1 else np.maximum(size - half, 0), size + half
+
+    def summary(self, labels: Sequence[str] | None = None) -> str:
+        """Write a table for a terminal; labels name the softnesses in place of their numbers."""
+        values, title = self.values
+        labels = list(map(format_number, values)) if labels is None else labels
+        names, several = [name for name in ESTIMATES if getattr(self, name) is not None], len(self.params) > 1
+        words = [ESTIMATES[name] for name in names]
+        head = [title, *(["at"] if several else []), "truth", *(f"bias, {word}" for word in words)]
+        lines = [[*head, *(f"variance, {word}" for word in words), *(["α"] if "alpha_order" in names else [])]]
+        for k, row in enumerate(self.rows()):
+            i, j = divmod(k, len(self.params))
+            label = labels[i] + " !" * any(TOO_STIFF in text for text in self.warnings[i])
+            place = [" ".join(f"{x:.3g}" for x in row["params"])] if several else []
+            biases = [with_half_width(row, f"{name}_bias") + " *" * row[f"{name}_is_biased"] for name in names]
+            variances = [f"{row[f'{name}_variance']:.3g}" for name in names]
+            alpha = [f"{row['alpha']:.2f}"] if "alpha_order" in names else []
+            lines.append([label if j == 0 else "", *place, with_half_width(row, "truth"), *biases, *variances, *alpha])
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        table = "\n".join(
+            "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines
+        )
+        what = "gradient" if self.params.shape[1] == 1 else "norm of the gradient"
+        sure = f"half a {self.confidence:.0%} interval"
+        notes = [f"truth: {what} of the smoothed cost, from rollouts of its own; ± {sure}; variances are per rollout"]
+        if any(" *" in cell for line in lines for cell in line):
+            notes.append("* differs from zero beyond chance over the whole table")
+        return "\n".join([table, "", *(textwrap.fill(note, 118) for note in [*notes, *self.too_stiff])])
+
+    @property
+    def too_stiff(self) -> list[str]:
+        """One sentence if the time step does not hold some stiffness, of the first such."""
+        found = [text for told in self.warnings for text in told if TOO_STIFF in text]
+        return [f"! beyond what the time step holds: {found[0]}."] if found else []
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self) -> Any:
+        """Draw bias and variance against softness with matplotlib, a column per point, and return the figure.
+
+        Raises:
+            ImportError: without matplotlib.
+        """
+        try:
+            import matplotlib.pyplot as plt
+        except ImportError as error:
+            raise ImportError("plot needs matplotlib: pip install 'mjxgrad[render]'") from error
+        rows, (values, title), points = self.rows(), self.values, len(self.params)
+        figure, axes = plt.subplots(2, points, squeeze=False, sharex=True, sharey="row", layout="constrained")
+        figure.set_size_inches(max(5.0, 3.2 * points), 5.6)
+        is_log = bool((values > 0).all()) and len(values) > 1
+        for j, (upper, lower) in enumerate(axes.T):
+            upper.axhline(0, color="grey", lw=0.8)
+            for name, (colour, marker) in LOOKS.items():
+                if getattr(self, name) is None:
+                    continue
+                for axis, what in ((upper, "bias"), (lower, "variance")):
+                    y, low, high = (
+                        np.array([row[f"{name}_{what}{x}"] for row in rows[j::points]]) for x in ("", "_low", "_high")
+                    )
+                    reach = np.maximum([y - low, high - y], 0)
+                    axis.errorbar(values, y, reach, color=colour, marker=marker, ms=4, capsize=2, label=ESTIMATES[name])
+            if points > 1:
+                upper.set_title(" ".join(f"{x:.3g}" for x in np.asarray(self.params[j])))
+            lower.set(xlabel=title, yscale="log", **({"xscale": "log"} if is_log else {}))
+        axes[0, 0].set_ylabel("bias of the gradient")
+        axes[1, 0].set_ylabel("variance per rollout")
+        axes[1, 0].legend(fontsize="small")
+        return figure
+
+
+LOOKS = {"first": ("#d55e00", "o"), "zeroth": ("#0072b2", "s"), "alpha_order": ("#009e73", "D")}
+"""Colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008)."""
+
+
+def with_half_width(row: dict[str, Any], name: str) -> str:
+    """Write a number of `BiasVariance.rows` with half the width of its interval."""
+    return f"{row[name]:.3g} ± {(row[f'{name}_high'] - row[f'{name}_low']) / 2:.2g}"
 
 
 def bias_variance(
@@ -138,13 +284,14 @@ def bias_variance(
     softness: PyTree | Sequence[PyTree],
     num_samples: int = 256,
     num_reference: int = 2048,
+    alpha_samples: int = 16,
     baseline: str = "leave_one_out",
     confidence: float = 0.95,
     num_resamples: int = 1000,
     chunk_size: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BiasVariance:
-    r"""Measure both estimates of the gradient of a smoothed cost, at every softness and point.
+    r"""Measure estimates of the gradient of a smoothed cost, first, zeroth and α-order, at every softness and point.
 
     The noise is the same at every softness, so that differences between them are not luck. Everything is compiled
     once, in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept
@@ -159,6 +306,7 @@ def bias_variance(
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference, per softness if the cost is of one parameter with noise on it (one
             landscape serves all points), otherwise per softness and point.
+        alpha_samples: rollouts of one α-order estimate, which it chooses α by. At least 4.
         baseline: of the zeroth-order estimate.
         confidence: of the intervals.
         num_resamples: of the bootstrap.
@@ -178,30 +326,58 @@ def bias_variance(
     check_baseline(baseline)
     params, restore = _points(params)
     whole("num_reference", num_reference, 4)
+    whole("alpha_samples", alpha_samples, 4)
     stacked, count = _stacked(softness)
-    has_zero_noise = baseline == "zero_noise"
-    plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
+    told = []
+    for one in each:  # outside of a trace, where a scene knows its values
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            objective = objective_of_softness(one)
+        messages = [str(warning.message) for warning in caught if issubclass(warning.category, SceneWarning)]
+        told.append(tuple(dict.fromkeys(messages)))
+    # By the noise where it is known: the derivatives by the parameters follow from it, and α-order asks for it.
+    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
+    wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
+    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
+    by_samples = (
+        knows_noise and not is_line
+    )  # the reference from more of the same program, which then has the cost, too
+    plan = Plan(num_samples, chunk_size, with_zero_noise=by_samples or baseline == "zero_noise", **wanted)
+    batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
 
     @jax.jit
     def measure(
         softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
-    ) -> tuple[dict[str, Any], Samples]:
+    ) -> tuple[dict[str, Any], Samples, Array | None]:
         objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
         samples_key, reference_key = jax.random.split(key)
-        samples = _sampled(objective, params, samples_key, plan)
+        by_noise = _sampled(objective, params, samples_key, plan)
+        samples = _by_parameters(by_noise) if knows_noise else by_noise
         first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
-        is_line = isinstance(objective, ParameterNoise) and objective.dim == 1
-        find = _by_landscape if is_line else _by_long_run
-        reference = find(objective, params, reference_key, num_reference, max(2, chunk_size or DEFAULT_CHUNK_SIZE))
-        return {"first": first, "zeroth": zeroth, **reference}, samples
+        mixed = (None, None)
+        if batch is not None:
+            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)
+        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0]}
+        if by_samples:
+            found |= jax.vmap(_by_control_variate)(by_noise) | {"cost": jax.vmap(Samples.noise_free_cost)(samples)}
+        else:
+            find = _by_landscape if is_line else _by_long_run
+            size = max(2, chunk_size or DEFAULT_CHUNK_SIZE)
+            found |= find(objective, params, reference_key, num_reference, size)
+        return found, samples, mixed[1]
 
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     # Compiled here, for a thread does not see what a `with` has set, such as the precision.
     compiled = measure.lower(each[0], params, key).compile()
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
-        measured, samples = jax.block_until_ready(compiled(one, params, key))
-        return measured, _variance_intervals(samples, baseline, confidence, num_resamples)
+        measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
+        if by_samples:
+            keys = [jax.random.fold_in(key, i + 1) for i in range(-(-num_reference // num_samples))]
+            values, errors = zip(*(compiled(one, params, k)[0]["reference"] for k in keys), strict=True)
+            error = jnp.sqrt((jnp.stack(errors) ** 2).sum(axis=0)) / len(keys)
+            measured |= {"reference": jnp.stack(values).mean(axis=0), "reference_error": error, "landscape": None}
+        return measured, _variance_intervals(samples, batches, batch or 1, baseline, confidence, num_resamples)
 
     rows = []
     with ThreadPoolExecutor(_WORKERS) as pool:
@@ -228,7 +404,9 @@ def bias_variance(
         bias_interval=mean_interval(bias, bias_error, count_first, confidence),
         first_variance_interval=variances[0],
         zeroth_variance_interval=variances[1],
-        reference_method="zeroth_order" if found["landscape"] is None else "landscape",
+        alpha_order_variance_interval=None if batch is None else variances[2],
+        warnings=tuple(told),
+        reference_method="landscape" if is_line else "control_variate" if by_samples else "zeroth_order",
         confidence=confidence,
     )
 
@@ -244,6 +422,49 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 
     samples = jax.lax.map(one_chunk, (points, chunks))
     return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
+
+
+def _by_parameters(samples: Samples) -> Samples:
+    """Pull derivatives and scores by the noise back to the parameters, by point, unit and rollout."""
+    pull = jax.vmap(jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x))))
+    gradients, scores = (pull(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
+    return dataclasses.replace(samples, gradients=gradients, scores=scores, pull_backs=Partial(unchanged))
+
+
+def _in_batches(
+    samples: Samples, plan: Plan, size: int, zeroth: GradientEstimate
+) -> tuple[GradientEstimate, Float[Array, "batches dim"]]:
+    """Make α-order estimates of so many samples each, as a descent would: their mean, and each of them."""
+    count = plan.num_samples // size
+    batches = jax.tree.map(lambda leaf: leaf[: count * size].reshape(count, size, *leaf.shape[1:]), samples)
+
+    def one(batch: Samples) -> tuple[Array, Array, Reason, Array]:
+        (parts,) = both_parts(batch, control_variate=True)
+        weights = weigh(Consistent(), parts, plan)
+        value, _ = parts.mixture(jnp.broadcast_to(weights.alpha, parts.first.offset.shape))
+        return value, weights.alpha, weights.reason, parts.unbiased.count >= 2
+
+    values, alpha, reasons, exists = jax.vmap(one)(batches)
+    found = Moments.of(values, exists)
+    most = jax.nn.one_hot(jax.tree.leaves(reasons)[0], len(Reason)).sum(axis=0).argmax()
+    return dataclasses.replace(
+        zeroth,
+        value=jnp.where(found.count > 1, found.mean, jnp.nan),
+        standard_error=jnp.sqrt(found.squared_error()),
+        covariance_diagonal=jnp.where(found.count > 1, size * found.variance(), jnp.nan),
+        num_finite=found.count,
+        alpha=jnp.where(exists, alpha, 0).sum() / jnp.maximum(found.count, 1),
+        reason=jax.tree.map(lambda _: most, zeroth.reason),
+        bias_bound=jnp.full_like(zeroth.bias_bound, jnp.nan),
+    ), jnp.where(exists[:, None], values, jnp.nan)
+
+
+def _by_control_variate(samples: Samples) -> dict[str, Any]:
+    """Take the reference and its error from the unbiased part of α-order; see `control_variate`."""
+    (parts,) = both_parts(samples, control_variate=True)
+    value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
+    value = jnp.where(parts.unbiased.count > 1, value, jnp.nan)
+    return {"reference": (value, jnp.sqrt(jnp.maximum(squared_error, 0)))}
 
 
 def _by_landscape(
@@ -281,15 +502,14 @@ def _by_long_run(
 
 
 def _variance_intervals(
-    samples: Samples, baseline: str, confidence: float, num_resamples: int
-) -> Float[np.ndarray, "2 2 points"]:
-    """Bootstrap both variances at each point: estimate, end of interval, point."""
-    points = range(len(samples.costs))
-    per_point = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples) for i in points]
-    intervals = [
-        [bootstrap_variance_interval(terms, confidence, num_resamples=num_resamples) for terms in _terms(s, baseline)]
-        for s in per_point
-    ]
+    samples: Samples, batches: Array | None, size: int, baseline: str, confidence: float, num_resamples: int
+) -> Float[np.ndarray, "estimates 2 points"]:
+    """Bootstrap all variances at each point, per rollout: estimate, end of interval, point."""
+    intervals = []
+    for i in range(len(samples.costs)):
+        terms = _terms(jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples), baseline)
+        terms += () if batches is None else (np.sqrt(size) * np.asarray(batches[i], float),)
+        intervals.append([bootstrap_variance_interval(x, confidence, num_resamples=num_resamples) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)
 
 
