@@ -12,7 +12,6 @@ at a jump and faster elsewhere. A quadrature on regular points would need a smoo
 """
 
 import dataclasses
-import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,14 +22,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import whole
 from mjxgrad.contact import Softness
 from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
-from mjxgrad.estimators.estimate import GradientEstimate, Reason
-from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
+from mjxgrad.estimators.estimate import GradientEstimate
+from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.rules import Consistent
@@ -43,10 +42,10 @@ from mjxgrad.scene import SceneWarning
 REACH = 6.0
 # XLA keeps 1.3 of two cores busy with one such program.
 _WORKERS = 2
+# In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
-"""What is measured, by the name of its field, in words."""
-TOO_STIFF = "without gaining energy"
-"""In what a scene says of a contact that its time step cannot follow."""
+_LOOKS = {"first": ("#d55e00", "o"), "zeroth": ("#0072b2", "s"), "alpha_order": ("#009e73", "D")}
+_TOO_STIFF = "without gaining energy"  # in what a scene says of a contact that its time step cannot follow
 
 
 class Landscape(eqx.Module):
@@ -153,127 +152,106 @@ class BiasVariance(eqx.Module):
     confidence: float = eqx.field(static=True)
 
     @property
-    def values(self) -> tuple[Float[np.ndarray, " softness"], str]:
-        """What was swept as one number each, and its name: the stiffness, a plain array, or else its place in the list."""
-        leaves, is_stiffness = jax.tree.leaves(self.softness), isinstance(self.softness, Softness)
-        if is_stiffness and self.softness.stiffness is not None:
-            return np.asarray(self.softness.stiffness, float), "stiffness, 1/s²"
-        is_plain = len(leaves) == 1 and leaves[0].ndim == 1 and not is_stiffness
-        return (np.asarray(leaves[0], float), "softness") if is_plain else (np.arange(len(self.cost)) + 1.0, "number")
+    def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
+        """What was swept, by name and value: stiffness, a plain array, or else the places in the list."""
+        given = self.softness.stiffness if isinstance(self.softness, Softness) else self.softness
+        if eqx.is_array(given) and given.ndim == 1:
+            return "softness" if given is self.softness else "stiffness, 1/s²", np.asarray(given, float)
+        return "number", np.arange(1.0, len(self.cost) + 1)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Return plain numbers, a row per softness and point: the truth, and of each estimate bias and variance with intervals.
+    def table(self) -> dict[str, Shaped[np.ndarray, "softness points"]]:
+        """Return `truth` and of each estimate, such as `first`, `_bias` and `_variance`, with the ends `_low` and `_high`.
 
-        Of several parameters they are norms, with an interval on the safe side (see `BiasConstrained`). `_is_biased` is beyond
-        chance over all rows together.
+        Of several parameters they are norms, with intervals on the safe side (see `BiasConstrained`). What `_is_biased` is so
+        beyond chance over the whole table.
         """
-        names = [name for name in ESTIMATES if getattr(self, name) is not None]
-        truth = self._sized(self.reference, self.reference_error, np.array(10**6))
-        columns: dict[str, np.ndarray] = dict(zip(("truth", "truth_low", "truth_high"), truth, strict=True))
-        for name in names:
-            one, ends = getattr(self, name), getattr(self, f"{name}_variance_interval")
-            error = np.hypot(one.standard_error, self.reference_error)
-            found = self._sized(one.value - self.reference, error, one.num_finite)
-            columns |= {f"{name}_bias{end}": x for end, x in zip(("", "_low", "_high"), found, strict=True)}
-            columns |= {
-                f"{name}_variance{end}": x for end, x in zip(("", "_low", "_high"), (one.variance, *ends), strict=True)
-            }
-            low, high = self._sized(one.value - self.reference, error, one.num_finite, over_all=True)[1:]
-            columns[f"{name}_is_biased"] = (low > 0) | (high < 0)
-        if self.alpha_order is not None:
-            columns["alpha"] = self.alpha_order.alpha
-        columns["finite_share"] = self.first.finite_fraction
-        every = {name: np.asarray(column) for name, column in columns.items()}
-        values, params = self.values[0], np.asarray(self.params)
-        return [
-            {"softness": float(values[i]), "params": params[j].tolist()} | {k: x[i, j].item() for k, x in every.items()}
-            for i, j in np.ndindex(self.cost.shape)
-        ]
+        sure, is_one, of_all = self.confidence, self.params.shape[1] == 1, 1 - (1 - self.confidence) / self.cost.size
+        found: dict[str, Any] = {"finite_share": self.first.finite_fraction}
 
-    def _sized(self, value: Array, error: ArrayLike, count: Array, *, over_all: bool = False) -> tuple[np.ndarray, ...]:
-        """Give numbers, norms for several parameters, with the ends of their intervals."""
-        tail = (1 - self.confidence) / (self.cost.size if over_all else 1)
-        half = mean_interval(0.0, np.linalg.norm(error, axis=-1), count, 1 - tail)[1]
-        size = np.asarray(value)[..., 0] if value.shape[-1] == 1 else np.linalg.norm(value, axis=-1)
-        return size, size - half if value.shape[-1] == 1 else np.maximum(size - half, 0), size + half
+        def add(name: str, value: ArrayLike, error: ArrayLike, count: ArrayLike) -> None:
+            size, spread = (
+                np.asarray(value)[..., 0] if is_one else np.linalg.norm(value, axis=-1),
+                np.linalg.norm(error, axis=-1),
+            )
+            half, reach = (mean_interval(0.0, spread, count, confidence)[1] for confidence in (sure, of_all))
+            low = size - half if is_one else np.maximum(size - half, 0)
+            found.update({f"{name}": size, f"{name}_low": low, f"{name}_high": size + half})
+            found[name.replace("bias", "is_biased")] = abs(size) > reach if "bias" in name else size
+
+        add("truth", self.reference, self.reference_error, 10**6)
+        for name in ESTIMATES:
+            if (one := getattr(self, name)) is not None:
+                add(
+                    f"{name}_bias",
+                    one.value - self.reference,
+                    np.hypot(one.standard_error, self.reference_error),
+                    one.num_finite,
+                )
+                low, high = getattr(self, f"{name}_variance_interval")
+                found |= {f"{name}_variance": one.variance, f"{name}_variance_low": low, f"{name}_variance_high": high}
+                found["alpha"] = one.alpha
+        return {name: np.asarray(value) for name, value in found.items()}
 
     def summary(self, labels: Sequence[str] | None = None) -> str:
-        """Write a table for a terminal; labels name the softnesses in place of their numbers."""
-        values, title = self.values
-        labels = list(map(format_number, values)) if labels is None else labels
-        names, several = [name for name in ESTIMATES if getattr(self, name) is not None], len(self.params) > 1
-        words = [ESTIMATES[name] for name in names]
-        head = [title, *(["at"] if several else []), "truth", *(f"bias, {word}" for word in words)]
-        lines = [[*head, *(f"variance, {word}" for word in words), *(["α"] if "alpha_order" in names else [])]]
-        for k, row in enumerate(self.rows()):
-            i, j = divmod(k, len(self.params))
-            label = labels[i] + " !" * any(TOO_STIFF in text for text in self.warnings[i])
-            place = [" ".join(f"{x:.3g}" for x in row["params"])] if several else []
-            biases = [with_half_width(row, f"{name}_bias") + " *" * row[f"{name}_is_biased"] for name in names]
-            variances = [f"{row[f'{name}_variance']:.3g}" for name in names]
-            alpha = [f"{row['alpha']:.2f}"] if "alpha_order" in names else []
-            lines.append([label if j == 0 else "", *place, with_half_width(row, "truth"), *biases, *variances, *alpha])
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        table = "\n".join(
-            "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines
+        """Write the table for a terminal; labels name the softnesses in place of their numbers."""
+        (title, swept), table = self.knob, self.table()
+        names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
+        first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
+        lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, "α"]]
+        bad = [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
+        for i, j in np.ndindex(self.cost.shape):
+            one = {name: value[i, j] for name, value in table.items()}
+            wide = {
+                x: f"{one[x]:.3g} ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one
+            }
+            biases = [wide[f"{name}_bias"] + " *" * bool(one[f"{name}_is_biased"]) for name in names]
+            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])
+            variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
+            at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
+            lines.append([label, at, wide["truth"], *biases, *variances, f"{one['alpha']:.2f}"])
+        columns = [column for column in zip(*lines, strict=True) if column[0] != "at" or len(points) > 1]
+        padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+        what = "gradient" if points.shape[1] == 1 else "norm of the gradient"
+        told = (
+            f"Truth: {what} of the cost under noise, from rollouts of its own; ± is half a {self.confidence:.0%} interval. "
+            "Variance: of one rollout. *: a bias beyond chance over the whole table."
         )
-        what = "gradient" if self.params.shape[1] == 1 else "norm of the gradient"
-        sure = f"half a {self.confidence:.0%} interval"
-        notes = [f"truth: {what} of the smoothed cost, from rollouts of its own; ± {sure}; variances are per rollout"]
-        if any(" *" in cell for line in lines for cell in line):
-            notes.append("* differs from zero beyond chance over the whole table")
-        return "\n".join([table, "", *(textwrap.fill(note, 118) for note in [*notes, *self.too_stiff])])
-
-    @property
-    def too_stiff(self) -> list[str]:
-        """One sentence if the time step does not hold some stiffness, of the first such."""
-        found = [text for told in self.warnings for text in told if TOO_STIFF in text]
-        return [f"! beyond what the time step holds: {found[0]}."] if found else []
+        stiff = [f"!: the time step does not hold it. {text}." for text in bad if text][:1]
+        return "\n".join(["  ".join(row).rstrip() for row in zip(*padded, strict=True)] + ["", told, *stiff])
 
     def __str__(self) -> str:
         return self.summary()
 
     def plot(self) -> Any:
-        """Draw bias and variance against softness with matplotlib, a column per point, and return the figure.
-
-        Raises:
-            ImportError: without matplotlib.
-        """
+        """Draw bias and variance against softness by matplotlib, a column per point, and return the figure."""
         try:
             import matplotlib.pyplot as plt
         except ImportError as error:
-            raise ImportError("plot needs matplotlib: pip install 'mjxgrad[render]'") from error
-        rows, (values, title), points = self.rows(), self.values, len(self.params)
-        figure, axes = plt.subplots(2, points, squeeze=False, sharex=True, sharey="row", layout="constrained")
-        figure.set_size_inches(max(5.0, 3.2 * points), 5.6)
-        is_log = bool((values > 0).all()) and len(values) > 1
+            raise ImportError("a picture needs matplotlib: pip install 'mjxgrad[render]'") from error
+        table, (title, swept), points = self.table(), self.knob, len(self.params)
+        settings = {"squeeze": False, "sharex": True, "sharey": "row", "layout": "constrained"}
+        figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
         for j, (upper, lower) in enumerate(axes.T):
             upper.axhline(0, color="grey", lw=0.8)
-            for name, (colour, marker) in LOOKS.items():
-                if getattr(self, name) is None:
-                    continue
-                for axis, what in ((upper, "bias"), (lower, "variance")):
-                    y, low, high = (
-                        np.array([row[f"{name}_{what}{x}"] for row in rows[j::points]]) for x in ("", "_low", "_high")
-                    )
-                    reach = np.maximum([y - low, high - y], 0)
-                    axis.errorbar(values, y, reach, color=colour, marker=marker, ms=4, capsize=2, label=ESTIMATES[name])
-            if points > 1:
-                upper.set_title(" ".join(f"{x:.3g}" for x in np.asarray(self.params[j])))
-            lower.set(xlabel=title, yscale="log", **({"xscale": "log"} if is_log else {}))
+            upper.plot(swept, table["truth"][:, j], color="grey", ls="--", label="the gradient itself")
+            for axis, what in ((upper, "bias"), (lower, "variance")):
+                for name, (colour, marker) in _LOOKS.items():
+                    if f"{name}_{what}" in table:
+                        y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
+                        look = {
+                            "color": colour,
+                            "marker": marker,
+                            "label": ESTIMATES[name],
+                            "ms": 4,
+                            "lw": 1,
+                            "capsize": 2,
+                        }
+                        axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), **look)
+            lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
         axes[0, 0].set_ylabel("bias of the gradient")
-        axes[1, 0].set_ylabel("variance per rollout")
-        axes[1, 0].legend(fontsize="small")
+        axes[1, 0].set_ylabel("variance of one rollout")
+        axes[0, 0].legend(fontsize="small")
         return figure
-
-
-LOOKS = {"first": ("#d55e00", "o"), "zeroth": ("#0072b2", "s"), "alpha_order": ("#009e73", "D")}
-"""Colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008)."""
-
-
-def with_half_width(row: dict[str, Any], name: str) -> str:
-    """Write a number of `BiasVariance.rows` with half the width of its interval."""
-    return f"{row[name]:.3g} ± {(row[f'{name}_high'] - row[f'{name}_low']) / 2:.2g}"
 
 
 def bias_variance(
@@ -289,6 +267,7 @@ def bias_variance(
     confidence: float = 0.95,
     num_resamples: int = 1000,
     chunk_size: int | None = None,
+    compiler_options: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BiasVariance:
     r"""Measure estimates of the gradient of a smoothed cost, first, zeroth and α-order, at every softness and point.
@@ -311,6 +290,7 @@ def bias_variance(
         confidence: of the intervals.
         num_resamples: of the bootstrap.
         chunk_size: rollouts at a time.
+        compiler_options: of XLA.
         progress: called after every softness with how many are done and how many there are.
 
     Returns:
@@ -358,25 +338,26 @@ def bias_variance(
         mixed = (None, None)
         if batch is not None:
             mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)
-        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0]}
-        if by_samples:
-            found |= jax.vmap(_by_control_variate)(by_noise) | {"cost": jax.vmap(Samples.noise_free_cost)(samples)}
-        else:
-            find = _by_landscape if is_line else _by_long_run
+        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
+        if is_line:
             size = max(2, chunk_size or DEFAULT_CHUNK_SIZE)
-            found |= find(objective, params, reference_key, num_reference, size)
+            return found | _by_landscape(objective, params, reference_key, num_reference, size), samples, mixed[1]
+        unbiased = jax.vmap(_unbiased)(by_noise) if knows_noise else (zeroth.value, zeroth.standard_error)
+        found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
         return found, samples, mixed[1]
 
     # Compiled here, for a thread does not see what a `with` has set, such as the precision.
-    compiled = measure.lower(each[0], params, key).compile()
+    compiled = measure.lower(each[0], params, key).compile(compiler_options)
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
         measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
-        if by_samples:
-            keys = [jax.random.fold_in(key, i + 1) for i in range(-(-num_reference // num_samples))]
-            values, errors = zip(*(compiled(one, params, k)[0]["reference"] for k in keys), strict=True)
-            error = jnp.sqrt((jnp.stack(errors) ** 2).sum(axis=0)) / len(keys)
-            measured |= {"reference": jnp.stack(values).mean(axis=0), "reference_error": error, "landscape": None}
+        if not is_line:
+            others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
+            values, errors = map(
+                jnp.stack, zip(*(compiled(one, params, k)[0]["reference"] for k in others), strict=True)
+            )
+            error = jnp.sqrt((errors**2).sum(axis=0)) / len(others)
+            measured |= {"reference": values.mean(axis=0), "reference_error": error}
         return measured, _variance_intervals(samples, batches, batch or 1, baseline, confidence, num_resamples)
 
     rows = []
@@ -406,7 +387,7 @@ def bias_variance(
         zeroth_variance_interval=variances[1],
         alpha_order_variance_interval=None if batch is None else variances[2],
         warnings=tuple(told),
-        reference_method="landscape" if is_line else "control_variate" if by_samples else "zeroth_order",
+        reference_method="landscape" if is_line else "control_variate" if knows_noise else "zeroth_order",
         confidence=confidence,
     )
 
@@ -438,33 +419,30 @@ def _in_batches(
     count = plan.num_samples // size
     batches = jax.tree.map(lambda leaf: leaf[: count * size].reshape(count, size, *leaf.shape[1:]), samples)
 
-    def one(batch: Samples) -> tuple[Array, Array, Reason, Array]:
+    def one(batch: Samples) -> tuple[Array, Array, Array]:
         (parts,) = both_parts(batch, control_variate=True)
-        weights = weigh(Consistent(), parts, plan)
-        value, _ = parts.mixture(jnp.broadcast_to(weights.alpha, parts.first.offset.shape))
-        return value, weights.alpha, weights.reason, parts.unbiased.count >= 2
+        alpha = weigh(Consistent(), parts, plan).alpha
+        value, _ = parts.mixture(jnp.broadcast_to(alpha, parts.first.offset.shape))
+        return jnp.where(parts.unbiased.count > 1, value, jnp.nan), alpha, parts.unbiased.count > 1
 
-    values, alpha, reasons, exists = jax.vmap(one)(batches)
+    values, alpha, exists = jax.vmap(one)(batches)
     found = Moments.of(values, exists)
-    most = jax.nn.one_hot(jax.tree.leaves(reasons)[0], len(Reason)).sum(axis=0).argmax()
-    return dataclasses.replace(
+    mean = dataclasses.replace(
         zeroth,
         value=jnp.where(found.count > 1, found.mean, jnp.nan),
         standard_error=jnp.sqrt(found.squared_error()),
-        covariance_diagonal=jnp.where(found.count > 1, size * found.variance(), jnp.nan),
+        covariance_diagonal=size * found.count * found.squared_error(),
         num_finite=found.count,
-        alpha=jnp.where(exists, alpha, 0).sum() / jnp.maximum(found.count, 1),
-        reason=jax.tree.map(lambda _: most, zeroth.reason),
-        bias_bound=jnp.full_like(zeroth.bias_bound, jnp.nan),
-    ), jnp.where(exists[:, None], values, jnp.nan)
+        alpha=jnp.nanmean(jnp.where(exists, alpha, jnp.nan)),
+    )
+    return mean, values
 
 
-def _by_control_variate(samples: Samples) -> dict[str, Any]:
-    """Take the reference and its error from the unbiased part of α-order; see `control_variate`."""
+def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    """Give the unbiased part of α-order with its error; see `control_variate`."""
     (parts,) = both_parts(samples, control_variate=True)
     value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
-    value = jnp.where(parts.unbiased.count > 1, value, jnp.nan)
-    return {"reference": (value, jnp.sqrt(jnp.maximum(squared_error, 0)))}
+    return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
 
 
 def _by_landscape(
@@ -484,21 +462,6 @@ def _by_landscape(
     landscape, cost = Landscape(points, costs[:num_reference], cell), costs[num_reference:]
     gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
     return {"cost": cost, "reference": gradient[:, None], "reference_error": error[:, None], "landscape": landscape}
-
-
-def _by_long_run(
-    objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, num_reference: int, chunk_size: int
-) -> dict[str, Any]:
-    """Take the reference from many more samples, in pairs, of the estimate that is unbiased."""
-    settings = {"num_samples": 2 * (num_reference // 2), "antithetic": True, "chunk_size": chunk_size}
-
-    def one_point(index_and_point: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        index, point = index_and_point
-        estimate = zeroth_order(objective, point, jax.random.fold_in(key, index), **settings)
-        return objective.value(point, objective.zero_noise()), estimate.value, estimate.standard_error
-
-    cost, gradient, error = jax.lax.map(one_point, (jnp.arange(len(params)), params))
-    return {"cost": cost, "reference": gradient, "reference_error": error, "landscape": None}
 
 
 def _variance_intervals(

@@ -88,9 +88,8 @@ class Motions:
 
 def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
     """Return half the width of each actuator's range of controls, in its units; 1 where there is none."""
-    low, high = np.asarray(scene.ctrlrange, float).T
-    width = high - low
-    return np.where(np.isfinite(width) & (width > 0), width / 2, 1.0)
+    low, high = scene.mj_model.actuator_ctrlrange.T
+    return np.where(scene.mj_model.actuator_ctrllimited & (high > low), (high - low) / 2, 1.0)
 
 
 def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:

@@ -123,7 +123,7 @@ class Programs:
         started = time.perf_counter()
         if kind == "event" and started + _EVENT * self._compile_seconds > self.deadline:
             return None
-        program = lowered.compile(compiler_options=_options())
+        program = lowered.compile(compiler_options=compiler_options())
         self._compile_seconds = time.perf_counter() - started
         return program
 
@@ -270,6 +270,7 @@ def with_contact(scene: Scene, contact: dict[str, Array]) -> Scene:
     return eqx.tree_at(lambda s: s.model, scene, scene.model.replace(**contact))
 
 
-def _options() -> dict | None:
+def compiler_options() -> dict | None:
+    """Return what makes XLA compile in half the time, where it is known to."""
     is_known = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
     return _OPTIONS if is_known else None
