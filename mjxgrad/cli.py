@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cyclopts
 import numpy as np
@@ -150,7 +150,7 @@ def sweep(
     stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
     noise: float = 0.1,
     samples: int = 256,
-    gradient: str = "onset",
+    gradient: Literal["onset", "discrete", "event"] = "onset",
     seed: int = 0,
     html: Path = Path("sweep.html"),
 ) -> None:

@@ -333,7 +333,7 @@ def bias_variance(
         objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
         samples_key, reference_key = jax.random.split(key)
         by_noise = _sampled(objective, params, samples_key, plan)
-        samples = _by_parameters(by_noise) if knows_noise else by_noise
+        samples = jax.vmap(_by_parameters)(by_noise) if knows_noise else by_noise
         first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
         mixed = (None, None)
         if batch is not None:
@@ -406,10 +406,12 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 
 
 def _by_parameters(samples: Samples) -> Samples:
-    """Pull derivatives and scores by the noise back to the parameters, by point, unit and rollout."""
-    pull = jax.vmap(jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x))))
+    """Pull derivatives and scores by the noise back to the parameters, for each unit and rollout."""
+    pull = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
     gradients, scores = (pull(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
-    return dataclasses.replace(samples, gradients=gradients, scores=scores, pull_backs=Partial(unchanged))
+    # Standard deviations are of the noise, and not known of the parameters.
+    known = {"gradients": gradients, "scores": scores, "stddevs": jnp.full_like(scores, jnp.nan)}
+    return dataclasses.replace(samples, **known, pull_backs=Partial(unchanged))
 
 
 def _in_batches(

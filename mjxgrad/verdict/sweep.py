@@ -164,7 +164,7 @@ def _along(direction: Float[Array, " m"], by_noise: Float[Array, " m"]) -> Float
 
 def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:
     start = eqx.tree_at(lambda state: state.qvel, task.state, task.state.qvel + speed[0] * along)
-    return task.run(None, start=start).cost  # pyright: ignore[reportArgumentType]
+    return task.run(jnp.zeros((task.horizon, 0)), start=start).cost
 
 
 @dataclass(frozen=True)
