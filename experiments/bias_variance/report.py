@@ -40,7 +40,7 @@ class Words:
 
 _WORDS = {
     "ball_wall": Words(
-        "contact stiffness", " 1/s²", "angle of the throw", " rad", "cost, m²", ", m²/rad", ", (m²/rad)²",
+        "contact stiffness", " 1/s²", "angle", " rad", "cost, m²", ", m²/rad", ", (m²/rad)²",
         "where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer the wall the sharper",
         "stiffness", ("choice", "landscape", "gradient", "bias_variance"),
     ),
@@ -49,7 +49,7 @@ _WORDS = {
         "slope", ("gradient", "landscape", "bias_variance", "choice"), "slope ",
     ),
     "own": Words(
-        "contact stiffness", " 1/s²", "control", " of half its range", "cost", ", cost per half range", ", its square", "",
+        "contact stiffness", " 1/s²", "control", " half ranges", "cost", ", cost per half range", ", its square", "",
         "stiffness", ("bias_variance", "gradient", "choice"),
     ),
 }  # fmt: skip
@@ -182,9 +182,13 @@ def _default(outcome: Outcome) -> list[str]:
         return []
     biased, wrong, count = int(default.is_biased.sum()), int(default.has_wrong_sign.sum()), default.angle.size
     if not biased:
-        return [f"Under MuJoCo's default contact no bias is seen at any of the {count} angles."]
+        return [f"Under {_own(outcome)} no bias is seen at any of the {count} {_words(outcome).place}s."]
     sign = f", and has the wrong sign at {wrong}" if wrong else ""
-    return [f"Under MuJoCo's default contact it is biased at {biased} of {count} angles{sign}."]
+    return [f"Under {_own(outcome)} it is biased at {biased} of {count} {_words(outcome).place}s{sign}."]
+
+
+def _own(outcome: Outcome) -> str:
+    return "the file's own contact" if outcome.settings.problem == "own" else "MuJoCo's default contact"
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -265,10 +269,11 @@ def bias_variance(outcome: Outcome):
         _bars(above, one, "bias", FIRST, "o", "bias of first order")
         chance = one.isel(stiffness=~one.is_biased.values)
         above.plot(chance.stiffness, chance.bias, "o", ms=5, mfc="white", mec=FIRST, zorder=3)
-        above.set_yscale("symlog", linthresh=threshold)
-        above.set_ylim(-2 * extreme, 2 * extreme)
-        # Labels nearer to zero would cover its own.
-        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
+        if extreme > 10 * threshold:
+            above.set_yscale("symlog", linthresh=threshold)
+            above.set_ylim(-2 * extreme, 2 * extreme)
+            # Labels nearer to zero would cover its own.
+            above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
         _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
         _bars(below, one, "first_order_variance", FIRST, "o", "first order")
         _bars(below, one, "alpha_order_variance", ONSET, "D", "α-order", shift=1 / 1.06)
@@ -347,7 +352,7 @@ def video(outcome: Outcome, workspace: Workspace, wanted: ThrowsSettings) -> tup
 
 def _diamond(outcome: Outcome) -> str:
     has_default = outcome.table.is_default.any()
-    return " The diamond on the dashed line is MuJoCo's default contact." if has_default else ""
+    return f" The diamond on the dashed line is {_own(outcome)}." if has_default else ""
 
 
 def _panels(outcome: Outcome, *, rows: int, height: float):
