@@ -165,50 +165,43 @@ class BiasVariance(eqx.Module):
         Of several parameters they are norms, with intervals on the safe side (see `BiasConstrained`). What `_is_biased` is so
         beyond chance over the whole table.
         """
-        sure, is_one, of_all = self.confidence, self.params.shape[1] == 1, 1 - (1 - self.confidence) / self.cost.size
-        found: dict[str, Any] = {"finite_share": self.first.finite_fraction}
+        is_one, found = self.params.shape[1] == 1, {"finite_share": self.first.finite_fraction}
+        levels = self.confidence, 1 - (1 - self.confidence) / self.cost.size
 
         def add(name: str, value: ArrayLike, error: ArrayLike, count: ArrayLike) -> None:
-            size, spread = (
-                np.asarray(value)[..., 0] if is_one else np.linalg.norm(value, axis=-1),
-                np.linalg.norm(error, axis=-1),
-            )
-            half, reach = (mean_interval(0.0, spread, count, confidence)[1] for confidence in (sure, of_all))
+            size = np.asarray(value)[..., 0] if is_one else np.linalg.norm(value, axis=-1)
+            half, reach = (mean_interval(0.0, np.linalg.norm(error, axis=-1), count, level)[1] for level in levels)
             low = size - half if is_one else np.maximum(size - half, 0)
-            found.update({f"{name}": size, f"{name}_low": low, f"{name}_high": size + half})
-            found[name.replace("bias", "is_biased")] = abs(size) > reach if "bias" in name else size
+            found.update({name: size, f"{name}_low": low, f"{name}_high": size + half})
+            found[name.removesuffix("_bias") + "_is_biased"] = abs(size) > reach
 
         add("truth", self.reference, self.reference_error, 10**6)
         for name in ESTIMATES:
             if (one := getattr(self, name)) is not None:
-                add(
-                    f"{name}_bias",
-                    one.value - self.reference,
-                    np.hypot(one.standard_error, self.reference_error),
-                    one.num_finite,
-                )
+                error = np.hypot(one.standard_error, self.reference_error)
+                add(f"{name}_bias", one.value - self.reference, error, one.num_finite)
                 low, high = getattr(self, f"{name}_variance_interval")
                 found |= {f"{name}_variance": one.variance, f"{name}_variance_low": low, f"{name}_variance_high": high}
                 found["alpha"] = one.alpha
-        return {name: np.asarray(value) for name, value in found.items()}
+        return {name: np.asarray(value) for name, value in found.items() if name != "truth_is_biased"}
 
     def summary(self, labels: Sequence[str] | None = None) -> str:
         """Write the table for a terminal; labels name the softnesses in place of their numbers."""
         (title, swept), table = self.knob, self.table()
         names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
+        has_alpha = "alpha_order" in names
         first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
-        lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, "α"]]
+        lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, *["α"] * has_alpha]]
         bad = [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
         for i, j in np.ndindex(self.cost.shape):
             one = {name: value[i, j] for name, value in table.items()}
-            wide = {
-                x: f"{one[x]:.3g} ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one
-            }
-            biases = [wide[f"{name}_bias"] + " *" * bool(one[f"{name}_is_biased"]) for name in names]
+            half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
+            truth, *biases = (f"{one[x]:.3g}{half[x]}" for x in ("truth", *(f"{name}_bias" for name in names)))
+            biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
             label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])
             variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
             at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
-            lines.append([label, at, wide["truth"], *biases, *variances, f"{one['alpha']:.2f}"])
+            lines.append([label, at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
         columns = [column for column in zip(*lines, strict=True) if column[0] != "at" or len(points) > 1]
         padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
         what = "gradient" if points.shape[1] == 1 else "norm of the gradient"
@@ -238,15 +231,8 @@ class BiasVariance(eqx.Module):
                 for name, (colour, marker) in _LOOKS.items():
                     if f"{name}_{what}" in table:
                         y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
-                        look = {
-                            "color": colour,
-                            "marker": marker,
-                            "label": ESTIMATES[name],
-                            "ms": 4,
-                            "lw": 1,
-                            "capsize": 2,
-                        }
-                        axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), **look)
+                        look = {"color": colour, "marker": marker, "label": ESTIMATES[name]}
+                        axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
             lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
         axes[0, 0].set_ylabel("bias of the gradient")
         axes[1, 0].set_ylabel("variance of one rollout")
@@ -320,10 +306,8 @@ def bias_variance(
     knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
     wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
     is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
-    by_samples = (
-        knows_noise and not is_line
-    )  # the reference from more of the same program, which then has the cost, too
-    plan = Plan(num_samples, chunk_size, with_zero_noise=by_samples or baseline == "zero_noise", **wanted)
+    # But on a line the reference comes from more runs of the same program: there is nothing else to compile.
+    plan = Plan(num_samples, chunk_size, with_zero_noise=not is_line or baseline == "zero_noise", **wanted)
     batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
 
     @jax.jit
@@ -353,11 +337,9 @@ def bias_variance(
         measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
         if not is_line:
             others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
-            values, errors = map(
-                jnp.stack, zip(*(compiled(one, params, k)[0]["reference"] for k in others), strict=True)
-            )
-            error = jnp.sqrt((errors**2).sum(axis=0)) / len(others)
-            measured |= {"reference": values.mean(axis=0), "reference_error": error}
+            runs = [compiled(one, params, k)[0]["reference"] for k in others]
+            measured["reference"] = sum(value for value, _ in runs) / len(runs)
+            measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
         return measured, _variance_intervals(samples, batches, batch or 1, baseline, confidence, num_resamples)
 
     rows = []

@@ -69,7 +69,7 @@ def scene_task(
     """
     model, state = scene.mj_model, initial_state(scene)
     if start is not None:
-        key = _index(model, "key", start)
+        key, _ = _found(model, start, "key")
         state = initial_state(scene, model.key_qpos[key], model.key_qvel[key], model.key_act[key])
         scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key_ctrl[key], state.qpos.dtype))
     if cost is None:
@@ -104,14 +104,13 @@ def _named_cost(scene: Scene, name: str) -> Cost:
         return load_function(name)
     if len(names := what.split("/")) != _BUILT_IN[kind]:
         raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
-    bodies = [_index(scene.mj_model, "body", name, "site") for name in names]
+    found = [_found(scene.mj_model, name, "body", "site") for name in names]
     data, seconds = scene.data, scene.mj_model.opt.timestep
 
     def frames(qpos: Float[Array, " nq"]) -> list[tuple[Array, Array]]:
         placed = kinematics(scene.model, data.replace(qpos=qpos))
-        return [
-            (placed.xpos[i], placed.xmat[i]) if i >= 0 else (placed.site_xpos[~i], placed.site_xmat[~i]) for i in bodies
-        ]
+        parts = {True: (placed.xpos, placed.xmat), False: (placed.site_xpos, placed.site_xmat)}
+        return [(place[i], turn[i]) for i, is_body in found for place, turn in [parts[is_body]]]
 
     def cost(trajectory: Trajectory) -> Float[Array, ""]:
         (place, turn), *other = frames(trajectory.qpos[-1])
@@ -124,19 +123,18 @@ def _named_cost(scene: Scene, name: str) -> Cost:
     return cost
 
 
-def _index(model: mujoco.MjModel, *kinds_and_name: str) -> int:
-    """Find a body, a site (as ~index), or a key frame."""
-    kind, name, *other = kinds_and_name
-    known = {k: _names(model, k) for k in (kind, *other)}
-    for k, names in known.items():
+def _found(model: mujoco.MjModel, name: str, *kinds: str) -> tuple[int, bool]:
+    """Return the number of a thing of one of some kinds, and whether it is of the first."""
+    known = {kind: _names(model, kind) for kind in kinds}
+    for kind, names in known.items():
         if name in names:
-            return names.index(name) if k == kind else ~names.index(name)
-    there = "; ".join(f"{k}: {', '.join(filter(None, names)) or 'none'}" for k, names in known.items())
-    raise ValueError(f"there is no {' or '.join(known)} {name!r} in the scene, but {there}")
+            return names.index(name), kind == kinds[0]
+    there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
+    raise ValueError(f"there is no {' or '.join(kinds)} {name!r} in the scene, but {there}")
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    number = {"actuator": model.nu, "joint": model.njnt}.get(kind) or getattr(model, f"n{kind}")
+    number = getattr(model, {"actuator": "nu", "joint": "njnt"}.get(kind, f"n{kind}"))
     return [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i) or "" for i in range(number)]
 
 
@@ -155,11 +153,7 @@ class Push(OpenLoop):
         return self.pull_back_at(params, None)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        return Partial(_along, jnp.tile(self.direction, self.task.horizon))
-
-
-def _along(direction: Float[Array, " m"], by_noise: Float[Array, " m"]) -> Float[Array, " 1"]:
-    return (direction @ by_noise)[None]
+        return Partial(jnp.matmul, jnp.tile(self.direction, self.task.horizon)[None])
 
 
 def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:

@@ -9,7 +9,7 @@ from scipy.stats import norm
 from mjxgrad.diagnostics import Landscape, bias_variance, mean_interval
 from mjxgrad.diagnostics.bias_variance import cell_points
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval
-from mjxgrad.objective import parameter_noise
+from mjxgrad.objective import Objective, ParameterNoise, parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import STDDEV
 
@@ -202,6 +202,30 @@ def test_several_parameters_take_a_long_run_for_reference():
     assert table.landscape is None
     np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
     np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
+
+
+class Hidden(ParameterNoise):
+    """A cost that does not tell of its noise what α-order asks for."""
+
+    differentiate = Objective.differentiate
+
+
+def test_where_the_noise_is_not_known_the_reference_is_zeroth_order_and_alpha_is_none():
+    point, stddev = jnp.array([0.5, -1.2, 0.4]), jnp.array([0.1, 0.4, 0.2])
+    table = bias_variance(
+        lambda scale: Hidden(lambda x: scale * textbook.bumpy(x), stddev, 3),
+        point[None],
+        jax.random.key(2),
+        softness=jnp.array([1.0, 3.0]),
+        num_samples=1000,
+        num_reference=20_000,
+    )
+    exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(np.asarray(point), np.asarray(stddev))
+    assert table.reference_method == "zeroth_order"
+    assert table.alpha_order is None
+    np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
+    np.testing.assert_allclose(table.cost[:, 0], np.array([1.0, 3.0]) * float(textbook.bumpy(point)))
+    assert str(table).splitlines()[0].split()[-3:] == ["variance:", "first", "zeroth"]
 
 
 def test_the_reference_is_unbiased_and_its_error_on_the_safe_side():
