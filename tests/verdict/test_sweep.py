@@ -119,6 +119,21 @@ def test_without_actuators_it_is_by_the_velocity_at_the_start(tmp_path):
     np.testing.assert_allclose(found.result.table()["truth"], -0.1, rtol=0.05)
 
 
+def test_the_files_own_stiffness_stands_for_its_contacts_as_they_are(folder):
+    """Half critical damping, which no other stiffness has; traced, too."""
+    (folder / "bouncy.xml").write_text(BLOCK.replace('mass=".2"', 'mass=".2" solref=".02 .5"'))
+    knob = Knob(scene_task(mg.load_scene(folder / "bouncy.xml"), "height:block"), 0.2)
+
+    def contact(stiffness):
+        return knob(mg.Softness(stiffness=stiffness)).task.scene.contact_parameters().damping_ratio
+
+    own = knob.task.scene.contact_parameters().damping_ratio
+    assert abs(own - 1).min() > 0.1
+    for read in (contact, jax.jit(contact)):
+        np.testing.assert_allclose(read(jnp.array(knob.own)), own)
+        np.testing.assert_allclose(read(jnp.array(2 * knob.own)), 1.0)
+
+
 def test_derivatives_by_the_push_are_those_by_all_controls_along_it(folder):
     """The transpose of how it moves them, for two actuators, whose directions differ."""
     (folder / "two.xml").write_text(BLOCK.replace("</actuator>", '<motor joint="x" ctrlrange="-3 1"/></actuator>'))
