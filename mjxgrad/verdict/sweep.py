@@ -203,7 +203,7 @@ class Knob:
         which = f"{names[0] or f'the {kind}'}" if len(names) == 1 else f"all {len(names)} {kind}s in a random mix"
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
-        return f"a constant control of {which}, with noise of {self.noise:g} on every step's (in halves of the range)"
+        return f"a constant control of {which}; noise of {self.noise:g} on it in each step, both in halves of its range"
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class Sweep:
                     f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else f"at {sum(good)} of {len(good)}"
                 )
                 found.setdefault("everywhere" if all(good) else where if any(good) else "nowhere", []).append(words)
-        return f"Right to {_NONE:.0%}: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
+        return f"No bias above {_NONE:.0%} seen: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
 
     def __str__(self) -> str:
         return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"
@@ -246,7 +246,7 @@ class Sweep:
             file = io.StringIO()
             self.result.plot().savefig(file, format="svg")
             picture = file.getvalue().partition("<svg")[2]
-            picture = f'<svg role="img" aria-label="Bias and variance against stiffness, as tabulated below"{picture}'
+            picture = f'<svg role="img" aria-label="Bias and variance over stiffness, as in the table"{picture}'
         except ImportError as error:
             picture = html.escape(str(error))
         question, table = html.escape(self.question), html.escape(self.result.summary(self.labels))
@@ -303,4 +303,8 @@ def sweep(
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
     question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
+    table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
+    ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
+    ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
+    question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
     return Sweep(scene.name, question, knob.own, result)

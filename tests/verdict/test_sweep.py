@@ -74,7 +74,7 @@ def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
 def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_not_hold(swept):
     assert swept.labels == ["1000", "2500 (file)", "1e6"]
     lines = str(swept).splitlines()
-    assert lines[0].startswith("block.xml: Right to 5%: ")
+    assert lines[0].startswith("block.xml: No bias above 5% seen: ")
     assert len(lines[0].removeprefix("block.xml: ").split()) <= 15
     assert [line.split("  ")[0] for line in lines[5:8]] == ["1000", "2500 (file)", "1e6 !"]
     (sentence,) = [line for line in lines if line.startswith("!")]
