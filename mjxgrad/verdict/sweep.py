@@ -222,7 +222,7 @@ class Sweep:
 
     @property
     def headline(self) -> str:
-        """The answer, in at most 15 words: where an estimate has no bias worth the name, nor one that is not to be seen."""
+        """The answer in a line: where an estimate has no bias worth the name, nor one that is not to be seen."""
         table, found = self.result.table(), {}
         truth = abs(table["truth"])
         for name, words in ESTIMATES.items():
@@ -234,7 +234,8 @@ class Sweep:
                 where = (
                     f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else f"at {sum(good)} of {len(good)}"
                 )
-                found.setdefault("everywhere" if all(good) else where if any(good) else "nowhere", []).append(words)
+                none = "nowhere" if is_off.any() else "too noisy to tell"
+                found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
         return f"No bias above {_NONE:.0%} seen: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
 
     def __str__(self) -> str:

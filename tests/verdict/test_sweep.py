@@ -75,7 +75,7 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
     assert swept.labels == ["1000", "2500 (file)", "1e6"]
     lines = str(swept).splitlines()
     assert lines[0].startswith("block.xml: No bias above 5% seen: ")
-    assert len(lines[0].removeprefix("block.xml: ").split()) <= 15
+    assert len(lines[0].removeprefix("block.xml: ").split()) <= 20
     assert [line.split("  ")[0] for line in lines[5:8]] == ["1000", "2500 (file)", "1e6 !"]
     (sentence,) = [line for line in lines if line.startswith("!")]
     assert "h²k + 2hb = 12, stable below 4" in sentence
@@ -189,3 +189,17 @@ def test_what_cannot_be_swept_is_said_in_one_sentence(folder, monkeypatch, capsy
     assert cli.main(["sweep", *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_the_answer_tells_a_bias_from_what_noise_hides(swept, monkeypatch):
+    """First order is half off at the stiffest contact, zeroth order hidden throughout, α-order right everywhere."""
+    wide = {"first": [0.0, 0.0, 0.5], "zeroth": [0.1, 0.1, 0.1], "alpha_order": [0.0, 0.0, 0.0]}
+    table = {"truth": np.ones((3, 1))}
+    for name, bias in wide.items():
+        half = 0.9 if name == "zeroth" else 0.01
+        table |= {f"{name}_bias": np.array(bias)[:, None], f"{name}_is_biased": np.array(bias)[:, None] > half}
+        table |= {f"{name}_bias_low": table[f"{name}_bias"] - half, f"{name}_bias_high": table[f"{name}_bias"] + half}
+    monkeypatch.setattr(type(swept.result), "table", lambda self: table)
+    assert swept.headline == (
+        "No bias above 5% seen: first order up to 2500 (file) 1/s²; zeroth order too noisy to tell; α-order everywhere."
+    )
