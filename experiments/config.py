@@ -244,7 +244,7 @@ def _apply(table: dict[str, Any], override: str) -> str | None:
         # A shell eats the quotes of a TOML string, so a bare word stands for one, alone or in a list.
         words = value[1:-1].split(",") if value.startswith("[") and value.endswith("]") else [value]
         words = [word.strip() for word in words]
-        if not all(re.fullmatch(r"[A-Za-z_][\w./-]*", word) for word in words):
+        if not all(re.fullmatch(r"(\.{0,2}/)?[A-Za-z_][\w./:-]*", word) for word in words):
             return f"{override}: {value or 'nothing'} is not a TOML value"
         parsed = words if value.startswith("[") else value
     if isinstance(table.get("sweep"), dict):

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
+from mjxgrad.dynamics.events import contacts_of
 from pydantic import Field
 
 import mjxgrad as mg
@@ -24,7 +25,6 @@ from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import data_of
 from mjxgrad.dynamics import Gradient, assembly
-from mjxgrad.dynamics.events import contacts_of
 from mjxgrad.integration import adaptive_rollout
 from mjxgrad.tasks import scene_path
 

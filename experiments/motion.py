@@ -1,13 +1,17 @@
-"""One stepping loop for all experiments, and a motion sampled at a few times in one program for every time step."""
+"""One stepping loop for all experiments, a motion sampled at a few times in one program for every time step, and own tasks."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 import mjxgrad as mg
+from experiments.config import ExperimentError
+from experiments.settings import OwnScene
 from mjxgrad._mjx import mjx
+from mjxgrad.verdict.sweep import scene_task
 
 Read = Callable[[Float[Array, " nq"], Float[Array, " nv"]], Float[Array, "..."]]
 
@@ -56,3 +60,15 @@ def motion(
         return moved, read(moved.qpos, moved.qvel)
 
     return jax.lax.scan(until_next, data, length=num_times)[1]
+
+
+def own_task(settings: OwnScene, **others: Any) -> mg.SceneTask:
+    """Make the task of a scene of one's own; its mistakes are one sentence."""
+    try:
+        scene = mg.load_scene(str(settings.scene))
+        task = scene_task(scene, settings.cost, start=settings.start, horizon=settings.horizon, **others)
+        # What the cost returns is only known once it is called.
+        jax.eval_shape(task.run, jnp.zeros((task.horizon, task.num_controls)))
+    except ValueError as error:
+        raise ExperimentError(str(error)) from error
+    return task

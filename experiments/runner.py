@@ -57,7 +57,9 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     recover(folder)
     settings = run.settings.model_dump(mode="json")
-    fingerprint = _fingerprint([settings, run.question, run.expected])
+    # Of a scene of one's own, what its files say, too.
+    own = (Path(str(settings.get(key)).rpartition(":")[0 if key == "cost" else 2]) for key in ("scene", "cost"))
+    fingerprint = _fingerprint([settings, run.question, run.expected, [p.read_text() for p in own if p.is_file()]])
     previous = _previous(folder)
     # A report that lacks its video is made again once there is an OpenGL to draw it with.
     is_unchanged = previous.get("fingerprint") == fingerprint

@@ -19,26 +19,30 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, at_time_step, motion
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, at_time_step, motion, own_task
 from experiments.report import Table
-from experiments.settings import Positive, RunSettings
+from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
 from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.tasks import scene_path
+from mjxgrad.verdict.sweep import Knob
 
 RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
 BallName = Literal["ball_frictionless", "ball", "ball_elliptic", "ball_torsion", "ball_rolling"]
 OtherName = Literal["ball_inclined", "ball_inclined_rolling", "two_balls", "two_balls_elliptic", "arm"]
 
 
-class Settings(RunSettings):
+class Settings(OwnScene, RunSettings):
     """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
 
     cases: Annotated[tuple[Literal[RobotName, BallName, OtherName], ...], Field(min_length=1)]
-    """Which motions, each with its own contact, limits and integrator."""
+    """Which motions, each with its own contact, limits and integrator; a scene of one's own takes their place."""
+    width: Positive = 0.05
+    """How far to both sides the one number goes that moves an own scene: a constant control in halves of its range, or without
+    actuators a velocity at the start (m/s, rad/s)."""
     timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)
     """In s, besides the motion's own."""
     num_phases: Annotated[int, Field(ge=64)] = 192
@@ -265,6 +269,9 @@ def _sample(
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Sample outcomes and derivatives of every motion at every time step."""
     courses = []
+    if settings.scene is not None:
+        with workspace.stage("rollouts", "motions", 1):
+            return Outcome([_own_course(settings, workspace)])
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
         for number, name in enumerate(settings.cases):
             own = float(case(name).model.opt.timestep)
@@ -296,6 +303,26 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     reference = sampled(DISCRETE, settings.reference)[0] if settings.reference else None
     times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
     return course(name, one.title, one.labels, timestep, times, arms, reference)
+
+
+def _own_course(settings: Settings, workspace: Workspace) -> xr.Dataset:
+    """The cost of a scene of one's own at its own time step, over how far it is pushed."""
+    task = own_task(settings, seed=settings.seed)
+    workspace.check(task.scene)
+    parameters, arms = phases((-settings.width, settings.width), settings.num_phases), {}
+    for arm, (gradient, onset) in ARMS.items():
+        knob = Knob(task.with_gradient(gradient) if onset is None else task.with_onset(onset), 1.0, settings.seed)
+        objective = knob(mg.Softness(stiffness=knob.own or 1.0)).sized_for(jnp.zeros(1))
+
+        def cost(at: Array, objective: mg.Objective = objective) -> Array:
+            return objective.value(at[None], objective.zero_noise())
+
+        both = jax.jit(jax.vmap(lambda x, cost=cost: jax.jvp(cost, (x,), (jnp.ones_like(x),))))(jnp.asarray(parameters))
+        outcomes, derivatives = (np.asarray(each)[:, None, None] for each in both)
+        arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
+    timestep = float(task.scene.mj_model.opt.timestep)
+    times, name = timestep * np.array([task.horizon]), Path(str(settings.scene)).stem
+    return course(name, name, (settings.cost or "a random mix",), timestep, times, arms)
 
 
 def answer(outcome: Outcome) -> str:

@@ -1,9 +1,10 @@
 """What every kind of experiment can be told, and what its settings are made of; imports nothing heavy."""
 
 from collections import Counter
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -51,3 +52,26 @@ class VideoSettings(SettingsTable):
     """Of one motion, in pixels."""
     height: Annotated[int, Field(ge=64, le=1080)] = 270
     """Of one motion, in pixels."""
+
+
+class OwnScene(SettingsTable):
+    """A scene of one's own, in place of those that a kind of experiment has."""
+
+    scene: str | None = None
+    """An MJCF file; without it, the experiment's own."""
+    cost: str | None = None
+    """Of a trajectory: file.py:function, module:function, or at the end height:body, speed:body, upright:body,
+    reach:body/site; without it, a random mix of where the heaviest body ends up."""
+    start: str | None = None
+    """A key frame of the scene by name; without it, the reference pose."""
+    horizon: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    """Time steps of a rollout; without it, those of half a second, 50 to 300."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.scene is None and (given := self.model_fields_set & {"cost", "start", "horizon"}):
+            raise ValueError(f"{', '.join(sorted(given))}: of a scene of one's own; give scene its file, too")
+        for file in (self.scene, (self.cost or "").rpartition(":")[0]):
+            if file and file.endswith((".xml", ".py")) and not Path(file).is_file():
+                raise ValueError(f"{'scene' if file == self.scene else 'cost'}: there is no file {file}")
+        return self

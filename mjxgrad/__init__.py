@@ -40,7 +40,7 @@ from mjxgrad.optimiser import (
 from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.scene import LeaveOut, Scene, load_scene, sensor, site_position
 from mjxgrad.task import SceneTask
-from mjxgrad.verdict import Verdict, check
+from mjxgrad.verdict import Verdict, check, sweep
 
 __all__ = [
     "Convergence",
@@ -95,5 +95,6 @@ __all__ = [
     "site_position",
     "solve",
     "step",
+    "sweep",
     "tasks",
 ]

@@ -39,18 +39,18 @@ _KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDi
 _MOST_KEPT = 64
 
 
-def compile_once(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> jax.stages.Compiled:
     """Compile a program, or return what was compiled of the same text: a function that was traced anew need not be.
 
     The text has every number in it that is no argument, but not what a callback calls.
     """
     text = lowered.as_text()
     if "callback" in text:
-        return lowered.compile()
+        return lowered.compile(compiler_options=options)
     shapes = str(jax.tree.leaves(lowered.args_info))
     key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
     if key not in _KEPT:
-        _KEPT[key] = lowered.compile()
+        _KEPT[key] = lowered.compile(compiler_options=options)
     _KEPT.move_to_end(key)
     if len(_KEPT) > _MOST_KEPT:
         _KEPT.popitem(last=False)

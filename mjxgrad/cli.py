@@ -1,4 +1,4 @@
-"""The command line: check a scene, find its parameters, begin a program of one's own, draw it, look at it, run experiments."""
+"""The command line: check and sweep a scene, find its parameters, begin a program, draw it, look at it, run experiments."""
 
 import functools
 import importlib
@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cyclopts
 import numpy as np
@@ -120,7 +120,7 @@ def check(
 
     Args:
         scene: an MJCF file.
-        cost: module:function, from a trajectory to its cost; the module is looked for in the current folder, too.
+        cost: file.py:function or module:function, from a trajectory to its cost; modules of the current folder, too.
         as_json: write JSON.
         html: write a page to this file.
         quick: only what takes seconds: contact, time step, what has no effect.
@@ -133,13 +133,63 @@ def check(
     def log(text: str) -> None:
         _say(f"{time.monotonic() - started:4.0f} s  {text}")
 
-    function = None if cost is None else _function(cost)
+    function = None if cost is None else importlib.import_module("mjxgrad.verdict.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict.as_json() if as_json else verdict.summary(), flush=True)
     if html is not None:
         html.write_text(verdict.as_html(), encoding="utf-8")
         log(f"wrote {html}")
     return 1 if verdict.faults else 0
+
+
+@app.command
+def sweep(
+    scene: str,
+    *,
+    cost: str | None = None,
+    start: str | None = None,
+    horizon: int | None = None,
+    stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
+    noise: float = 0.1,
+    samples: int = 256,
+    gradient: Literal["onset", "discrete", "event"] = "onset",
+    seed: int = 0,
+    html: Path = Path("sweep.html"),
+) -> None:
+    """Measure bias and variance of first, zeroth and α-order gradients of a scene, over contact stiffness.
+
+    Args:
+        scene: an MJCF file.
+        cost: file.py:function or module:function, from a trajectory to its cost; or at the end height:body, speed:body,
+            upright:body, reach:body/site; without it, a random mix of where the heaviest body ends up.
+        start: a key frame by name; without it the reference pose.
+        horizon: time steps; without it those of half a second, 50 to 300.
+        stiffness: of contacts in 1/s², beside the file's own: 1e2 to 1e6 unless given.
+        noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
+        samples: rollouts of each estimate; the truth takes eight times as many.
+        gradient: onset, or in MuJoCo's motion discrete or event.
+        seed: of what is random.
+        html: the page to write.
+    """
+    mg, started = _library(), time.monotonic()
+    if not html.parent.is_dir():
+        raise CommandError(f"there is no folder {html.parent} for {html}")
+    found = mg.sweep(
+        _existing(scene),
+        cost,
+        **({} if stiffness is None else {"stiffness": stiffness}),
+        noise=noise,
+        num_samples=samples,
+        num_reference=8 * samples,
+        seed=seed,
+        log=lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}"),
+        start=start,
+        horizon=horizon,
+        gradient=gradient,
+    )
+    print(found)
+    html.write_text(found.as_html(), encoding="utf-8")
+    _say(f"wrote {html}")
 
 
 @app.command
@@ -378,19 +428,6 @@ def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
     )
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
-
-
-def _function(name: str) -> Callable:
-    """Find a function by module:function."""
-    module, colon, function = name.partition(":")
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        found = getattr(importlib.import_module(module), function, None) if colon else None
-    except ImportError as error:
-        raise CommandError(f"--cost must be module:function, got {name!r}: {error}") from error
-    if not callable(found):
-        raise CommandError(f"--cost must be module:function of a function that is there, got {name!r}")
-    return found
 
 
 def _checkout() -> Path:

@@ -46,7 +46,7 @@ def test_json_is_all_that_is_on_standard_output(scene, capsys):
     [
         (["check", "nowhere.xml"], "there is no file nowhere.xml"),
         (["check", "refused.xml"], "MJX has no integrator 'implicit'"),
-        (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "must be module:function"),
+        (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (["chek"], 'Did you mean "check"'),
         (["new", "scene.xml", "--output", "scene.xml"], "--force"),
     ],

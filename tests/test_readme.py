@@ -54,6 +54,14 @@ def _falls_and_swings(names):
     np.testing.assert_allclose(names["data"].qvel[2], -9.81 * 0.002, rtol=1e-6)
 
 
+def _tells_which_gradient_holds(names):
+    """Its time step does not hold 1e6 1/s²; the smoothed cost of a block pushed to a wall rises with the push."""
+    table = names["found"].result.table()
+    assert (table["truth"][:3] > 0).all()  # but for 1e6
+    assert "h²k" in str(names["found"])
+    assert "<svg" in Path("sweep.html").read_text()
+
+
 _CHECKS = (
     _moves_and_is_filmed,
     _finds_the_parameters,
@@ -61,6 +69,7 @@ _CHECKS = (
     _pushes_the_ball_to_its_place,
     _rises,
     _falls_and_swings,
+    _tells_which_gradient_holds,
 )
 
 

@@ -11,17 +11,20 @@ import mujoco
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, Float, PyTree
+from mjxgrad.verdict.programs import compiler_options
 from scipy import stats
 
 import mjxgrad as mg
 from experiments.bias_variance.settings import Settings
 from experiments.config import ExperimentError
+from experiments.motion import own_task
 from experiments.theme import power
 from experiments.words import percent
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics import BiasVariance, bias_variance
+from mjxgrad.diagnostics import BiasVariance, bias_variance, mean_interval
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
+from mjxgrad.verdict.sweep import Knob
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 _DEFAULT = (1 / (0.02 * 1.0) ** 2, 1.0, (0.9, 0.95), 0.001)
@@ -33,17 +36,17 @@ _REACH = 4.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """Both estimates by `stiffness` (in 1/s²; ascending, the default last if `is_default`) and `angle` (rad).
+    """Three estimates by `stiffness` (in 1/s²; ascending, the default last if `is_default`) and `angle` (rad).
 
-    `table` has `first_order`, `zeroth_order`, `reference` and `bias` in m²/rad, and the variances of one sample of both
-    estimates, each with the ends `_low` and `_high` of its interval; whether first order `is_biased` or `has_wrong_sign`; the
+    `table` has `first_order`, `zeroth_order`, `alpha_order`, `reference` and `bias` in m²/rad, and the variances of one sample of
+    the estimates, each with the ends `_low` and `_high` of its interval; whether first order `is_biased` or `has_wrong_sign`; the
     expected errors within the budget and which is clearly smaller. `landscape` has the cost (m²) without noise over `grid` and
     its mean under noise over `smooth_grid`.
     """
 
     settings: Settings
     table: xr.Dataset
-    landscape: xr.Dataset
+    landscape: xr.Dataset | None
     task: BallWall | None  # to draw, if it can be drawn
 
     @property
@@ -68,10 +71,15 @@ class Ramp(eqx.Module):
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Estimate at every stiffness and angle; an `ExperimentError` if somewhere hardly any rollout was finite."""
-    task, knob_name = (None, "slope") if settings.task == "ramp" else (ball_wall(), "stiffness")
-    stiffness, knob, objective = _ramp(settings) if task is None else _wall(task, settings)
-    if task is not None:
+    task, knob_name = None, "slope" if settings.problem == "ramp" else "stiffness"
+    if settings.problem == "own":
+        stiffness, knob, objective = _own(settings, workspace)
+    elif settings.problem == "ramp":
+        stiffness, knob, objective = _ramp(settings)
+    else:
+        task = ball_wall()
         workspace.check(task.scene)
+        stiffness, knob, objective = _wall(task, settings)
     with workspace.stage("gradients", f"values of {knob_name}", len(stiffness)) as advance_to:
         measured = workspace.once(
             "gradients",
@@ -83,17 +91,19 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 num_samples=settings.num_samples,
                 num_reference=settings.reference_samples,
                 confidence=settings.confidence,
+                compiler_options=compiler_options() if settings.problem == "own" else None,
                 progress=lambda done, _: advance_to(done),
             ),
         )
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
         remedy = "take smaller angles, less noise or a smaller slope"
-        if task is not None:
+        if knob_name == "stiffness":
             remedy = "leave it out, or lower it until it is stable at the scene's time step (h²k + 2hb < 4)"
         raise ExperimentError(
             f"{knob_name} {', '.join(map(power, stiffness[bad]))} gives no estimate: too few of its rollouts, or of their "
             f"derivatives, are finite; {remedy}"
         )
+    workspace.warnings += [text for told in measured.warnings for text in told]
     table = _table(measured, stiffness, settings)
     for i in np.flatnonzero((table.finite_share < 1).any("angle")):
         lost = 1 - float(table.finite_share[i].min())
@@ -101,7 +111,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             f"At {knob_name} {power(stiffness[i])}, {percent(lost)} of the rollouts at one place were not finite and left out, "
             "so its means are over the others."
         )
-    return Outcome(settings, table, _landscape(measured, settings.stddev), task)
+    return Outcome(settings, table, measured.landscape and _landscape(measured, settings.stddev), task)
 
 
 def wall_contact(
@@ -125,11 +135,17 @@ def _wall(task: BallWall, settings: Settings) -> _Problem:
     knob = wall_contact(
         task, np.sort(settings.stiffness), settings.damping_ratio, with_default=settings.include_default
     )
-    stiffness = np.asarray(knob.stiffness)
-    for row in range(len(stiffness)):
-        # Outside of a trace, where the scene knows its values and warns of what its time step cannot follow.
-        task.with_softness(jax.tree.map(lambda leaf, row=row: leaf[row], knob))
-    return stiffness, knob, lambda softness: task.objective(settings.stddev, softness)
+    return np.asarray(knob.stiffness), knob, lambda softness: task.objective(settings.stddev, softness)
+
+
+def _own(settings: Settings, workspace: Workspace) -> _Problem:
+    task = own_task(settings, seed=settings.seed)
+    workspace.check(task.scene)
+    if not task.scene.pairs:
+        raise ExperimentError(f"no two geoms of {settings.scene} can touch, so there is no stiffness to sweep")
+    knob = Knob(task, settings.stddev, settings.seed)
+    stiffness = np.array([*sorted(settings.stiffness), *[knob.own] * settings.include_default])
+    return stiffness, mg.Softness.sweep(stiffness=stiffness), knob
 
 
 def _ramp(settings: Settings) -> _Problem:
@@ -148,8 +164,13 @@ def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settin
         "first_order_variance": (first.covariance_diagonal, measured.first_variance_interval[..., None]),
         "zeroth_order_variance": (zeroth.covariance_diagonal, measured.zeroth_variance_interval[..., None]),
     }
+    if (mixed := measured.alpha_order) is not None:
+        ends = mean_interval(mixed.value, mixed.standard_error, mixed.num_finite[..., None], settings.confidence)
+        intervals["alpha_order"] = (mixed.value, ends)
+        ends = np.asarray(measured.alpha_order_variance_interval)[..., None]
+        intervals["alpha_order_variance"] = (mixed.covariance_diagonal, ends)
     table = xr.Dataset(coords={"stiffness": stiffness, "angle": list(settings.angles)})
-    has_default = settings.task == "ball_wall" and settings.include_default
+    has_default = settings.problem != "ramp" and settings.include_default
     table["is_default"] = "stiffness", np.arange(len(stiffness)) >= len(stiffness) - has_default
     for name, (value, (low, high)) in intervals.items():
         for end, values in (("", value), ("_low", low), ("_high", high)):
@@ -159,6 +180,7 @@ def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settin
     tail = (1 - settings.confidence) / 2 / table.bias.size
     reach = stats.t.isf(tail, settings.num_samples - 1) * np.asarray(measured.bias_error)[..., 0]
     table["is_biased"] = abs(table.bias) > reach
+    table["zeroth_is_off"] = cell, measured.table()["zeroth_is_biased"]
     # Both means are surely not zero and point in opposite directions.
     table["has_wrong_sign"] = ((table.first_order_low > 0) & (table.reference_high < 0)) | (
         (table.first_order_high < 0) & (table.reference_low > 0)
@@ -172,6 +194,10 @@ def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settin
     table["first_wins"] = _MARGIN * table.first_order_error < table.zeroth_order_error
     table["zeroth_wins"] = _MARGIN * table.zeroth_order_error < table.first_order_error
     table["finite_share"] = cell, np.asarray(first.finite_fraction)
+    if mixed is not None:
+        table["alpha"] = cell, np.asarray(mixed.alpha)
+        for end in ("", "_low", "_high"):
+            table[f"alpha_order_bias{end}"] = table[f"alpha_order{end}"] - table.reference
     return table
 
 

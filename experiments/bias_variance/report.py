@@ -15,7 +15,7 @@ from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
 from experiments.bias_variance.settings import ThrowsSettings
 from experiments.report import Table
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
+from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
 from experiments.workspace import Workspace
@@ -40,7 +40,7 @@ class Words:
 
 _WORDS = {
     "ball_wall": Words(
-        "contact stiffness", " 1/s²", "angle of the throw", " rad", "cost, m²", ", m²/rad", ", (m²/rad)²",
+        "contact stiffness", " 1/s²", "angle", " rad", "cost, m²", ", m²/rad", ", (m²/rad)²",
         "where a blocked throw becomes one that clears the wall the cost jumps, and the stiffer the wall the sharper",
         "stiffness", ("choice", "landscape", "gradient", "bias_variance"),
     ),
@@ -48,11 +48,15 @@ _WORDS = {
         "slope of the ramp", "", "parameter", "", "cost", "", "", "a ramp from −1 to 1, and the steeper the more it is a step",
         "slope", ("gradient", "landscape", "bias_variance", "choice"), "slope ",
     ),
+    "own": Words(
+        "contact stiffness", " 1/s²", "control", " half ranges", "cost", ", cost per half range", ", its square", "",
+        "stiffness", ("bias_variance", "gradient", "choice"),
+    ),
 }  # fmt: skip
 
 
 def _words(outcome: Outcome) -> Words:
-    return _WORDS[outcome.settings.task]
+    return _WORDS[outcome.settings.problem]
 
 
 def _titled(name: str, unit: str) -> str:
@@ -63,7 +67,7 @@ def _titled(name: str, unit: str) -> str:
 def answer(outcome: Outcome) -> str:
     """Say where each estimate is right: where its mean does not differ from the reference beyond chance."""
     swept, words = outcome.swept, _words(outcome)
-    is_off = (swept.zeroth_order_high < swept.reference_low) | (swept.zeroth_order_low > swept.reference_high)
+    is_off = swept.zeroth_is_off
     zeroth = "throughout" if not is_off.any() else f"at {int((~is_off).sum())} of {is_off.size} points"
     biased, is_blind = _bias_seen(swept)
     is_wrong = (biased | is_blind).values
@@ -178,9 +182,13 @@ def _default(outcome: Outcome) -> list[str]:
         return []
     biased, wrong, count = int(default.is_biased.sum()), int(default.has_wrong_sign.sum()), default.angle.size
     if not biased:
-        return [f"Under MuJoCo's default contact no bias is seen at any of the {count} angles."]
+        return [f"Under {_own(outcome)} no bias is seen at any of the {count} {_words(outcome).place}s."]
     sign = f", and has the wrong sign at {wrong}" if wrong else ""
-    return [f"Under MuJoCo's default contact it is biased at {biased} of {count} angles{sign}."]
+    return [f"Under {_own(outcome)} it is biased at {biased} of {count} {_words(outcome).place}s{sign}."]
+
+
+def _own(outcome: Outcome) -> str:
+    return "the file's own contact" if outcome.settings.problem == "own" else "MuJoCo's default contact"
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -230,6 +238,7 @@ def gradient(outcome: Outcome):
         one = outcome.table.isel(angle=j)
         _bars(axis, one, "reference", REFERENCE, "_", "reference")
         _bars(axis, one, "zeroth_order", ZEROTH, "s", "zeroth order", shift=1.06)
+        _bars(axis, one, "alpha_order", ONSET, "D", "α-order", shift=1 / 1.12)
         _bars(axis, one, "first_order", FIRST, "o", "first order", shift=1 / 1.06)
         # One wild interval of a stiff contact is not to flatten all others.
         seen = ("reference_low", "reference_high", "zeroth_order_low", "zeroth_order_high", "first_order")
@@ -238,7 +247,7 @@ def gradient(outcome: Outcome):
         axis.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
         axis.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useMathText=True)
     axes[0, 0].set_ylabel(f"gradient{_words(outcome).gradient}")
-    theme.legend_below(figure, axes[0, 0], 3)
+    theme.legend_below(figure, axes[0, 0], 4)
     caption = (
         f"Mean of {outcome.settings.num_samples} samples with its {outcome.settings.confidence:.0%} interval, at each place. "
         f"The reference comes from {outcome.settings.reference_samples} rollouts of its own. Intervals that leave a panel are "
@@ -256,25 +265,28 @@ def bias_variance(outcome: Outcome):
     for j, (above, below) in enumerate(axes.T):
         one = table.isel(angle=j)
         above.axhline(0, color=MUTED, lw=0.8)
+        _bars(above, one, "alpha_order_bias", ONSET, "D", "bias of α-order", shift=1 / 1.06)
         _bars(above, one, "bias", FIRST, "o", "bias of first order")
         chance = one.isel(stiffness=~one.is_biased.values)
         above.plot(chance.stiffness, chance.bias, "o", ms=5, mfc="white", mec=FIRST, zorder=3)
-        above.set_yscale("symlog", linthresh=threshold)
-        above.set_ylim(-2 * extreme, 2 * extreme)
-        # Labels nearer to zero would cover its own.
-        above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
+        if extreme > 10 * threshold:
+            above.set_yscale("symlog", linthresh=threshold)
+            above.set_ylim(-2 * extreme, 2 * extreme)
+            # Labels nearer to zero would cover its own.
+            above.yaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=10 * threshold))
         _bars(below, one, "zeroth_order_variance", ZEROTH, "s", "zeroth order")
         _bars(below, one, "first_order_variance", FIRST, "o", "first order")
+        _bars(below, one, "alpha_order_variance", ONSET, "D", "α-order", shift=1 / 1.06)
         below.set_yscale("log")
     words = _words(outcome)
-    axes[0, 0].set_ylabel(f"bias of first order{words.gradient}")
+    axes[0, 0].set_ylabel(f"bias{words.gradient}")
     axes[1, 0].set_ylabel(f"variance of one sample{words.variance}")
-    theme.legend_below(figure, axes[1, 0], 2)
+    theme.legend_below(figure, axes[1, 0], 3)
     percent = f"{outcome.settings.confidence:.0%}"
     caption = (
-        f"Above, the mean of the first-order estimate less the reference, with the {percent} interval of the difference; "
-        "filled where it differs from zero beyond chance over all cases, hollow where it does not. Below, the variance of a "
-        f"single sample, with {percent} bootstrap intervals.{_diamond(outcome)}"
+        f"Above, the mean of first order and of α-order less the reference, with the {percent} interval of that; hollow "
+        "where that of first order does not differ from zero beyond chance over all cases. Below, the variance of one sample "
+        f"(of α-order, of estimates from 16, per rollout), with {percent} bootstrap intervals.{_diamond(outcome)}"
     )
     return figure, "Bias and variance", caption
 
@@ -340,7 +352,7 @@ def video(outcome: Outcome, workspace: Workspace, wanted: ThrowsSettings) -> tup
 
 def _diamond(outcome: Outcome) -> str:
     has_default = outcome.table.is_default.any()
-    return " The diamond on the dashed line is MuJoCo's default contact." if has_default else ""
+    return f" The diamond on the dashed line is {_own(outcome)}." if has_default else ""
 
 
 def _panels(outcome: Outcome, *, rows: int, height: float):
@@ -362,6 +374,8 @@ def _panels(outcome: Outcome, *, rows: int, height: float):
 
 def _bars(axis: Axes, one: xr.Dataset, name: str, colour: str, marker: str, label: str, shift: float = 1.0) -> None:
     """Draw an interval against stiffness: the sweep as a line, the default as a point beside it."""
+    if name not in one:  # α-order of too few samples
+        return
     swept = ~one.is_default.values
     for rows, look in ((swept, {"marker": marker, "lw": 1.2, "label": label}), (~swept, {"marker": "D", "ls": ""})):
         picked = one.isel(stiffness=rows)

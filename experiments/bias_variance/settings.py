@@ -2,9 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from experiments.settings import Finite, Positive, RunSettings, VideoSettings
+from experiments.settings import Finite, OwnScene, Positive, RunSettings, VideoSettings
 
 
 class ThrowsSettings(VideoSettings):
@@ -16,15 +16,16 @@ class ThrowsSettings(VideoSettings):
     """One row each, in 1/s²."""
 
 
-class Settings(RunSettings):
+class Settings(OwnScene, RunSettings):
     """Bias and variance of both estimates against contact stiffness, at several points."""
 
-    task: Literal["ball_wall", "ramp"]
-    """What is differentiated."""
+    task: Literal["ball_wall", "ramp"] | None = None
+    """What is differentiated; a scene of one's own takes its place."""
     stddev: Annotated[float, Field(ge=1e-9, allow_inf_nan=False)]
-    """Of the noise on the angle, in rad (on the ramp without a unit)."""
+    """Of the noise on the angle, in rad (on the ramp without a unit; of an own scene on each control at each step, in halves of
+    its range, or without actuators on velocities at the start)."""
     angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=6)]
-    """Where gradients are estimated, in rad."""
+    """Where gradients are estimated, in rad (of an own scene a constant control, or a velocity, along one direction)."""
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=2)]
     """Contact stiffness to sweep, in 1/s² (for the ramp its slope, without a unit)."""
     damping_ratio: Positive = 1.0
@@ -40,3 +41,15 @@ class Settings(RunSettings):
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
     video: ThrowsSettings | None = None
+    """Of the throws of `ball_wall`."""
+
+    @property
+    def problem(self) -> str:
+        """Give what is differentiated."""
+        return "own" if self.scene else str(self.task)
+
+    @model_validator(mode="after")
+    def _has_problem(self) -> "Settings":
+        if self.task is None and self.scene is None:
+            raise ValueError("task: required where there is no scene, and missing")
+        return self

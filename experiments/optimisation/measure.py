@@ -13,12 +13,15 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from scipy import stats
 
 import mjxgrad as mg
+from experiments.config import ExperimentError
+from experiments.motion import own_task
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
 from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import GradientEstimate, Reason, rules
+from mjxgrad.verdict.motions import half_range
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
 ROUNDING = 1e-6
@@ -180,7 +183,7 @@ class Outcome:
         """One row per method, seed and evaluation, for metrics.csv."""
         return [
             {
-                "task": self.settings.task,
+                "task": self.settings.scene or self.settings.task,
                 "dynamics": self.settings.dynamics,
                 "method": run.method.label,
                 "seed": seed,
@@ -203,6 +206,7 @@ _SCENES = {
     "motion_planning": mg.tasks.motion_planning,
     "tennis": mg.tasks.tennis,
 }
+_OWN = {"num_samples": 16, "learning_rate": 1.0, "num_steps": 100, "gamma": 1.0, "bound": 1.0}
 _ELITE = 0.2  # share of the candidates that cross-entropy fits to
 # How to optimise the scenes; found by trying, so that few steps show what each is about.
 _PUSH = {"num_samples": 10, "learning_rate": 1e-3, "num_steps": 200, "gamma": 1e8, "bound": 100.0}
@@ -219,19 +223,28 @@ _SCENE_SETTINGS = {
 
 def problem(settings: Settings) -> Published:
     """Set up the task, with the run's own settings in place of the published ones, which alone have reference results."""
-    if settings.dynamics == "published":
-        found = TASKS[settings.task]()
+    if settings.scene is not None:
+        task = own_task(settings, seed=settings.seed)
+        if not task.num_controls:
+            raise ExperimentError(f"{settings.scene} has no actuators, so there are no controls to optimise")
+        objective = mg.open_loop(task, settings.stddev * jnp.asarray(half_range(task.scene)))
+        start = jnp.tile(task.scene.data.ctrl, task.horizon)
+        found = Published(objective, start, reference={}, **_OWN)
+    elif settings.dynamics == "published":
+        found = TASKS[str(settings.task)]()
     else:
-        task = _SCENES[settings.task]()
+        task = _SCENES[str(settings.task)]()
         # What is published of the equations does not hold for the scene.
-        found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[settings.task])
+        found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[str(settings.task)])
     chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
     return replace(found, **chosen, reference={}) if chosen else found
 
 
 def scene(settings: Settings) -> mg.Scene | None:
     """Give the scene of the task; None under the published equations, which have none."""
-    return None if settings.dynamics == "published" else _SCENES[settings.task]().scene
+    if settings.scene is not None:
+        return own_task(settings).scene
+    return None if settings.dynamics == "published" else _SCENES[str(settings.task)]().scene
 
 
 def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:

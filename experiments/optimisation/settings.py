@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.settings import Positive, RunSettings, SettingsTable
+from experiments.settings import OwnScene, Positive, RunSettings, SettingsTable
 
 Count = Annotated[int, Field(ge=2)]
 
@@ -78,13 +78,15 @@ class MethodSettings(SettingsTable):
         return name + (f" ({', '.join(parts)})" if parts else "")
 
 
-class Settings(RunSettings):
-    """A published task, optimised by several methods from the same start at equal rollouts, over many seeds."""
+class Settings(OwnScene, RunSettings):
+    """A task, optimised by several methods from the same start at equal rollouts, over many seeds."""
 
-    task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"]
-    """What is optimised; see `experiments.optimisation.published`."""
+    task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"] | None = None
+    """What is optimised; see `experiments.optimisation.published`. A scene of one's own, by its controls, takes its place."""
+    stddev: Positive = 0.1
+    """Of the noise on each control of an own scene, in halves of its range."""
     dynamics: Literal["published", "mjx"] = "published"
-    """Whether the paper's own equations simulate the task, or MJX with contact."""
+    """Whether the paper's own equations simulate the task, or MJX with contact, as it does an own scene."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
     """In the order of the table."""
     seeds: Count = 10
@@ -109,6 +111,10 @@ class Settings(RunSettings):
         labels = [method.label for method in self.methods]
         if repeated := {label for label in labels if labels.count(label) > 1}:
             raise ValueError(f"methods must differ, got {', '.join(sorted(repeated))} more than once")
+        if self.task is None and self.scene is None:
+            raise ValueError("task: required where there is no scene, and missing")
+        if self.scene is not None and self.learning_rate is None:
+            raise ValueError("learning_rate: required with a scene of one's own, and missing; in control² per cost")
         if self.dynamics == "mjx" and self.task == "lqr":
             raise ValueError('dynamics: must be "published" for lqr, which has no contact to simulate')
         return self

@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from experiments.motion import own_task
 from experiments.sawtooth import ball
 from experiments.sawtooth import case as landing_case
 from experiments.work_precision.outcome import Cone
+from experiments.work_precision.settings import Settings
 from mjxgrad.tasks import scene_path
 
 CONES: dict[Cone, mujoco.mjtCone] = {
@@ -73,6 +76,16 @@ def _filled(base: np.ndarray, values: Mapping[int, float]) -> np.ndarray:
 def case(name: str) -> Case:
     """Build a motion by its name in the settings."""
     return _BUILDERS[name]()
+
+
+def own_case(settings: Settings) -> Case:
+    """Build the motion of a scene of one's own, its controls constant, its outcome a random mix of positions."""
+    task = own_task(settings)
+    model, state, rng = task.scene.mj_model, task.state, np.random.default_rng(settings.seed)
+    qpos, qvel = (dict(enumerate(np.asarray(one, float).tolist())) for one in (state.qpos, state.qvel))
+    mix = dict(enumerate(rng.normal(size=model.nq).tolist()))
+    seconds, ctrl = task.horizon * model.opt.timestep, tuple(np.asarray(task.scene.data.ctrl, float).tolist())
+    return Case(Path(str(settings.scene)).stem, model, seconds, (0, model.nv - 1), 0.1, mix, qpos, qvel, ctrl)
 
 
 def _scene(name: str) -> mujoco.MjModel:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.parallel import in_threads
-from experiments.work_precision.cases import CONES, Case, case
+from experiments.work_precision.cases import CONES, Case, case, own_case
 from experiments.work_precision.outcome import (
     MG,
     MJX,
@@ -73,6 +73,9 @@ ESTIMATORS: dict[str, tuple[str, str | None]] = {
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure every scene, one after the other: first its programs are compiled, then nothing is while it is timed."""
     cases = {name: case(name) for name in settings.scenes or settings.sizes.scenes}
+    if settings.scene is not None:
+        own = own_case(settings)
+        cases = {own.title: own}
     needed = {name: variants(one, settings, settings.has_asides(name)) for name, one in cases.items()}
     courses = []
     # Compiling is most of the time, so progress is counted in programs; each scene is one more, measured.

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.settings import RunSettings, SettingsTable
+from experiments.settings import OwnScene, RunSettings, SettingsTable
 
 SceneName = Literal[
     "pendulum", "bounce", "slide", "cube", "arm", "hopper", "half_cheetah", "push", "heap", "walker2d", "ant"
@@ -41,7 +41,7 @@ class Sizes(SettingsTable):
     """Whether MJX is run with every integrator, mg.step in single precision with more, and with few iterations."""
 
 
-class Settings(RunSettings):
+class Settings(OwnScene, RunSettings):
     """Error of motions and gradients against the time that they take, by scene."""
 
     size: Literal["quick", "default", "full"] = "default"
@@ -49,7 +49,7 @@ class Settings(RunSettings):
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
     scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
-    """Which scenes, in place of those of the size."""
+    """Which scenes, in place of those of the size; `scene`, one's own, takes the place of all."""
     targets: Annotated[tuple[Annotated[float, Field(gt=0, lt=1)], ...], Field(min_length=1, max_length=3)] = (
         0.05,
         1e-3,
@@ -64,4 +64,6 @@ class Settings(RunSettings):
     def _check(self) -> "Settings":
         if self.precision != "float64":
             raise ValueError("precision must be float64: both precisions are compared within the run")
+        if self.cost is not None:
+            raise ValueError("cost: none here, where errors are of final positions, the only ones that are kept")
         return self

@@ -11,6 +11,8 @@ unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included
 at a jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
 """
 
+import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
@@ -19,20 +21,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import compile_once, whole
+from mjxgrad.contact import Softness
+from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
-from mjxgrad.estimators.first_and_zeroth import both_results, both_summary, zeroth_order
+from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
+from mjxgrad.estimators.mixture import both_parts, weigh
+from mjxgrad.estimators.moments import Moments
+from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
 from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
 from mjxgrad.objective.base import unchanged
+from mjxgrad.scene import SceneWarning
 
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
 REACH = 6.0
 # XLA keeps 1.3 of two cores busy with one such program.
 _WORKERS = 2
+# In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
+ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
+_LOOKS = {"first": ("#d55e00", "o"), "zeroth": ("#0072b2", "s"), "alpha_order": ("#009e73", "D")}
+_TOO_STIFF = "without gaining energy"  # in what a scene says of a contact that its time step cannot follow
 
 
 class Landscape(eqx.Module):
@@ -97,16 +110,22 @@ class BiasVariance(eqx.Module):
         params: the points.
         first: the first-order estimates.
         zeroth: the zeroth-order estimates, of the same rollouts.
+        alpha_order: the mean of α-order estimates from `alpha_samples` rollouts each, the same ones in batches, their variance
+            per rollout and their mean α; None for fewer than two batches, random starts, or an objective that does not know
+            its noise.
         cost: without noise.
         reference: the gradient of the smoothed cost, from rollouts of its own.
         reference_error: its standard error.
-        reference_method: "landscape" (see `Landscape`) or "zeroth_order" (a long run).
+        reference_method: "landscape" (see `Landscape`), or a long run of what is unbiased however wrong derivatives are:
+            "control_variate" or, for random starts and where the noise is not known, "zeroth_order".
         bias: first order less reference.
         bias_error: its standard error, from both.
         first_interval: of the mean of the first-order estimate; the other intervals likewise of what they are named for.
         first_variance_interval: of the variance of one first-order sample.
         zeroth_variance_interval: of the variance of one zeroth-order sample.
+        alpha_order_variance_interval: of the variance of α-order, per rollout.
         landscape: the cost along the parameter at every softness, if there is only one parameter, with noise on it.
+        warnings: what the scene says of each softness, such as that the time step cannot follow it; often nothing.
         confidence: of every interval.
     """
 
@@ -114,6 +133,7 @@ class BiasVariance(eqx.Module):
     params: Float[Array, "points dim"]
     first: GradientEstimate
     zeroth: GradientEstimate
+    alpha_order: GradientEstimate | None
     cost: Float[Array, "softness points"]
     reference: Float[Array, "softness points dim"]
     reference_error: Float[Array, "softness points dim"]
@@ -125,9 +145,99 @@ class BiasVariance(eqx.Module):
     bias_interval: Float[np.ndarray, "2 softness points dim"]
     first_variance_interval: Float[np.ndarray, "2 softness points"]
     zeroth_variance_interval: Float[np.ndarray, "2 softness points"]
+    alpha_order_variance_interval: Float[np.ndarray, "2 softness points"] | None
     landscape: Landscape | None
-    reference_method: Literal["landscape", "zeroth_order"] = eqx.field(static=True)
+    reference_method: Literal["landscape", "control_variate", "zeroth_order"] = eqx.field(static=True)
+    warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
+
+    @property
+    def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
+        """What was swept, by name and value: stiffness, a plain array, or else the places in the list."""
+        given = self.softness.stiffness if isinstance(self.softness, Softness) else self.softness
+        if eqx.is_array(given) and given.ndim == 1:
+            return "softness" if given is self.softness else "stiffness, 1/s²", np.asarray(given, float)
+        return "number", np.arange(1.0, len(self.cost) + 1)
+
+    def table(self) -> dict[str, Shaped[np.ndarray, "softness points"]]:
+        """Return `truth` and of each estimate, such as `first`, `_bias` and `_variance`, with the ends `_low` and `_high`.
+
+        Of several parameters they are norms, with intervals on the safe side (see `BiasConstrained`). What `_is_biased` is so
+        beyond chance over the whole table.
+        """
+        is_one, found = self.params.shape[1] == 1, {"finite_share": self.first.finite_fraction}
+        levels = self.confidence, 1 - (1 - self.confidence) / self.cost.size
+
+        def add(name: str, value: ArrayLike, error: ArrayLike, count: ArrayLike) -> None:
+            size = np.asarray(value)[..., 0] if is_one else np.linalg.norm(value, axis=-1)
+            half, reach = (mean_interval(0.0, np.linalg.norm(error, axis=-1), count, level)[1] for level in levels)
+            low = size - half if is_one else np.maximum(size - half, 0)
+            found.update({name: size, f"{name}_low": low, f"{name}_high": size + half})
+            found[name.removesuffix("_bias") + "_is_biased"] = abs(size) > reach
+
+        add("truth", self.reference, self.reference_error, 10**6)
+        for name in ESTIMATES:
+            if (one := getattr(self, name)) is not None:
+                error = np.hypot(one.standard_error, self.reference_error)
+                add(f"{name}_bias", one.value - self.reference, error, one.num_finite)
+                low, high = getattr(self, f"{name}_variance_interval")
+                found |= {f"{name}_variance": one.variance, f"{name}_variance_low": low, f"{name}_variance_high": high}
+                found["alpha"] = one.alpha
+        return {name: np.asarray(value) for name, value in found.items() if name != "truth_is_biased"}
+
+    def summary(self, labels: Sequence[str] | None = None) -> str:
+        """Write the table for a terminal; labels name the softnesses in place of their numbers."""
+        (title, swept), table = self.knob, self.table()
+        names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
+        has_alpha = "alpha_order" in names
+        first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
+        lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, *["α"] * has_alpha]]
+        bad = [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
+        for i, j in np.ndindex(self.cost.shape):
+            one = {name: value[i, j] for name, value in table.items()}
+            half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
+            truth, *biases = (f"{one[x]:.3g}{half[x]}" for x in ("truth", *(f"{name}_bias" for name in names)))
+            biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
+            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])
+            variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
+            at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
+            lines.append([label, at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
+        columns = [column for column in zip(*lines, strict=True) if column[0] != "at" or len(points) > 1]
+        padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+        what = "gradient" if points.shape[1] == 1 else "norm of the gradient"
+        told = (
+            f"Truth: {what} of the cost under noise, from rollouts of its own; ± is half a {self.confidence:.0%} interval. "
+            "Variance: of one rollout. *: a bias beyond chance over the whole table."
+        )
+        stiff = [f"!: the time step does not hold it. {text}." for text in bad if text][:1]
+        return "\n".join(["  ".join(row).rstrip() for row in zip(*padded, strict=True)] + ["", told, *stiff])
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def plot(self) -> Any:
+        """Draw bias and variance against softness by matplotlib, a column per point, and return the figure."""
+        try:
+            import matplotlib.pyplot as plt
+        except ImportError as error:
+            raise ImportError("a picture needs matplotlib: pip install 'mjxgrad[render]'") from error
+        table, (title, swept), points = self.table(), self.knob, len(self.params)
+        settings = {"squeeze": False, "sharex": True, "sharey": "row", "layout": "constrained"}
+        figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
+        for j, (upper, lower) in enumerate(axes.T):
+            upper.axhline(0, color="grey", lw=0.8)
+            upper.plot(swept, table["truth"][:, j], color="grey", ls="--", label="the gradient itself")
+            for axis, what in ((upper, "bias"), (lower, "variance")):
+                for name, (colour, marker) in _LOOKS.items():
+                    if f"{name}_{what}" in table:
+                        y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
+                        look = {"color": colour, "marker": marker, "label": ESTIMATES[name]}
+                        axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
+            lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
+        axes[0, 0].set_ylabel("bias of the gradient")
+        axes[1, 0].set_ylabel("variance of one rollout")
+        axes[0, 0].legend(fontsize="small")
+        return figure
 
 
 def bias_variance(
@@ -138,13 +248,15 @@ def bias_variance(
     softness: PyTree | Sequence[PyTree],
     num_samples: int = 256,
     num_reference: int = 2048,
+    alpha_samples: int = 16,
     baseline: str = "leave_one_out",
     confidence: float = 0.95,
     num_resamples: int = 1000,
     chunk_size: int | None = None,
+    compiler_options: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BiasVariance:
-    r"""Measure both estimates of the gradient of a smoothed cost, at every softness and point.
+    r"""Measure estimates of the gradient of a smoothed cost, first, zeroth and α-order, at every softness and point.
 
     The noise is the same at every softness, so that differences between them are not luck. Everything is compiled
     once, in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept
@@ -159,10 +271,12 @@ def bias_variance(
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference, per softness if the cost is of one parameter with noise on it (one
             landscape serves all points), otherwise per softness and point.
+        alpha_samples: rollouts of one α-order estimate, which it chooses α by. At least 4.
         baseline: of the zeroth-order estimate.
         confidence: of the intervals.
         num_resamples: of the bootstrap.
         chunk_size: rollouts at a time.
+        compiler_options: of XLA.
         progress: called after every softness with how many are done and how many there are.
 
     Returns:
@@ -178,30 +292,55 @@ def bias_variance(
     check_baseline(baseline)
     params, restore = _points(params)
     whole("num_reference", num_reference, 4)
+    whole("alpha_samples", alpha_samples, 4)
     stacked, count = _stacked(softness)
-    has_zero_noise = baseline == "zero_noise"
-    plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True, with_zero_noise=has_zero_noise)
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
+    told = []
+    for one in each:  # outside of a trace, where a scene knows its values
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            objective = objective_of_softness(one)
+        messages = [str(warning.message) for warning in caught if issubclass(warning.category, SceneWarning)]
+        told.append(tuple(dict.fromkeys(messages)))
+    # By the noise where it is known: the derivatives by the parameters follow from it, and α-order asks for it.
+    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
+    wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
+    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
+    # But on a line the reference comes from more runs of the same program: there is nothing else to compile.
+    plan = Plan(num_samples, chunk_size, with_zero_noise=not is_line or baseline == "zero_noise", **wanted)
+    batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
 
     @jax.jit
     def measure(
         softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
-    ) -> tuple[dict[str, Any], Samples]:
+    ) -> tuple[dict[str, Any], Samples, Array | None]:
         objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
         samples_key, reference_key = jax.random.split(key)
-        samples = _sampled(objective, params, samples_key, plan)
+        by_noise = _sampled(objective, params, samples_key, plan)
+        samples = jax.vmap(_by_parameters)(by_noise) if knows_noise else by_noise
         first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
-        is_line = isinstance(objective, ParameterNoise) and objective.dim == 1
-        find = _by_landscape if is_line else _by_long_run
-        reference = find(objective, params, reference_key, num_reference, max(2, chunk_size or DEFAULT_CHUNK_SIZE))
-        return {"first": first, "zeroth": zeroth, **reference}, samples
+        mixed = (None, None)
+        if batch is not None:
+            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)
+        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
+        if is_line:
+            size = max(2, chunk_size or DEFAULT_CHUNK_SIZE)
+            return found | _by_landscape(objective, params, reference_key, num_reference, size), samples, mixed[1]
+        unbiased = jax.vmap(_unbiased)(by_noise) if knows_noise else (zeroth.value, zeroth.standard_error)
+        found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
+        return found, samples, mixed[1]
 
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     # Compiled here, for a thread does not see what a `with` has set, such as the precision.
-    compiled = compile_once(measure.lower(each[0], params, key))
+    compiled = compile_once(measure.lower(each[0], params, key), compiler_options)
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
-        measured, samples = jax.block_until_ready(compiled(one, params, key))
-        return measured, _variance_intervals(samples, baseline, confidence, num_resamples)
+        measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
+        if not is_line:
+            others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
+            runs = [compiled(one, params, k)[0]["reference"] for k in others]
+            measured["reference"] = sum(value for value, _ in runs) / len(runs)
+            measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
+        return measured, _variance_intervals(samples, batches, batch or 1, baseline, confidence, num_resamples)
 
     rows = []
     with ThreadPoolExecutor(_WORKERS) as pool:
@@ -228,7 +367,9 @@ def bias_variance(
         bias_interval=mean_interval(bias, bias_error, count_first, confidence),
         first_variance_interval=variances[0],
         zeroth_variance_interval=variances[1],
-        reference_method="zeroth_order" if found["landscape"] is None else "landscape",
+        alpha_order_variance_interval=None if batch is None else variances[2],
+        warnings=tuple(told),
+        reference_method="landscape" if is_line else "control_variate" if knows_noise else "zeroth_order",
         confidence=confidence,
     )
 
@@ -244,6 +385,48 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 
     samples = jax.lax.map(one_chunk, (points, chunks))
     return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
+
+
+def _by_parameters(samples: Samples) -> Samples:
+    """Pull derivatives and scores by the noise back to the parameters, for each unit and rollout."""
+    pull = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
+    gradients, scores = (pull(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
+    # Standard deviations are of the noise, and not known of the parameters.
+    known = {"gradients": gradients, "scores": scores, "stddevs": jnp.full_like(scores, jnp.nan)}
+    return dataclasses.replace(samples, **known, pull_backs=Partial(unchanged))
+
+
+def _in_batches(
+    samples: Samples, plan: Plan, size: int, zeroth: GradientEstimate
+) -> tuple[GradientEstimate, Float[Array, "batches dim"]]:
+    """Make α-order estimates of so many samples each, as a descent would: their mean, and each of them."""
+    count = plan.num_samples // size
+    batches = jax.tree.map(lambda leaf: leaf[: count * size].reshape(count, size, *leaf.shape[1:]), samples)
+
+    def one(batch: Samples) -> tuple[Array, Array, Array]:
+        (parts,) = both_parts(batch, control_variate=True)
+        alpha = weigh(Consistent(), parts, plan).alpha
+        value, _ = parts.mixture(jnp.broadcast_to(alpha, parts.first.offset.shape))
+        return jnp.where(parts.unbiased.count > 1, value, jnp.nan), alpha, parts.unbiased.count > 1
+
+    values, alpha, exists = jax.vmap(one)(batches)
+    found = Moments.of(values, exists)
+    mean = dataclasses.replace(
+        zeroth,
+        value=jnp.where(found.count > 1, found.mean, jnp.nan),
+        standard_error=jnp.sqrt(found.squared_error()),
+        covariance_diagonal=size * found.count * found.squared_error(),
+        num_finite=found.count,
+        alpha=jnp.nanmean(jnp.where(exists, alpha, jnp.nan)),
+    )
+    return mean, values
+
+
+def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    """Give the unbiased part of α-order with its error; see `control_variate`."""
+    (parts,) = both_parts(samples, control_variate=True)
+    value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
+    return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
 
 
 def _by_landscape(
@@ -265,31 +448,15 @@ def _by_landscape(
     return {"cost": cost, "reference": gradient[:, None], "reference_error": error[:, None], "landscape": landscape}
 
 
-def _by_long_run(
-    objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, num_reference: int, chunk_size: int
-) -> dict[str, Any]:
-    """Take the reference from many more samples, in pairs, of the estimate that is unbiased."""
-    settings = {"num_samples": 2 * (num_reference // 2), "antithetic": True, "chunk_size": chunk_size}
-
-    def one_point(index_and_point: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        index, point = index_and_point
-        estimate = zeroth_order(objective, point, jax.random.fold_in(key, index), **settings)
-        return objective.value(point, objective.zero_noise()), estimate.value, estimate.standard_error
-
-    cost, gradient, error = jax.lax.map(one_point, (jnp.arange(len(params)), params))
-    return {"cost": cost, "reference": gradient, "reference_error": error, "landscape": None}
-
-
 def _variance_intervals(
-    samples: Samples, baseline: str, confidence: float, num_resamples: int
-) -> Float[np.ndarray, "2 2 points"]:
-    """Bootstrap both variances at each point: estimate, end of interval, point."""
-    points = range(len(samples.costs))
-    per_point = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples) for i in points]
-    intervals = [
-        [bootstrap_variance_interval(terms, confidence, num_resamples=num_resamples) for terms in _terms(s, baseline)]
-        for s in per_point
-    ]
+    samples: Samples, batches: Array | None, size: int, baseline: str, confidence: float, num_resamples: int
+) -> Float[np.ndarray, "estimates 2 points"]:
+    """Bootstrap all variances at each point, per rollout: estimate, end of interval, point."""
+    intervals = []
+    for i in range(len(samples.costs)):
+        terms = _terms(jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples), baseline)
+        terms += () if batches is None else (np.sqrt(size) * np.asarray(batches[i], float),)
+        intervals.append([bootstrap_variance_interval(x, confidence, num_resamples=num_resamples) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)
 
 

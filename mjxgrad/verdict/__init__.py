@@ -1,6 +1,7 @@
-"""What to do with a scene of one's own: `check` it, and read the verdict."""
+"""What to do with a scene of one's own: `check` it, `sweep` its contact, and read what they say."""
 
 from mjxgrad.verdict.check import Verdict, check
 from mjxgrad.verdict.findings import Finding, Recommendation
+from mjxgrad.verdict.sweep import Sweep, sweep
 
-__all__ = ["Finding", "Recommendation", "Verdict", "check"]
+__all__ = ["Finding", "Recommendation", "Sweep", "Verdict", "check", "sweep"]

@@ -194,7 +194,9 @@ def check(
         measuring = time.perf_counter()
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
         try:
-            measured = measure(scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say)
+            measured = measure(
+                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
+            )
         except TimeoutError:
             measured = None
         found += measured_findings(measured) if measured and measured.lines else ()

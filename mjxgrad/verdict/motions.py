@@ -88,9 +88,8 @@ class Motions:
 
 def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
     """Return half the width of each actuator's range of controls, in its units; 1 where there is none."""
-    low, high = np.asarray(scene.ctrlrange, float).T
-    width = high - low
-    return np.where(np.isfinite(width) & (width > 0), width / 2, 1.0)
+    low, high = scene.mj_model.actuator_ctrlrange.T
+    return np.where(scene.mj_model.actuator_ctrllimited & (high > low), (high - low) / 2, 1.0)
 
 
 def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:
@@ -198,9 +197,7 @@ def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
     return max(0.0, -float(data.efc_vel[contact.efc_address : contact.efc_address + num_rows].mean()))
 
 
-def pairs_at(
-    scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1
-) -> frozenset[str]:
+def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1) -> frozenset[str]:
     """Return what touches at any time of a motion by C MuJoCo, at a time step so many times shorter."""
     model = scene.to_mujoco()
     model.opt.timestep /= refined

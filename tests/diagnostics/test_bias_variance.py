@@ -9,7 +9,7 @@ from scipy.stats import norm
 from mjxgrad.diagnostics import Landscape, bias_variance, mean_interval
 from mjxgrad.diagnostics.bias_variance import cell_points
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval
-from mjxgrad.objective import parameter_noise
+from mjxgrad.objective import Objective, ParameterNoise, parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import STDDEV
 
@@ -109,6 +109,69 @@ def test_the_bias_of_first_order_is_the_jump_that_it_misses(jumps):
     assert ((low[0] < 0) & (high[0] > 0)).sum() >= 2
 
 
+def test_alpha_order_misses_no_jump_and_is_no_worse_than_zeroth_order(jumps, ramps):
+    """Its bias is at most the root of what may stay unexplained times sd(f)/σ; here it is within its error at once."""
+    table, _, _ = jumps
+    np.testing.assert_array_less(table.table()["alpha"][2], 0.1)
+    mixed, column = table.alpha_order, table.table()
+    np.testing.assert_array_less(
+        np.abs(mixed.value - table.reference)[2], 4 * np.hypot(mixed.standard_error, table.reference_error)[2]
+    )
+    assert not column["alpha_order_is_biased"][2].any()
+    # The variance of means of 16, per rollout; its interval holds it.
+    assert (column["alpha_order_variance_low"] < column["alpha_order_variance"]).all()
+    assert (column["alpha_order_variance"] < column["alpha_order_variance_high"]).all()
+    np.testing.assert_array_less(column["alpha_order_variance"][2], 1.5 * column["zeroth_variance"][2])
+    # Of a ramp that is as wide as the noise derivatives tell all: there it is as good as first order.
+    soft = ramps.table()
+    np.testing.assert_array_less(soft["alpha_order_variance"][0], 0.5 * soft["zeroth_variance"][0])
+
+
+def test_the_table_says_what_is_biased_and_how_large(jumps):
+    """The bias is known: minus the height times the density at the point; 1.5 of it is seen, 0 is not."""
+    table, _, _ = jumps
+    column = table.table()
+    assert column["first_is_biased"][2].all()
+    assert not column["first_is_biased"][0].any()
+    assert not column["zeroth_is_biased"].any()
+    lines = str(table).splitlines()
+    assert lines[0].split()[:5] == ["number", "at", "truth", "bias:", "first"]
+    cells = lines[9].split("  ")  # of the largest height, at the last point
+    assert cells[0] == "3"
+    assert any(cell.strip().endswith("*") for cell in cells)
+
+
+def test_norms_of_several_parameters_lie_in_their_intervals():
+    point, stddev = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2])
+    table = bias_variance(
+        lambda scale: parameter_noise(lambda x: scale * textbook.bumpy(x), jnp.asarray(stddev)),
+        jnp.asarray(point)[None],
+        jax.random.key(3),
+        softness=jnp.array([1.0, 3.0]),
+        num_samples=500,
+        num_reference=4000,
+    ).table()
+    exact = np.array([1.0, 3.0]) * np.linalg.norm(textbook.bumpy_gradient(point, stddev))
+    assert (table["truth_low"][:, 0] < exact).all()
+    assert (exact < table["truth_high"][:, 0]).all()
+    assert (table["zeroth_bias_low"] == 0).all()
+
+
+def test_the_picture_has_every_estimate_and_axes_with_units(jumps):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("Agg")
+    figure = jumps[0].plot()
+    (upper, *_), (lower, *_) = np.array(figure.axes).reshape(2, 3)
+    assert [text.get_text() for text in upper.get_legend().get_texts()][-3:] == [
+        "first order",
+        "zeroth order",
+        "α-order",
+    ]
+    assert lower.get_xlabel() == "number"
+    assert lower.get_ylabel() == "variance of one rollout"
+    pyplot.close(figure)
+
+
 def test_the_landscape_is_the_cost(jumps):
     table, _, _ = jumps
     x = table.landscape.points
@@ -118,8 +181,9 @@ def test_the_landscape_is_the_cost(jumps):
 
 
 def test_everything_is_compiled_once_and_progress_is_told(jumps):
+    """Each softness is built once to hear what its scene says of it, and once more in the program."""
     _, calls, progress = jumps
-    assert len(calls) == 1
+    assert len(calls) == 3 + 1
     assert progress == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -134,10 +198,34 @@ def test_several_parameters_take_a_long_run_for_reference():
         num_reference=20_000,
     )
     exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(point, stddev)
-    assert table.reference_method == "zeroth_order"
+    assert table.reference_method == "control_variate"
     assert table.landscape is None
     np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
     np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
+
+
+class Hidden(ParameterNoise):
+    """A cost that does not tell of its noise what α-order asks for."""
+
+    differentiate = Objective.differentiate
+
+
+def test_where_the_noise_is_not_known_the_reference_is_zeroth_order_and_alpha_is_none():
+    point, stddev = jnp.array([0.5, -1.2, 0.4]), jnp.array([0.1, 0.4, 0.2])
+    table = bias_variance(
+        lambda scale: Hidden(lambda x: scale * textbook.bumpy(x), stddev, 3),
+        point[None],
+        jax.random.key(2),
+        softness=jnp.array([1.0, 3.0]),
+        num_samples=1000,
+        num_reference=20_000,
+    )
+    exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(np.asarray(point), np.asarray(stddev))
+    assert table.reference_method == "zeroth_order"
+    assert table.alpha_order is None
+    np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
+    np.testing.assert_allclose(table.cost[:, 0], np.array([1.0, 3.0]) * float(textbook.bumpy(point)))
+    assert str(table).splitlines()[0].split()[-3:] == ["variance:", "first", "zeroth"]
 
 
 def test_the_reference_is_unbiased_and_its_error_on_the_safe_side():
@@ -171,6 +259,7 @@ def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():
         ({"baseline": "mean"}, "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'"),
         ({"num_samples": 1}, "num_samples must be at least 2, got 1"),
         ({"num_reference": 3}, "num_reference must be at least 4, got 3"),
+        ({"alpha_samples": 3}, "alpha_samples must be at least 4, got 3"),
         ({"softness": []}, "softness must have at least one value, got none"),
         ({"softness": {"a": jnp.ones(2), "b": jnp.ones(3)}}, "softness must have the same leading axis in every leaf"),
         ({"softness": [{"a": 1.0}, {"b": 1.0}]}, "softness must have the same parts set in every value, got 2"),

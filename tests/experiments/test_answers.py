@@ -26,15 +26,13 @@ def throws(task, biased, zeroth=0.0, noisy=0):
     off[0, 0] = zeroth
     cells = {
         "is_biased": np.array(biased)[:, None] & np.ones((3, 2), bool),
-        "reference_low": zero - 1,
-        "reference_high": zero + 1,
+        "zeroth_is_off": abs(off) > 2,
     }
     cells |= {"reference": zero + 1, "bias_low": zero - 0.1, "bias_high": zero + 0.1 + np.array([[0], [noisy], [0]])}
-    cells |= {"zeroth_order_low": off - 1, "zeroth_order_high": off + 1}
     swept = xr.Dataset(
         {name: (("stiffness", "angle"), value) for name, value in cells.items()}, {"stiffness": stiffness}
     )
-    return SimpleNamespace(swept=swept, settings=SimpleNamespace(task=task))
+    return SimpleNamespace(swept=swept, settings=SimpleNamespace(problem=task))
 
 
 def estimated(problem, biased, errors=None, num_outlying=(5, 0)):

@@ -252,7 +252,9 @@ def test_both_engines_move_alike():
 def test_a_fine_motion_is_that_of_a_shorter_time_step():
     scene = mg.load_scene(ball(height=0.06), timestep=0.002 / REFINED)
     for speed, found in zip((-1.0, -2.0, 0.5), _moved("mujoco", "fine")[0].outcomes, strict=True):
-        course = mg.rollout(scene, mg.initial_state(scene, qvel=np.array([speed])), horizon=20 * REFINED, engine="mujoco")
+        course = mg.rollout(
+            scene, mg.initial_state(scene, qvel=np.array([speed])), horizon=20 * REFINED, engine="mujoco"
+        )
         np.testing.assert_allclose(found[-1], [course.qpos[-1, 0], course.qvel[-1, 0]], rtol=1e-6)
 
 

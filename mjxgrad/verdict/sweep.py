@@ -1,0 +1,311 @@
+"""Bias and variance of gradients in a scene of one's own, over contact stiffness; scene, cost and start are given by names."""
+
+import functools
+import html
+import importlib
+import io
+import runpy
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, PyTree
+
+from mjxgrad._arrays import is_known
+from mjxgrad._rollout import Trajectory, initial_state
+from mjxgrad.contact import Softness
+from mjxgrad.contact.warnings import format_number
+from mjxgrad.diagnostics import BiasVariance, bias_variance
+from mjxgrad.diagnostics.bias_variance import ESTIMATES
+from mjxgrad.dynamics import Onset
+from mjxgrad.dynamics.kinematics import kinematics
+from mjxgrad.objective import Objective, parameter_noise
+from mjxgrad.objective.actions import OpenLoop
+from mjxgrad.scene import Scene, SceneWarning, load_scene
+from mjxgrad.task import SceneTask
+from mjxgrad.verdict.check import Cost, Source, _outcomes
+from mjxgrad.verdict.motions import half_range
+from mjxgrad.verdict.moving import CONTACT_FIELDS, compiler_options
+from mjxgrad.verdict.page import document
+
+STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
+_BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # and how many bodies or sites each is of
+_SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
+_NONE, _BLIND = 0.05, 0.5  # shares of the truth: a smaller bias is none, and at least a larger one must have been seen
+
+
+def scene_task(
+    scene: Scene,
+    cost: str | Cost | None = None,
+    *,
+    start: str | None = None,
+    horizon: int | None = None,
+    gradient: str = "onset",
+    seed: int = 0,
+) -> SceneTask:
+    """Make a task of a scene by names.
+
+    Args:
+        scene: from `load_scene`; its resting controls become those of the key frame.
+        cost: of a trajectory: a function; or file.py:function, module:function; or of bodies and sites, in the end, height:torso
+            (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of its tilt),
+            reach:hand/ball (their distance, m). None is a random mix of where the heaviest body ends up.
+        start: a key frame; None is the reference pose, at rest.
+        horizon: steps; None is half a second, but 50 to 300 steps.
+        gradient: "onset", for contacts that begin within the step; or one of `step`, in MuJoCo's motion.
+        seed: of the mix.
+
+    Raises:
+        ValueError: in one sentence, if there is no such file, function, body or key frame.
+    """
+    model, state = scene.mj_model, initial_state(scene)
+    if start is not None:
+        key, _ = _found(model, start, "key")
+        state = initial_state(scene, model.key_qpos[key], model.key_qvel[key], model.key_act[key])
+        scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key_ctrl[key], state.qpos.dtype))
+    if cost is None:
+        outcomes = _outcomes(scene, None, np.random.default_rng(seed))[1]
+        cost = lambda trajectory: outcomes(trajectory)[0]  # noqa: E731
+    cost = _named_cost(scene, cost) if isinstance(cost, str) else cost
+    usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
+    task = SceneTask(scene, state, cost, usual if horizon is None else horizon, onset=Onset())
+    return task if gradient == "onset" else task.with_gradient(gradient)  # pyright: ignore[reportArgumentType]
+
+
+def load_function(name: str) -> Callable[..., Any]:
+    """Find a function by file.py:function or module:function, the module also in the current folder."""
+    source, _, function = name.rpartition(":")
+    if source.endswith(".py") and not Path(source).is_file():
+        raise ValueError(f"cost: there is no file {source}")
+    try:
+        sys.path.insert(0, str(Path.cwd()))
+        names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
+    except Exception as error:  # whatever a file of one's own may do
+        forms = "file.py:function, module:function, or of a body as height:torso"
+        raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
+    if not callable(names.get(function)):
+        there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
+        raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
+    return names[function]
+
+
+def _named_cost(scene: Scene, name: str) -> Cost:
+    kind, _, what = name.partition(":")
+    if kind not in _BUILT_IN:
+        return load_function(name)
+    if len(names := what.split("/")) != _BUILT_IN[kind]:
+        raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
+    found = [_found(scene.mj_model, name, "body", "site") for name in names]
+    data, seconds = scene.data, scene.mj_model.opt.timestep
+
+    def frames(qpos: Float[Array, " nq"]) -> list[tuple[Array, Array]]:
+        placed = kinematics(scene.model, data.replace(qpos=qpos))
+        parts = {True: (placed.xpos, placed.xmat), False: (placed.site_xpos, placed.site_xmat)}
+        return [(place[i], turn[i]) for i, is_body in found for place, turn in [parts[is_body]]]
+
+    def cost(trajectory: Trajectory) -> Float[Array, ""]:
+        (place, turn), *other = frames(trajectory.qpos[-1])
+        if kind == "reach":
+            return jnp.linalg.norm(place - other[0][0])
+        if kind == "speed":
+            return (frames(trajectory.qpos[0])[0][0] - place)[0] / (seconds * len(trajectory.ctrl))
+        return -place[2] if kind == "height" else 1 - turn[2, 2]
+
+    return cost
+
+
+def _found(model: mujoco.MjModel, name: str, *kinds: str) -> tuple[int, bool]:
+    """Return the number of a thing of one of some kinds, and whether it is of the first."""
+    known = {kind: _names(model, kind) for kind in kinds}
+    for kind, names in known.items():
+        if name in names:
+            return names.index(name), kind == kinds[0]
+    there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
+    raise ValueError(f"there is no {' or '.join(kinds)} {name!r} in the scene, but {there}")
+
+
+def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+    number = getattr(model, {"actuator": "nu", "joint": "njnt"}.get(kind, f"n{kind}"))
+    return [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i) or "" for i in range(number)]
+
+
+class Push(OpenLoop):
+    """The cost under noise on every control, by how far all of them are moved along one direction, at every step.
+
+    By single controls the gradient is hundreds of small numbers; of a single one an interval says what is known of it.
+    """
+
+    direction: Float[Array, " nu"]
+
+    def unravel(self, params: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
+        return jnp.broadcast_to(self.task.scene.data.ctrl + params[0] * self.direction, self.noise_shape)
+
+    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+        return self.pull_back_at(params, None)(self._noise_score(params, noise))
+
+    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+        return Partial(jnp.matmul, jnp.tile(self.direction, self.task.horizon)[None])
+
+
+def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:
+    start = eqx.tree_at(lambda state: state.qvel, task.state, task.state.qvel + speed[0] * along)
+    return task.run(jnp.zeros((task.horizon, 0)), start=start).cost
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A task's cost under noise, as a function of the stiffness of its contacts and of one number.
+
+    That number moves all controls along one direction, and noise is on each of them at each step, both in halves of their ranges;
+    without actuators both are on the velocities at the start, in m/s or rad/s. Of several the direction is random.
+    """
+
+    task: SceneTask
+    noise: float
+    seed: int = 0
+
+    @functools.cached_property
+    def own(self) -> float:
+        """The stiffness of the file's contacts (1/s²), their median; exactly this one stands for them as they are."""
+        scene = self.task.scene
+        return float(np.median(np.asarray(scene.contact_parameters().stiffness))) if scene.pairs else 0.0
+
+    def __call__(self, softness: Softness) -> Objective:
+        """Return the objective at a stiffness, at critical damping."""
+        task, scene, is_own = self.task, self.task.scene, softness.stiffness == self.own
+        if is_known(is_own) and is_own:
+            for text in scene.warnings():
+                warnings.warn(f"{scene.name}: {text}", SceneWarning, stacklevel=2)
+        elif scene.pairs:
+            model, soft = scene.model, scene.with_softness(Softness(softness.stiffness, 1.0)).model
+            fields = {k: jnp.where(is_own, getattr(model, k), getattr(soft, k)) for k in CONTACT_FIELDS}
+            task = eqx.tree_at(lambda one: one.scene.model, task, model.replace(**fields))
+        count, like = task.num_controls or scene.mj_model.nv, task.state.qpos.dtype
+        drawn = np.random.default_rng(self.seed).normal(size=count)
+        along = jnp.asarray(drawn / np.linalg.norm(drawn) if count > 1 else np.ones(1), like)
+        if not task.num_controls:
+            return parameter_noise(Partial(_thrown, task, along), self.noise, dim=1)
+        half = jnp.asarray(half_range(scene), like)
+        return Push(task, self.noise * half, dim=1, direction=half * along)
+
+    def __str__(self) -> str:
+        kind = "actuator" if self.task.num_controls else "joint"
+        names = _names(self.task.scene.mj_model, kind)
+        which = f"{names[0] or f'the {kind}'}" if len(names) == 1 else f"all {len(names)} {kind}s in a random mix"
+        if kind == "joint":
+            return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
+        return f"a constant control of {which}; noise of {self.noise:g} on it in each step, both in halves of its range"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What `sweep` measured: of which scene, what by what in words, the stiffness of the file's own contacts, and the numbers."""
+
+    name: str
+    question: str
+    own: float
+    result: BiasVariance
+
+    @property
+    def labels(self) -> list[str]:
+        """What the rows are called."""
+        return [format_number(k) + " (file)" * bool(k == self.own) for k in self.result.knob[1]]
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line: where an estimate has no bias worth the name, nor one that is not to be seen."""
+        table, found = self.result.table(), {}
+        truth = abs(table["truth"])
+        for name, words in ESTIMATES.items():
+            if f"{name}_bias" in table:
+                width = table[f"{name}_bias_high"] - table[f"{name}_bias_low"]
+                is_off = table[f"{name}_is_biased"] & (abs(table[f"{name}_bias"]) > _NONE * truth)
+                good = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()
+                until = good.index(False) if False in good else len(good)
+                where = (
+                    f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else f"at {sum(good)} of {len(good)}"
+                )
+                none = "nowhere" if is_off.any() else "too noisy to tell"
+                found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
+        return f"No bias above {_NONE:.0%} seen: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"
+
+    def as_html(self) -> str:
+        """Write it as one page that needs nothing beside it, with a picture where matplotlib is installed."""
+        try:
+            file = io.StringIO()
+            self.result.plot().savefig(file, format="svg")
+            picture = file.getvalue().partition("<svg")[2]
+            picture = f'<svg role="img" aria-label="Bias and variance over stiffness, as in the table"{picture}'
+        except ImportError as error:
+            picture = html.escape(str(error))
+        question, table = html.escape(self.question), html.escape(self.result.summary(self.labels))
+        table, _, notes = table.partition("\n\n")
+        notes = "".join(f"<li>{note}</li>" for note in notes.splitlines())
+        body = f"<p>{question}</p><figure>{picture}</figure><pre>{table}</pre><ul>{notes}</ul>"
+        return document(f"mjxgrad sweep {self.name}", self.headline, body, {})
+
+
+def sweep(
+    source: Source,
+    cost: str | Cost | None = None,
+    *,
+    stiffness: Sequence[float] = STIFFNESS,
+    noise: float = 0.1,
+    num_samples: int = 256,
+    num_reference: int = 2048,
+    seed: int = 0,
+    log: Callable[[str], None] | None = None,
+    **task_settings: Any,
+) -> Sweep:
+    """Measure bias and variance of first, zeroth and α-order over contact stiffness, in a scene of one's own.
+
+    Args:
+        source: an MJCF file, or what else `load_scene` takes.
+        cost: as of `scene_task`.
+        stiffness: to sweep (1/s²), besides the file's own.
+        noise: standard deviation, as of `Knob`.
+        num_samples: rollouts of each estimate.
+        num_reference: rollouts of the truth.
+        seed: of all that is random.
+        log: called with what is being done.
+        **task_settings: start, horizon and gradient of `scene_task`.
+
+    Raises:
+        ValueError: as `scene_task` and `bias_variance` do, or if a stiffness is not positive.
+    """
+    if not all(0 < k < np.inf for k in stiffness):
+        raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, stiffness))}")
+    scene = load_scene(source)
+    task = scene_task(scene, cost, seed=seed, **task_settings)
+    knob = Knob(task, noise, seed)
+    swept = sorted({*stiffness, knob.own}) if scene.pairs else [1.0]
+    result = bias_variance(
+        knob,
+        jnp.zeros((1, 1)),
+        jax.random.key(seed),
+        softness=Softness.sweep(stiffness=swept),
+        num_samples=num_samples,
+        num_reference=num_reference,
+        compiler_options=compiler_options(),
+        progress=None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses"),
+    )
+    called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
+    question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
+    question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
+    table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
+    ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
+    ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
+    question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
+    return Sweep(scene.name, question, knob.own, result)

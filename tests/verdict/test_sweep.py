@@ -1,0 +1,205 @@
+"""A scene and a cost of a user's own, swept over contact stiffness by one line."""
+
+import math
+import sys
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad import cli
+from mjxgrad.verdict.sweep import Knob, scene_task
+
+# A block is pushed against a wall; its time step holds neither 1e6 1/s² (h²k + 2hb = 8) nor more.
+BLOCK = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody>
+  <geom name="wall" type="box" pos=".2 0 0" size=".02 .1 .1"/>
+  <body name="block"><joint name="x" type="slide" axis="1 0 0"/><geom name="block" size=".05" mass=".2"/>
+    <site name="tip" pos=".05 0 0"/></body></worldbody>
+  <actuator><motor name="push" joint="x" gear="6" ctrlrange="-1 1"/></actuator>
+  <keyframe><key name="near" qpos=".12" qvel=".5" ctrl=".5"/></keyframe></mujoco>"""
+COSTS = """
+def reward(trajectory):
+    return (trajectory.qpos[-1, 0] + 0.1) ** 2 - 0.01 * trajectory.qvel[-1, 0]
+
+def all_of_it(trajectory):
+    return trajectory.qpos[-1]
+"""
+PENDULUM = str(Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "block.xml").write_text(BLOCK)
+    (folder / "costs.py").write_text(COSTS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def swept(folder):
+    return mg.sweep(
+        folder / "block.xml",
+        f"{folder}/costs.py:reward",
+        start="near",
+        horizon=40,
+        stiffness=[1e3, 1e6],
+        noise=0.5,
+        num_samples=64,
+        num_reference=512,
+        gradient="discrete",
+    )
+
+
+def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
+    """By differences of the mean over common noise, a twentieth of its standard deviation to both sides."""
+    scene = mg.load_scene(folder / "block.xml")
+    task = scene_task(scene, f"{folder}/costs.py:reward", start="near", horizon=40, gradient="discrete")
+    knob, keys, width = Knob(task.with_engine("mujoco"), 0.5), jax.random.split(jax.random.key(5), 2000), 0.025
+    table = swept.result.table()
+    for row, stiffness in enumerate(swept.result.knob[1][:2]):
+        objective = knob(mg.Softness(stiffness=stiffness))
+        noise = jax.vmap(objective.sample_noise)(keys)
+        ends = [jax.vmap(objective.value, in_axes=(None, 0))(jnp.array([at]), noise) for at in (-width, width)]
+        slopes = np.asarray(ends[1] - ends[0]) / (2 * width)
+        error = np.hypot(slopes.std() / math.sqrt(len(slopes)), (table["truth_high"] - table["truth"])[row, 0] / 2)
+        assert abs(slopes.mean() - table["truth"][row, 0]) < 4 * error
+        assert error < 0.25 * abs(slopes.mean())
+
+
+def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_not_hold(swept):
+    assert swept.labels == ["1000", "2500 (file)", "1e6"]
+    lines = str(swept).splitlines()
+    assert lines[0].startswith("block.xml: No bias above 5% seen: ")
+    assert len(lines[0].removeprefix("block.xml: ").split()) <= 20
+    assert [line.split("  ")[0] for line in lines[5:8]] == ["1000", "2500 (file)", "1e6 !"]
+    (sentence,) = [line for line in lines if line.startswith("!")]
+    assert "h²k + 2hb = 12, stable below 4" in sentence
+
+
+def test_the_page_has_answer_picture_table_and_sentence(swept):
+    page = swept.as_html()
+    assert f"<h1>{swept.headline}</h1>" in page
+    assert page.count("<svg role=") == 1
+    assert "2500 (file)" in page
+    assert "h²k" in page.partition("</pre>")[2]
+
+
+def test_without_matplotlib_the_page_says_what_draws_it(swept, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    assert "mjxgrad[render]" in swept.as_html()
+    with pytest.raises(ImportError, match="mjxgrad\\[render\\]"):
+        swept.result.plot()
+
+
+def test_a_sweep_of_gymnasiums_pendulum_is_one_line(tmp_path, monkeypatch, capsys):
+    """Nothing of it can touch, which is said, and its own contact measured alone."""
+    monkeypatch.chdir(tmp_path)
+    Path("upright.py").write_text("def cost(trajectory):\n    return (trajectory.qpos[-1] ** 2).sum()\n")
+    arguments = ["--cost", "upright.py:cost", "--horizon", "10", "--samples", "32", "--gradient", "discrete"]
+    assert cli.main(["sweep", PENDULUM, *arguments]) == 0
+    said = capsys.readouterr().out
+    assert "a constant control of slide" in said
+    assert "No two geoms can touch" in said
+    assert Path("sweep.html").read_text().startswith("<!DOCTYPE html>")
+
+
+def test_without_actuators_it_is_by_the_velocity_at_the_start(tmp_path):
+    """A ball falls freely for 0.1 s: its height has the derivative 0.1 by its velocity, without any spread."""
+    (tmp_path / "ball.xml").write_text(
+        '<mujoco><worldbody><body name="ball"><joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    found = mg.sweep(tmp_path / "ball.xml", "height:ball", horizon=50, num_samples=32, num_reference=200)
+    assert "velocity of the joint at the start" in found.question
+    np.testing.assert_allclose(found.result.first.value, -0.1, rtol=1e-6)
+    np.testing.assert_allclose(found.result.table()["truth"], -0.1, rtol=0.05)
+
+
+def test_the_files_own_stiffness_stands_for_its_contacts_as_they_are(folder):
+    """Half critical damping, which no other stiffness has; traced, too."""
+    (folder / "bouncy.xml").write_text(BLOCK.replace('mass=".2"', 'mass=".2" solref=".02 .5"'))
+    knob = Knob(scene_task(mg.load_scene(folder / "bouncy.xml"), "height:block"), 0.2)
+
+    def contact(stiffness):
+        return knob(mg.Softness(stiffness=stiffness)).task.scene.contact_parameters().damping_ratio
+
+    own = knob.task.scene.contact_parameters().damping_ratio
+    assert abs(own - 1).min() > 0.1
+    for read in (contact, jax.jit(contact)):
+        np.testing.assert_allclose(read(jnp.array(knob.own)), own)
+        np.testing.assert_allclose(read(jnp.array(2 * knob.own)), 1.0)
+
+
+def test_derivatives_by_the_push_are_those_by_all_controls_along_it(folder):
+    """The transpose of how it moves them, for two actuators, whose directions differ."""
+    (folder / "two.xml").write_text(BLOCK.replace("</actuator>", '<motor joint="x" ctrlrange="-3 1"/></actuator>'))
+    scene = mg.load_scene(folder / "two.xml")
+    objective = Knob(scene_task(scene, "height:block", horizon=3), 0.2)(mg.Softness(stiffness=1e3))
+    by_control = jnp.arange(1.0, 7.0)
+    (expected,) = jax.vjp(lambda at: objective.unravel(at).ravel(), jnp.zeros(1))[1](by_control)
+    np.testing.assert_allclose(objective.pull_back_at(jnp.zeros(1), None)(by_control), expected)
+    np.testing.assert_allclose(objective.stddev, [0.2, 0.4])  # of half the range
+
+
+def test_costs_by_name_are_what_c_mujoco_says(folder):
+    scene = mg.load_scene(folder / "block.xml")
+    moved = mg.rollout(scene, mg.initial_state(scene, qpos=jnp.array([0.05])), jnp.ones((20, 1)), engine="mujoco")
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:] = moved.qpos[-1]
+    mujoco.mj_kinematics(scene.mj_model, data)
+    block, tip, start = data.body("block").xpos, data.site("tip").xpos, 0.05
+    expected = {
+        "height:tip": -tip[2],
+        "reach:block/tip": np.linalg.norm(block - tip),
+        "speed:block": -(block[0] - start) / (20 * 0.002),
+        "upright:block": 0.0,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(scene_task(scene, name, horizon=20).cost(moved), value, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere.xml"], "there is no file nowhere.xml"),
+        (["block.xml", "--cost", "none.py:reward"], "there is no file none.py"),
+        (["block.xml", "--cost", "costs.py:rewards"], "costs.py has no function 'rewards', but reward, all_of_it"),
+        (["block.xml", "--cost", "costs.py:all_of_it"], "cost must return a scalar of shape ()"),
+        (["block.xml", "--cost", "broken.py:cost"], "'broken.py:cost': invalid syntax"),
+        (
+            ["block.xml", "--cost", "height:blok"],
+            "there is no body or site 'blok' in the scene, but body: world, block",
+        ),
+        (["block.xml", "--cost", "reach:block"], "reach is of two, as reach:hand/ball, got 'block'"),
+        (["block.xml", "--cost", "hight:block"], "cost must be file.py:function, module:function, or of a body as"),
+        (["block.xml", "--start", "far"], "there is no key 'far' in the scene, but key: near"),
+        (["block.xml", "--stiffness", "0"], "stiffness must be positive and finite, got 0.0"),
+        (["block.xml", "--html", "nowhere/page.html"], "there is no folder nowhere"),
+        (["block.xml", "--gradient", "slop"], 'Choose from: "onset", "discrete", "event"'),
+    ],
+)
+def test_what_cannot_be_swept_is_said_in_one_sentence(folder, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    Path("broken.py").write_text("def cost(:\n")
+    assert cli.main(["sweep", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_the_answer_tells_a_bias_from_what_noise_hides(swept, monkeypatch):
+    """First order is half off at the stiffest contact, zeroth order hidden throughout, α-order right everywhere."""
+    wide = {"first": [0.0, 0.0, 0.5], "zeroth": [0.1, 0.1, 0.1], "alpha_order": [0.0, 0.0, 0.0]}
+    table = {"truth": np.ones((3, 1))}
+    for name, bias in wide.items():
+        half = 0.9 if name == "zeroth" else 0.01
+        table |= {f"{name}_bias": np.array(bias)[:, None], f"{name}_is_biased": np.array(bias)[:, None] > half}
+        table |= {f"{name}_bias_low": table[f"{name}_bias"] - half, f"{name}_bias_high": table[f"{name}_bias"] + half}
+    monkeypatch.setattr(type(swept.result), "table", lambda self: table)
+    assert swept.headline == (
+        "No bias above 5% seen: first order up to 2500 (file) 1/s²; zeroth order too noisy to tell; α-order everywhere."
+    )
