@@ -27,6 +27,9 @@ from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
+from mjxgrad.dynamics import Gradient
+from mjxgrad.native.derivative import to_coordinates
+from mjxgrad.native.engine import Engine
 from mjxgrad.tasks import scene_path
 from mjxgrad.verdict.sweep import Knob
 
@@ -181,6 +184,10 @@ _BUILDERS = {
 
 # The trend that an outcome may have over the interval; what it leaves is the sawtooth.
 _DEGREE = 9
+# MuJoCo's motion and its two derivatives, by C MuJoCo and by MJX, and a motion whose contacts begin within the step.
+NATIVE = "slope, C MuJoCo"
+_BY_MUJOCO: dict[str, Gradient] = {DISCRETE: "discrete", NATIVE: "slope"}
+_ARMS = (DISCRETE, NATIVE, SLOPE, CONTINUOUS)
 _READING, _SAMPLE = ("arm", "time", "coordinate"), ("arm", "start", "time", "coordinate")
 _NUM_TIMES = 5  # at which outcomes are read, evenly over the motion
 
@@ -215,12 +222,12 @@ def course(
     MuJoCo's outcome has teeth (`has_impact`), how many times `smaller` they are with an onset, the `shift` of the mean
     outcome by it, over MuJoCo's teeth, and `closer`, its distance from the reference over MuJoCo's.
     """
-    found = [arms[arm] for arm in ARMS]
+    found = [arms[arm] for arm in _ARMS]
     start, shape = found[0].parameters, found[0].slope.shape
     names = ("slope", "mean", "mean_error", "standard_error", "resolution")
     data = xr.Dataset(
         {name: (_READING, np.stack([getattr(one, name).reshape(shape) for one in found])) for name in names},
-        coords={"arm": list(ARMS), "start": start, "time": times, "coordinate": list(labels)},
+        coords={"arm": list(_ARMS), "start": start, "time": times, "coordinate": list(labels)},
     ).assign_coords(case=name, title=title, timestep=timestep)
     data["outcome"] = _SAMPLE, np.stack([one.outcomes for one in found])
     data["derivative"] = _SAMPLE, np.stack([one.derivatives[0] for one in found])
@@ -266,6 +273,39 @@ def _sample(
     return jax.vmap(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)))(parameters)
 
 
+def _by_mujoco(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    parameters: Float[np.ndarray, " starts"],
+    steps_between: int,
+    one: Case,
+    gradient: Gradient | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give readings and derivatives by C MuJoCo, which has nothing to compile; without a gradient readings alone."""
+    num, steps = len(parameters), _NUM_TIMES * steps_between
+    start = {"time": np.zeros((num, 1)), "qpos": np.tile(qpos, (num, 1)), "qvel": np.tile(qvel, (num, 1))}
+    start["act"], controls = np.zeros((num, model.na)), np.zeros((num, steps, model.nu))
+    start["qpos"][:, one.moved] += parameters
+    engine, read = Engine(model), slice(steps_between - 1, None, steps_between)
+    if gradient is None:
+        found = engine.run({}, start, {"ctrl": controls})
+        change = np.zeros((num, steps, 2 * model.nv + model.na))
+    else:
+        # The coordinate that is moved has the same number among velocities: of quaternions none is.
+        along = np.tile(np.eye(2 * model.nv + model.na)[one.moved], (num, 1))
+        found = engine.follow(gradient, {}, start, {"ctrl": controls}, (along, controls))
+        change = found["change"]
+    scene = mg.load_scene(model, engine="mujoco")
+
+    def reading(qpos: Array, qvel: Array, change: Array) -> tuple[Array, Array]:
+        turned = to_coordinates(scene, qpos, change[: model.nv])
+        return jax.jvp(one.read, (qpos, qvel), (turned, change[model.nv : 2 * model.nv]))
+
+    both = jax.jit(jax.vmap(jax.vmap(reading)))(found["qpos"][:, read], found["qvel"][:, read], change[:, read])
+    return np.asarray(both[0]), np.asarray(both[1])
+
+
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Sample outcomes and derivatives of every motion at every time step."""
     courses = []
@@ -291,16 +331,21 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     parameters = phases(one.interval, settings.num_phases)
     steps = max(1, round(one.duration / timestep / _NUM_TIMES))
 
-    def sampled(arm: str, refinement: int = 1) -> list[np.ndarray]:
-        model, count = at_time_step(scene.model, timestep / refinement), jnp.int32(steps * refinement)
-        both = _sample(model, start, jnp.asarray(parameters), count, one.read, one.moved, arm)
-        return [np.asarray(each) for each in both]
-
+    model = scene.to_mujoco()
+    model.opt.timestep = timestep
     arms = {}
-    for arm in ARMS:
-        outcomes, derivatives = sampled(arm)
+    for arm in _ARMS:
+        if arm in _BY_MUJOCO:
+            outcomes, derivatives = _by_mujoco(model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm])
+        else:
+            given = at_time_step(scene.model, timestep), start, jnp.asarray(parameters), jnp.int32(steps)
+            outcomes, derivatives = (np.asarray(each) for each in _sample(*given, one.read, one.moved, arm))
         arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
-    reference = sampled(DISCRETE, settings.reference)[0] if settings.reference else None
+    reference = None
+    if settings.reference:
+        model.opt.timestep /= settings.reference
+        count = steps * settings.reference
+        reference, _ = _by_mujoco(model, qpos, qvel, parameters, count, one, None)
     times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
     return course(name, one.title, one.labels, timestep, times, arms, reference)
 
@@ -310,8 +355,10 @@ def _own_course(settings: Settings, workspace: Workspace) -> xr.Dataset:
     task = own_task(settings, seed=settings.seed)
     workspace.check(task.scene)
     parameters, arms = phases((-settings.width, settings.width), settings.num_phases), {}
-    for arm, (gradient, onset) in ARMS.items():
-        knob = Knob(task.with_gradient(gradient) if onset is None else task.with_onset(onset), 1.0, settings.seed)
+    for arm in _ARMS:
+        gradient, onset = ARMS.get(arm, ("slope", None))
+        stepped = task.with_gradient(gradient) if onset is None else task.with_onset(onset)
+        knob = Knob(stepped.with_engine("mujoco") if arm in _BY_MUJOCO else stepped, 1.0, settings.seed)
         objective = knob(mg.Softness(stiffness=knob.own or 1.0)).sized_for(jnp.zeros(1))
 
         def cost(at: Array, objective: mg.Objective = objective) -> Array:
@@ -341,12 +388,14 @@ def verdict(outcome: Outcome) -> str:
     smaller, spread = _pooled(outcome, "smaller"), _pooled(outcome, "spread", CONTINUOUS)
     if not smaller.size:
         return "Nothing touches in these motions: there are no teeth."
-    within = {arm: _pooled(outcome, "within", arm).mean() for arm in ARMS}
+    within = {arm: _pooled(outcome, "within", arm).mean() for arm in _ARMS}
     return (
         f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
-        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings ({within[DISCRETE]:.0%} without, "
-        f"{within[SLOPE]:.0%} for the slope at MuJoCo's motion), and single derivatives scatter by {np.median(spread):.2f} of it."
+        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is right at "
+        f"{within[NATIVE]:.0%} by C MuJoCo and {within[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {within[DISCRETE]:.0%}. "
+        f"Single derivatives scatter by {np.median(spread):.2f} of the slope with an onset, "
+        f"{np.median(_pooled(outcome, 'spread', NATIVE)):.2f} by C MuJoCo."
     )
 
 
@@ -381,7 +430,7 @@ def tables(outcome: Outcome) -> list[Table]:
         row.append(f"{float(middle['shift']):.2f}")
         rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
-    columns += [f"{what}, {arm}" for what in ("spread", "error", "within 2 errors") for arm in ARMS]
+    columns += [f"{what}, {arm}" for what in ("spread", "error", "within 2 errors") for arm in _ARMS]
     columns += ["shift of the mean", "off the converged motion"]
     caption = (
         "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
@@ -402,10 +451,11 @@ def _name(course: xr.Dataset) -> str:
     return f"{course.title.values}, {1e3 * float(course.timestep):g} ms"
 
 
-_COLOURS = {DISCRETE: FIRST, SLOPE: ZEROTH, CONTINUOUS: ONSET}
+_COLOURS = {DISCRETE: FIRST, NATIVE: "#7a3fb0", SLOPE: ZEROTH, CONTINUOUS: ONSET}
 _NAMES = {
     DISCRETE: "MuJoCo's step; its derivative",
-    SLOPE: "slope at MuJoCo's motion",
+    NATIVE: "slope, C MuJoCo",
+    SLOPE: "slope, MJX",
     CONTINUOUS: "contact begins within the step",
 }
 
@@ -429,7 +479,7 @@ def _teeth(course: xr.Dataset, is_first: bool, _: Outcome):
         column[0].set_title(label)
     for row, label in enumerate(("outcome less its trend", "derivative, each start", "derivative, mean")):
         axes[row, 0].set_ylabel(label)
-    handles = [Line2D([], [], color=_COLOURS[arm], marker=".", label=_NAMES[arm]) for arm in ARMS]
+    handles = [Line2D([], [], color=_COLOURS[arm], marker=".", label=_NAMES[arm]) for arm in _ARMS]
     handles.append(Line2D([], [], color=REFERENCE, label="slope of the simulated outcome"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
     title, duration, h = str(course.title.values), float(course.time[-1]), 1e3 * float(course.timestep)
@@ -445,7 +495,7 @@ def _draw_starts(upper: Axes, lower: Axes, one: xr.Dataset) -> None:
     """Draw one coordinate of the last reading over the start."""
     for arm in (DISCRETE, CONTINUOUS):
         upper.plot(one.start, one.residual.sel(arm=arm), color=_COLOURS[arm], lw=1.3)
-    for arm in ARMS:
+    for arm in _ARMS:
         lower.plot(one.start, one.derivative.sel(arm=arm), ".", color=_COLOURS[arm], ms=4)
     slope = float(one.slope.sel(arm=CONTINUOUS))
     lower.axhline(slope, color=REFERENCE, lw=1.2)
@@ -459,7 +509,7 @@ def _draw_times(axis: Axes, one: xr.Dataset) -> None:
     """Draw the slope of one coordinate and the mean of each derivative over time."""
     slope = one.slope.sel(arm=CONTINUOUS)
     axis.plot(one.time, slope, color=REFERENCE, lw=2.6)
-    for arm in ARMS:
+    for arm in _ARMS:
         mean, wide = one["mean"].sel(arm=arm), 2 * one.mean_error.sel(arm=arm)
         axis.plot(one.time, mean, color=_COLOURS[arm], lw=1.3)
         axis.fill_between(one.time, mean - wide, mean + wide, color=_COLOURS[arm], alpha=0.15, lw=0)

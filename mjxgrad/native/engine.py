@@ -248,15 +248,18 @@ class _Linearisation:
         events = self.surfaces.events(self.far, row[self.places["qvel"]], after)
         if events is None:
             return None, row
-        near = 4 * _WIDTH * np.abs(events.rows).max(axis=1)
-        shift = np.where(np.abs(events.gaps) < near, np.where(events.gaps < 0, -near, near) - events.gaps, 0.0)
+        near, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
+        off = events.gaps - surfaces
+        off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
+        shift = np.where(np.abs(off) < near, np.where(off < 0, -near, near) - off, 0.0)
         return events, self._moved(model, row, events.moves @ shift)
 
     def _spanned(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> Float[np.ndarray, "size events"]:
         """Return D, the differences that span each event."""
         columns = []
-        for gap, width, move in zip(events.gaps, events.widths, events.moves.T, strict=True):
-            ends = [self._moved(model, row, (end - gap) * move) for end in (width, -width)]
+        middle = events.centres - events.gaps
+        for to, width, move in zip(middle, events.widths, events.moves.T, strict=True):
+            ends = [self._moved(model, row, (to + end) * move) for end in (width, -width)]
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 

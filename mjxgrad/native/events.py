@@ -12,6 +12,8 @@ q±_i is the present position moved along P_i until its gap is ±w_i. So D_i hol
 each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
 of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
+- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. The window about -hv/2 of twice the
+  travel holds all of them, and a crossing is met by two steps, each with half the weight.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
@@ -32,9 +34,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
+_NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
 _USUAL_WIDTH, _ENDLESS = 1e-3, 1e3  # m or rad, of an impedance that has none, and what counts as none
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
 _FARTHEST = 10.0
@@ -51,12 +54,14 @@ class Events:
     Attributes:
         rows: J, the rate of each gap by joint velocity.
         gaps: distance less margin at present (m or rad).
-        widths: half the travel about zero that is spanned (m or rad).
+        centres: gap in the middle of what is spanned; zero, but for steps of several stages (m or rad).
+        widths: half of what is spanned (m or rad).
         moves: P, the displacement that changes one gap by one and leaves the others.
     """
 
     rows: Float[np.ndarray, "events nv"]
     gaps: Float[np.ndarray, " events"]
+    centres: Float[np.ndarray, " events"]
     widths: Float[np.ndarray, " events"]
     moves: Float[np.ndarray, "nv events"]
 
@@ -69,7 +74,8 @@ class Surfaces:
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
-        travel = 0.5 * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
+        spanned = 2.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
+        travel = spanned * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
@@ -88,14 +94,20 @@ class Surfaces:
         mujoco.mj_fwdPosition(self.model, data)
         if not data.nefc:
             return None
-        rows, gaps, least = self._gaps(data)
-        rates = np.maximum(np.abs(rows @ before), np.abs(rows @ after))
-        widths = np.maximum(0.5 * self.timestep * rates, least)
-        chosen = np.abs(gaps) < widths
-        return _moved_apart(rows / self.lengths, gaps, widths, chosen, self.lengths) if chosen.any() else None
+        rows, gaps, least, jumps = self._gaps(data)
+        rate, centres = rows @ before, np.zeros(len(rows))
+        widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            # Its stages meet the surface at gaps of 0, -hv/2 and -hv. What spans all three spans two steps' travel.
+            widths, centres = 2 * widths, -0.5 * self.timestep * rate
+        widths = np.maximum(widths, least)
+        chosen = (np.abs(gaps - centres) < widths) & jumps
+        if not chosen.any():
+            return None
+        return _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
 
-    def _gaps(self, data: mujoco.MjData) -> tuple[_Rows, _PerRow, _PerRow]:
-        """Return J, gap and least width of each contact, along its normal, and of each limit."""
+    def _gaps(self, data: mujoco.MjData) -> tuple[_Rows, _PerRow, _PerRow, Bool[np.ndarray, " rows"]]:
+        """Return J, gap, least width and whether force jumps, of each contact, along its normal, and of each limit."""
         model, jacobian = self.model, data.efc_J.reshape(-1, self.model.nv)
         contact = data.contact
         first = np.asarray(contact.efc_address)
@@ -107,15 +119,20 @@ class Surfaces:
         kinds = data.efc_type
         limits = np.flatnonzero((kinds == _LIMITS[0]) | (kinds == _LIMITS[1]))
         is_joint = kinds[limits] == _LIMITS[0]
-        widths = [np.asarray(contact.solimp).reshape(-1, 5)[acts, 2]]
+        solimp = [np.asarray(contact.solimp).reshape(-1, 5)[acts]]
         for i, joint in zip(data.efc_id[limits].tolist(), is_joint.tolist(), strict=True):
-            widths.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i, 2:3])
+            solimp.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i : i + 1])
         margin = np.concatenate([np.full(len(first), self.contact_reach), np.full(len(limits), self.limit_reach)])
         address = np.concatenate([first, limits])
-        width = np.concatenate(widths)
+        first_impedance, _, width, *_ = np.concatenate(solimp).T
         width = np.where((width > 0) & (width < _ENDLESS), width, _USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
-        return rows, data.efc_pos[address] - data.efc_margin[address] + margin, _LEAST_WIDTH * width
+        return (
+            rows,
+            data.efc_pos[address] - data.efc_margin[address] + margin,
+            _LEAST_WIDTH * width,
+            first_impedance > _NO_JUMP,
+        )
 
 
 def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
@@ -137,7 +154,7 @@ def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
 
 
 def _moved_apart(
-    scaled: _Rows, gaps: _PerRow, widths: _PerRow, chosen: np.ndarray, lengths: np.ndarray
+    scaled: _Rows, gaps: _PerRow, centres: _PerRow, widths: _PerRow, chosen: np.ndarray, lengths: np.ndarray
 ) -> Events | None:
     """Return the chosen rows as events, with displacements that change one gap each and carry no other row across zero."""
     index = np.flatnonzero(chosen)
@@ -151,17 +168,17 @@ def _moved_apart(
     members = [index[group == i] for i in range(len(apart))]
     rows = np.array([scaled[one].mean(axis=0) for one in members])
     width = np.array([widths[one].max() for one in members])
-    gap = gaps[index[apart]]
+    gap, centre = gaps[index[apart]], centres[index[apart]]
     held = np.zeros(0, int)
     while True:
         kept = held[_independent(scaled[held], rows)]
         moves = np.linalg.pinv(np.concatenate([rows, scaled[kept]]))[:, : len(rows)]
-        reach = np.max(np.abs(scaled @ moves) * (width + np.abs(gap)), axis=1)
+        reach = np.max(np.abs(scaled @ moves) * (width + np.abs(gap - centre)), axis=1)
         crossed = np.setdiff1d(np.flatnonzero((np.abs(gaps) < reach) & ~chosen), held)
         if not crossed.size:
             break
         held = np.concatenate([held, crossed])
-    return Events(rows * lengths, gap, width, moves / lengths[:, None])
+    return Events(rows * lengths, gap, centre, width, moves / lengths[:, None])
 
 
 def _independent(rows: _Rows, others: Float[np.ndarray, "others nv"]) -> list[int]:

@@ -146,3 +146,18 @@ def test_a_landing_foot_does_not_carry_its_knee_across_the_limit():
     assert found is not None
     carried = np.abs(found.moves[3:] * (found.widths + np.abs(found.gaps)))
     assert (carried < 1e-4).all()
+
+
+def test_force_that_begins_without_a_jump_is_no_event():
+    """Small differences see all of it."""
+    soft = BALL.format(h=0.002).replace("<geom size", '<geom solimp="0 .9 .01" priority="1" size')
+    assert _events(soft, [1e-4 - 0.1], [-2.0]) is None
+
+
+def test_a_runge_kutta_step_spans_all_of_its_stages():
+    """They meet the surface at gaps of 0, 2 and 4 mm, at 2 m/s and 2 ms; the window reaches from -2 to 6 mm."""
+    ball = BALL.format(h=0.002).replace("<option", '<option integrator="RK4"')
+    for gap, is_event in ((-1.9e-3, True), (5.9e-3, True), (-2.1e-3, False), (6.1e-3, False)):
+        assert (_events(ball, [gap - 0.1], [-2.0]) is not None) == is_event
+    found = _compared(mg.load_scene(ball), 0, (0.0, 0.03), 120, [-2.0], read=1)
+    np.testing.assert_allclose(found.mean[0, 1], found.slope[1], atol=0.02)
