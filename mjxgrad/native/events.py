@@ -12,8 +12,8 @@ q±_i is the present position moved along P_i until its gap is ±w_i. So D_i hol
 each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
 of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
-- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. The window about -hv/2 of twice the
-  travel holds all of them, and a crossing is met by two steps, each with half the weight.
+- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way, and is in contact with all of them or
+  none at the ends of a window about -hv/2. That window stands in for the one about zero.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
@@ -74,7 +74,7 @@ class Surfaces:
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
-        spanned = 2.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
+        spanned = 1.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
         travel = spanned * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
@@ -98,8 +98,8 @@ class Surfaces:
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            # Its stages meet the surface at gaps of 0, -hv/2 and -hv. What spans all three spans two steps' travel.
-            widths, centres = 2 * widths, -0.5 * self.timestep * rate
+            # Its stages meet the surface at gaps of 0, -hv/2 and -hv.
+            centres = -0.5 * self.timestep * rate
         widths = np.maximum(widths, least)
         chosen = (np.abs(gaps - centres) < widths) & jumps
         if not chosen.any():

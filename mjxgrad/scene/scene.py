@@ -137,7 +137,8 @@ class Scene(eqx.Module):
             if is_known(value) and np.isnan(value).any():
                 raise ValueError(f"{name} must hold numbers, got NaN")
             if is_known(value) and (
-                (name in _NOT_NEGATIVE and (value < 0).any()) or (name == "timestep" and value == 0)
+                (name in _NOT_NEGATIVE and (np.asarray(value) < 0).any())
+                or (name == "timestep" and not np.asarray(value).all())
             ):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {np.asarray(value).min():g}")
