@@ -359,7 +359,8 @@ def _ball_limit(model: mjx.Model, data: mjx.Data, joints: np.ndarray) -> tuple[R
     quaternion = data.qpos[model.jnt_qposadr[joints][:, None] + np.arange(4)]
     turn = spatial.logarithm(quaternion / safe_norm(quaternion)[:, None])
     angle = safe_norm(turn)
-    axis = turn / jnp.where(angle > 0, angle, 1.0)[:, None]
+    # Without an axis there is no limit near; a smaller angle, squared, is nothing in single precision.
+    axis = turn / jnp.where(angle > 1e-12, angle, 1.0)[:, None]
     select = np.zeros((len(joints), 3, model.nv))
     select[np.arange(len(joints))[:, None], np.arange(3), model.jnt_dofadr[joints][:, None] + np.arange(3)] = 1
     rows = DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1))
