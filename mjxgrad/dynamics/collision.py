@@ -42,8 +42,6 @@ CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
-# In m.
-_ON_AXIS = 1e-12
 # How much sooner a ball outside an edge is too far from it to be pushed by both faces.
 _ROUND_EDGES = 4.0
 
@@ -212,8 +210,7 @@ def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> caps
     away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
     centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
     radius = safe_norm(centre[:, :2])
-    # Nearer to it than this a turn about the axis is none, and its derivative overflows.
-    on_axis = (radius < _ON_AXIS)[:, None]
+    on_axis = (radius < 1e-12)[:, None]  # m; nearer to it a turn about it is none, and its derivative overflows
     radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
     # In the half-plane of axis and centre: across, along.
     beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]

@@ -40,8 +40,6 @@ _PerRow = Float[Array, "rows *batch"]
 _PerContact = Float[Array, "contacts *batch"]
 _Directions = Float[Array, "contacts dim *batch"]
 _Columns = Float[Array, "contacts dim columns *batch"]
-# In m/s².
-_LEAST_SLIP = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,8 +263,7 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     group, scale = layout.cones[which], rows.scales[which]
     u = _blocks(group, x) * scale
     square = sum_of_few(u[:, 1:] ** 2)[:, 0]
-    # Slower is rest, without a direction whose derivative could overflow.
-    slides = square > _LEAST_SLIP**2
+    slides = square > 1e-24  # m²/s⁴; less is rest, without a direction whose derivative could overflow
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
     mu, normal = scale[:, 0], u[:, 0]
     stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))

@@ -136,25 +136,14 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
     weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
     spin, angular, moved = _accelerations(model, data, points, bodies)
-    drift = jnp.concatenate([moved[:, 0] - moved[:, 1], scale * _twist(back, first, spin, angular)], axis=1)
+    # With q' = ω q / 2 the rate of q₂* q₁ is q₂* (ω₁ - ω₂) q₁ / 2, and that once more:
+    own, other, change = (jnp.pad(x, ((0, 0), (1, 0))) for x in (spin[:, 0], spin[:, 1], angular[:, 0] - angular[:, 1]))
+    change += 0.5 * (spatial.multiply(own - other, own) - spatial.multiply(other, own - other))
+    twist = 0.5 * scale * spatial.multiply(spatial.multiply(back, change), first)[:, 1:]
+    drift = jnp.concatenate([moved[:, 0] - moved[:, 1], twist], axis=1)
     jacobian = jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1)
     residual = jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1)
     return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1), drift)
-
-
-def _twist(
-    back: Float[Array, "constraints 4"], first: Float[Array, "constraints 4"], spin: _Ends, angular: _Ends
-) -> Float[Array, "constraints 3"]:
-    """Return the second derivative of the vector part of q₂* q₁ while no joint accelerates.
-
-    With q' = ω q / 2 the first is that of q₂* (ω₁ - ω₂) q₁ / 2.
-    """
-    own, other, relative, change = (
-        jnp.pad(x, ((0, 0), (1, 0)))
-        for x in (spin[:, 0], spin[:, 1], spin[:, 0] - spin[:, 1], angular[:, 0] - angular[:, 1])
-    )
-    turned = spatial.multiply(relative, own) - spatial.multiply(other, relative)
-    return 0.5 * spatial.multiply(spatial.multiply(back, change + 0.5 * turned), first)[:, 1:]
 
 
 def _polynomial(

@@ -106,11 +106,8 @@ def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION:
         return mended.fwd_actuation(model, data)
     if not _is_plain(model):
-        return (
-            _with_tendon_limits(model, data)
-            if np.any(model.tendon_actfrclimited)
-            else mended.fwd_actuation(model, data)
-        )
+        find = _with_tendon_limits if np.any(model.tendon_actfrclimited) else mended.fwd_actuation
+        return find(model, data)
     control = data.ctrl
     if not model.opt.disableflags & _Disable.mjDSBL_CLAMPCTRL:
         control = _clamp(control, model.actuator_ctrllimited, model.actuator_ctrlrange)
@@ -126,10 +123,8 @@ def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _with_tendon_limits(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find forces of which those on a tendon are limited together: MJX divides by their sum, though it be zero."""
     tendons = np.flatnonzero(model.tendon_actfrclimited)
-    unlimited = model.replace(tendon_actfrclimited=np.zeros_like(model.tendon_actfrclimited))
-    data = mended.fwd_actuation(
-        unlimited.replace(actuator_forcelimited=np.zeros_like(model.actuator_forcelimited)), data
-    )
+    limits = ("tendon_actfrclimited", "actuator_forcelimited")
+    data = mended.fwd_actuation(model.replace(**{x: np.zeros_like(getattr(model, x)) for x in limits}), data)
     pulls = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON) & (model.actuator_trnid[:, 0] == tendons[:, None])
     total = contract("tu,u->t", jnp.asarray(pulls, data.actuator_force.dtype), data.actuator_force)
     least, most = model.tendon_actfrcrange[tendons].T

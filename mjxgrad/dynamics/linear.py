@@ -71,24 +71,23 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
 
-def batch_last(function: Callable, batch: int | None = None) -> Callable:
+def batch_last(function: Callable) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank. `batch` is for the recursion,
-    the size of the trailing axis that the arguments have already.
+    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank.
     """
 
     def flat(*args: PyTree) -> PyTree:
         # Leaves alone: the forward mode of `custom_vmap` takes a None among its arguments for an array (jax 0.10.2), and
         # `jax.hessian` is forward mode under `jax.vmap`.
         leaves, structure = jax.tree.flatten(args)
-        return _batch_last(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), batch)(*leaves)
+        return _batch_last(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), None)(*leaves)
 
     return flat
 
 
 def _batch_last(function: Callable, batch: int | None) -> Callable:
-    """Return what `batch_last` does for a function of arrays."""
+    """Return what `batch_last` does for a function of arrays; `batch` is the size of the trailing axis that they have."""
     # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
     # `jax.lax.cond` asks for where its condition differs between members of the batch.
     batched = jax.custom_batching.custom_vmap(jax.jit(function))

@@ -21,14 +21,14 @@ from types import ModuleType
 
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import COLLISION_FUNCTIONS as _COLLISION_FUNCTIONS
 from mjxgrad.dynamics import spatial, wrapping
 
 _Scalar = Float[Array, "..."]
-_Point = Float[Array, "3"]
+_Point, _Points = Float[Array, "3"], Float[Array, "_ 3"]
 # In m² of an edge's length times a distance from a plane: less is rounding, in either precision.
 _PARALLEL = 1e-12
 
@@ -39,50 +39,39 @@ def _copy(name: str, **replaced: Callable | ModuleType) -> ModuleType:
     Raises:
         ImportError: if the module has no such name: then this is not the MJX that was mended.
     """
-    spec = importlib.util.find_spec(f"mujoco.mjx._src.{name}")
-    if spec is None or spec.loader is None:
-        raise ImportError(f"mujoco.mjx must have a module {name}: install mujoco-mjx 3.17")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    spec = sys.modules[f"mujoco.mjx._src.{name}"].__spec__
+    module = importlib.util.module_from_spec(spec)  # pyright: ignore[reportArgumentType]
+    spec.loader.exec_module(module)  # pyright: ignore[reportOptionalMemberAccess]
     if missing := replaced.keys() - vars(module).keys():
         raise ImportError(f"MJX's {name} must have {', '.join(sorted(missing))}: install mujoco-mjx 3.17")
     vars(module).update(replaced)
     return module
 
 
-def _away_from(least: float, x: _Scalar, instead: float) -> _Scalar:
-    """Return a denominator, and something else in place of one that is too small."""
-    return jnp.where(jnp.abs(x) >= least, x, instead)
+def _divisor(x: _Scalar) -> _Scalar:
+    """Return what to divide by, where MJX does so by anything but zero."""
+    return jnp.where(jnp.abs(x) >= _PARALLEL, x, 1e-6)
 
 
 def _closest_segment_point_plane(a: _Point, b: _Point, p0: _Point, plane_normal: _Point) -> _Point:
-    """Return where a segment meets a plane, or else its end that is nearer; of a parallel one some point."""
+    """Return where a segment meets a plane, or its nearer end; of a parallel one some point."""
     along = jnp.sum(plane_normal * (b - a))
-    share = (jnp.sum(p0 * plane_normal) - jnp.sum(plane_normal * a)) / _away_from(_PARALLEL, along, 1e-6)
+    share = (jnp.sum(p0 * plane_normal) - jnp.sum(plane_normal * a)) / _divisor(along)
     return a + jnp.clip(share, 0, 1) * (b - a)
 
 
-def _project_poly_onto_poly_plane(
-    poly1: Float[Array, "n 3"], norm1: _Point, poly2: Float[Array, "m 3"], norm2: _Point
-) -> Float[Array, "n 3"]:
+def _project_poly_onto_poly_plane(poly1: _Points, norm1: _Point, poly2: _Points, norm2: _Point) -> _Points:
     """Return the first polygon moved along its normal onto the plane of the second."""
-    along = _away_from(_PARALLEL, norm1.dot(norm2), 1e-6)
-    return poly1 + ((poly2[0].dot(norm2) - poly1.dot(norm2)) / along).reshape(-1, 1) * norm1
+    way = (poly2[0].dot(norm2) - poly1.dot(norm2)) / _divisor(norm1.dot(norm2))
+    return poly1 + way.reshape(-1, 1) * norm1
 
 
-def _muscle_dynamics_timescale(
-    dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Scalar, smoothing_width: _Scalar
-) -> _Scalar:
+def _muscle_dynamics_timescale(dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Scalar, width: _Scalar) -> _Scalar:
     """Return the time constant of a muscle (s), which switches at once or within a width of the control."""
-    is_hard = smoothing_width < mujoco.mjMINVAL
-    x = jnp.clip(dctrl / jnp.where(is_hard, 1.0, smoothing_width) + 0.5, 0, 1)
+    is_hard = width < mujoco.mjMINVAL
+    x = jnp.clip(dctrl / jnp.where(is_hard, 1.0, width) + 0.5, 0, 1)
     smooth = tau_deact + (tau_act - tau_deact) * (x * x * x * (3 * x * (2 * x - 5) + 10))
     return jnp.where(is_hard, jnp.where(dctrl > 0, tau_act, tau_deact), smooth)
-
-
-def _quat_to_axis_angle(q: Float[Array, "4"]) -> tuple[_Point, float]:
-    """Return axis times angle, and one: nothing in these modules asks for more than the product of both."""
-    return spatial.logarithm(q), 1.0
 
 
 def _safe_div(num: _Scalar, den: _Scalar) -> _Scalar:
@@ -93,16 +82,13 @@ def _safe_div(num: _Scalar, den: _Scalar) -> _Scalar:
 def _ray_quad(a: _Scalar, b: _Scalar, c: _Scalar) -> tuple[_Scalar, _Scalar]:
     """Return the solutions of a x² + 2 b x + c = 0 that are not negative, infinity in place of others."""
     square = b * b - a * c
-    root = safe_sqrt(square)
-
-    def kept(x: _Scalar, is_real: Bool[Array, "..."]) -> _Scalar:
-        return jnp.where(is_real & (x >= 0), x, jnp.inf)
-
-    is_real = square >= mujoco.mjMINVAL
-    return kept(_safe_div(-b - root, a), is_real), kept(_safe_div(-b + root, a), is_real)
+    is_real, root = square >= mujoco.mjMINVAL, safe_sqrt(square)
+    found = (_safe_div(-b - root, a), _safe_div(-b + root, a))
+    return tuple(jnp.where(is_real & (x >= 0), x, jnp.inf) for x in found)  # pyright: ignore[reportReturnType]
 
 
-_math = _copy("math", quat_to_axis_angle=_quat_to_axis_angle, safe_div=_safe_div)
+# Nothing in these modules asks for more than the product of axis and angle.
+_math = _copy("math", quat_to_axis_angle=lambda q: (spatial.logarithm(q), 1.0), safe_div=_safe_div)
 _support = _copy(
     "support", muscle_dynamics_timescale=_muscle_dynamics_timescale, _length_circle=wrapping.arc_length, math=_math
 )

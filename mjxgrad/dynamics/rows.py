@@ -63,8 +63,8 @@ class Block(eqx.Module):
 def joined(blocks: list[Block]) -> Block:
     """Return all rows as one block; which of them begin and end together it no longer says."""
     if any(block.drift is not None for block in blocks):
-        still = [jnp.zeros_like(block.residual) if block.drift is None else block.drift for block in blocks]
-        blocks = [dataclasses.replace(block, drift=drift) for block, drift in zip(blocks, still, strict=True)]
+        still = [jnp.zeros_like(x.residual) if x.drift is None else x.drift for x in blocks]
+        blocks = [dataclasses.replace(x, drift=drift) for x, drift in zip(blocks, still, strict=True)]
     leaves = {
         field.name: jax.tree.map(lambda *x: jnp.concatenate(x), *(getattr(block, field.name) for block in blocks))
         for field in dataclasses.fields(Block)
@@ -79,10 +79,8 @@ def law(model: mjx.Model, qvel: Float[Array, " nv"], block: Block) -> tuple[_Per
     rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
     present = block.impedance.present
-    reference = -damping * rate - stiffness * present * residual
-    if block.drift is not None:
-        reference -= jnp.where(block.is_active, block.drift, 0.0)
-    return reference, weight_of(block, present)
+    drift = 0.0 if block.drift is None else jnp.where(block.is_active, block.drift, 0.0)
+    return -damping * rate - stiffness * present * residual - drift, weight_of(block, present)
 
 
 def weight_of(block: Block, impedance: _PerRow) -> _PerRow:

@@ -1,8 +1,7 @@
 """Tendons on spheres and cylinders: where they touch, and how long they are on them.
 
-MJX has this, with three faults. Its square roots have no derivative where a tendon's end lies on the axis, so that the tendon's
-is NaN though it touches nothing. The angle of an arc is an arccosine, NaN where rounding makes the cosine of a short arc one.
-And for a tendon inside a ring it takes five steps of a search that needs up to twenty.
+MJX has this, with three faults. A tendon whose end lies on the axis has a derivative of NaN, by a square root. So has a short
+arc, by an arccosine of what rounding makes one. And inside a ring five steps of a search are taken that needs up to twenty.
 
 A tendon that passes through a ring (its sidesite lies within) bends, unless its straight line passes too, at the point e of the
 ring where the way is shortest. There a/|a - e| + b/|b - e|, with a and b its ends, points along e. That point is bracketed as
@@ -22,26 +21,12 @@ from mjxgrad.dynamics.spatial import normalise
 
 _Point = Float[Array, "3"]
 _Scalar = Float[Array, ""]
-_Truth = Bool[Array, ""]
-# Twice the digits that Newton's first step needs.
 _HALVINGS = 40
 # Slope, a pure number of order one, from which on a tendon only just touches the ring: the point has no derivative there.
 _FLAT = 1e-6
 
 
-def wrap(
-    wrap_circle: Callable,
-    x0: _Point,
-    x1: _Point,
-    xpos: _Point,
-    xmat: Float[Array, "3 3"],
-    size: _Scalar,
-    side: _Point,
-    has_side: Bool[Array, "1"],
-    is_sphere: _Truth,
-    is_inside: bool,
-    *_,
-) -> tuple[Float[Array, "1"], _Point, _Point]:
+def wrap(wrap_circle: Callable, x0, x1, xpos, xmat, size, side, has_side, is_sphere, is_inside: bool, *_):
     """Return the length on a geom, -1 where the tendon does not touch it, and where it begins and ends there.
 
     In place of MJX's `support.wrap`, with its arguments after the first; that is MJX's wrap round a circle in the plane.
@@ -94,7 +79,7 @@ def arc_length(p0: Float[Array, "2"], p1: Float[Array, "2"], ind: Array, rad: _S
     return rad * jnp.where(across < 0, angle + 2 * jnp.pi, angle)
 
 
-def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[_Truth, _Point]:
+def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[Bool[Array, ""], _Point]:
     """Return whether a tendon inside a ring touches it, and where: at a point of the plane of both ends and the centre."""
     does_touch = _bends(*jax.lax.stop_gradient((a, b, radius)))
     # Elsewhere a case that has a solution, so that nothing is divided by zero.
@@ -128,13 +113,10 @@ def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[_Truth, _Point]:
     return does_touch, radius * at(share)
 
 
-def _bends(a: _Point, b: _Point, radius: _Scalar) -> _Truth:
+def _bends(a: _Point, b: _Point, radius: _Scalar) -> Bool[Array, ""]:
     """Return whether both ends lie outside the ring and their straight line does not meet it."""
     apart = b - a
     square = jnp.sum(apart**2)
     share = -(apart @ a) / jnp.maximum(square, mujoco.mjMINVAL)
-    nearest = safe_norm(a + share * apart)
-    misses = (square <= mujoco.mjMINVAL) | (share <= 0) | (share >= 1) | (nearest > radius)
-    ends = jnp.stack([safe_norm(a), safe_norm(b)])
-    is_opposite = a @ b < (mujoco.mjMINVAL - 1) * ends[0] * ends[1]
-    return misses & jnp.all(ends > radius) & (radius >= mujoco.mjMINVAL) & ~is_opposite
+    misses = (share <= 0) | (share >= 1) | (safe_norm(a + share * apart) > radius)
+    return misses & (safe_norm(a) > radius) & (safe_norm(b) > radius)

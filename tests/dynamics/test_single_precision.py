@@ -100,7 +100,8 @@ def test_contacts_of_nearly_symmetric_poses_have_both_derivatives(pair):
     right, left = (
         (x[..., 1] - there[:, None, 1]) / w for x, w in zip(_over_poses(*near), (width, -width), strict=True)
     )
-    assert np.isfinite(forward).all() and np.isfinite(reverse).all()
+    assert np.isfinite(forward).all()
+    assert np.isfinite(reverse).all()
     scale = 1 + np.abs(forward).max(axis=(1, 2), keepdims=True)
     # Sums of some hundred terms, each rounded to 1e-7 of the largest; a rim's point turns by 1e7 radians for one of tilt.
     np.testing.assert_allclose(forward / scale, reverse / scale, atol=2e-2 if pair == ("plane", "cylinder") else 2e-5)
@@ -145,7 +146,9 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
     <site name="missing" pos="0 1.2 .04" euler="0 90 0"/>
 </worldbody>
 <tendon>
-  <fixed name="sum" stiffness="50" damping="1" range="-.1 .1" limited="true" actuatorfrclimited="true" actuatorfrcrange="-1 1"><joint joint="push" coef="1"/><joint joint="drag" coef="-.5"/></fixed>
+  <fixed name="sum" stiffness="50" damping="1" range="-.1 .1"
+    limited="true" actuatorfrclimited="true" actuatorfrcrange="-1 1"><joint joint="push" coef="1"/>
+    <joint joint="drag" coef="-.5"/></fixed>
   <fixed name="slack" stiffness="50" springlength="-.05 .05"><joint joint="drag" coef="1"/></fixed>
   <spatial name="string" stiffness="20" frictionloss=".1"><site site="bob"/><site site="on_ball"/><pulley divisor="2"/>
     <site site="tip"/><site site="on_ball"/></spatial>
@@ -161,7 +164,8 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
     <intvelocity joint="slide" kp="5" actrange="-1 1"/>
   <damper joint="hinge" kv="2" ctrlrange="0 1"/><cylinder joint="slide" timeconst=".1" area=".1"/>
     <muscle joint="elbow" lengthrange="-1 1"/>
-  <general joint="arm" dyntype="filterexact" dynprm=".01" gaintype="affine" gainprm="1 .1 .1" biastype="affine" biasprm="0 -1 -.1"/>
+  <general joint="arm" dyntype="filterexact" dynprm=".01" gaintype="affine" gainprm="1 .1 .1"
+    biastype="affine" biasprm="0 -1 -.1"/>
   <position joint="ball" gear="1 0 .3" kp="2"/><position jointinparent="free_ball" gear="0 1 .2" kp="2"/>
   <position site="turned" refsite="world" gear="0 0 0 1 .2 0" kp="2"/>
     <position site="pushed" refsite="world" gear="1 0 .5 0 0 0" kp="2"/>
@@ -258,7 +262,8 @@ def test_a_step_of_nearly_everything_has_both_derivatives(has_rows):
 
         fields = (np.stack([getattr(data, name) for data in states]) for name in ("qpos", "qvel", "ctrl", "act"))
         slopes, reverse = jax.jit(jax.vmap(both))(*(jnp.asarray(x, jnp.float32) for x in fields))
-    assert np.isfinite(slopes).all() and np.isfinite(reverse).all()
+    assert np.isfinite(slopes).all()
+    assert np.isfinite(reverse).all()
     forward = np.asarray(weights, float) @ np.asarray(slopes, float)
     np.testing.assert_allclose(reverse, forward, rtol=1e-4, atol=1e-4 * np.abs(forward).max())
     for start, found in zip(states, slopes, strict=True):
