@@ -1,7 +1,6 @@
 """Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order.
 
-Points of turning bodies accelerate while no joint does, and so does the turn of one body against another: J̇ v, which connect and
-weld take off the acceleration that they ask for. Without it, as in MJX, welded bodies that tumble drift apart.
+Connect and weld ask for J̇ v less, by which points and turns of moving bodies accelerate while no joint does. MJX lacks it.
 """
 
 import jax

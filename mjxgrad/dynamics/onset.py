@@ -289,7 +289,7 @@ def _normal(block: Block, rates: Float[Array, "contacts each"]) -> _PerContact:
 
 def _is_slow(rate: _PerContact, speed: Float[Array, "..."]) -> _PerContact:
     """Return 1 for what is much slower than a speed, and 0 for impacts."""
-    # Their ratio: in single precision a fourth power of 1e-6 m/s, squared, is nothing, and the derivative NaN.
+    # By their ratio: the square of a fourth power, of 1e-6 m/s, is nothing in single precision.
     is_impact = jnp.abs(rate) >= _IMPACT * speed
     ratio = jnp.where(is_impact, 0.0, rate) / jnp.where(is_impact, 1.0, speed)
     return jnp.where(is_impact, 0.0, 1 / (1 + ratio**4))

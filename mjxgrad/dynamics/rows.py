@@ -1,8 +1,7 @@
 """Constraint rows, kind by kind: contacts, limits and friction loss; `equality` has the others.
 
 A row has residual r, rate J v, and asks for a_ref = -B J v - K d(r) r, with weight D = d / ((1 - d) Â), Â the inverse inertia
-of the row estimated at the reference pose. Where bodies are held together it asks for J̇ v less: points of turning bodies
-accelerate without joint accelerations. That is C MuJoCo's; MJX lacks it.
+of the row estimated at the reference pose. Where bodies are held together it asks for J̇ v less, as in C MuJoCo.
 """
 
 import dataclasses
