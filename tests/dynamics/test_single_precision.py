@@ -258,8 +258,10 @@ def test_a_step_of_nearly_everything_has_both_derivatives(has_rows):
         weights = jnp.cos(jnp.arange(float(model.nv + model.na + model.nsensordata)))
 
         def both(*start):
-            motion = jnp.zeros(size)
-            return jax.jacfwd(outcome)(motion, *start), jax.grad(lambda x: weights @ outcome(x, *start))(motion)
+            end, push = jax.linearize(lambda motion: outcome(motion, *start), jnp.zeros(size))
+            return jax.vmap(push, out_axes=1)(jnp.eye(size)), jax.linear_transpose(push, jnp.zeros(size))(
+                weights.astype(end.dtype)
+            )[0]
 
         fields = (np.stack([getattr(data, name) for data in states]) for name in ("qpos", "qvel", "ctrl", "act"))
         slopes, reverse = jax.jit(jax.vmap(both))(*(jnp.asarray(x, jnp.float32) for x in fields))
