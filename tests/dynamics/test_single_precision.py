@@ -12,7 +12,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import kinematics, spatial
+from mjxgrad.dynamics import kinematics, onset, spatial
 from mjxgrad.dynamics.collision import collide
 
 _SHAPES = {
@@ -274,3 +274,18 @@ def test_a_step_of_nearly_everything_has_both_derivatives(has_rows):
         # Rounding of single precision, through weights and stiffness of some thousand.
         close = 2e-3 * (1 + np.abs(least).max(axis=1, keepdims=True))
         assert ((found > least - close) & (found < greatest + close)).all()
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-6, 0.1])
+def test_how_slow_an_approach_is_has_a_derivative_at_any_rate(speed):
+    """1 / (1 + x⁴) has -4 x³ / (1 + x⁴)², x the rate as a multiple of the speed; zero where all rates are beyond it."""
+    rates = np.array([0.0, *(10.0**k for k in range(-25, 4))])
+    with jax.enable_x64(False):
+        rate = jnp.asarray(rates, jnp.float32)
+        _, pull = jax.vjp(lambda rate: onset._is_slow(rate, jnp.float32(speed)), rate)
+        found = pull(jnp.ones_like(rate))[0]
+    x = np.minimum(rates / speed, 1e3) if speed else np.full_like(rates, 1e3)
+    # From 1000 times the speed on it is zero in place of 1e-12.
+    np.testing.assert_allclose(
+        found, np.where(x < 1e3, -4 * x**3 / (1 + x**4) ** 2, 0) / (speed or 1), rtol=1e-4, atol=1e-8
+    )
