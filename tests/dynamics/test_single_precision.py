@@ -110,7 +110,8 @@ def test_contacts_of_nearly_symmetric_poses_have_both_derivatives(pair):
     # Rounding of a double over the width is 1e-10, single precision 1e-6 of numbers up to ten.
     is_between = (found > np.minimum(left, right) - 1e-3) & (found < np.maximum(left, right) + 1e-3)
     is_right = is_between | (np.abs(found - slope[:, 1]) < 1e-3)
-    assert is_same.mean() > 0.6
+    # Of a pyramid, and of a grid of prisms, more points are equally near than of a box.
+    assert is_same.mean() > (0.3 if {"mesh", "hfield"} & {*pair} else 0.6)
     # MJX moves a face's point by a micrometre where it clips it, which precisions may decide otherwise.
     assert is_right[is_same].all(axis=1).mean() > 0.98
 
