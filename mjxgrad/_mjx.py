@@ -25,14 +25,18 @@ try:
         from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
         from mujoco.mjx._src.constraint import counts, make_efc_address, make_efc_type
         from mujoco.mjx._src.math import make_frame
+        from mujoco.mjx._src.passive import _fluid as fluid_force
+        from mujoco.mjx._src.passive import _gravcomp as compensate_gravity
 finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 __all__ = [
     "COLLISION_FUNCTIONS",
+    "compensate_gravity",
     "contact_groups",
     "counts",
     "custom_number",
+    "fluid_force",
     "geom_groups",
     "geom_pairs",
     "has_collision_fn",

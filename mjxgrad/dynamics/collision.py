@@ -25,9 +25,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mjxgrad._arrays import safe_norm
-from mjxgrad._mjx import COLLISION_FUNCTIONS, contact_groups, custom_number, geom_groups, make_frame, mjx
+from mjxgrad._mjx import contact_groups, custom_number, geom_groups, make_frame, mjx
 from mjxgrad.dynamics import capsules, maps
 from mjxgrad.dynamics.maps import contract, dot, pick
+from mjxgrad.dynamics.mended import COLLISION_FUNCTIONS
 
 _PerPair = Float[Array, " pairs"]
 _Frames = Float[Array, "pairs 3 3"]
@@ -41,7 +42,6 @@ CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """What has no bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
-
 # How much sooner a ball outside an edge is too far from it to be pushed by both faces.
 _ROUND_EDGES = 4.0
 
@@ -210,7 +210,7 @@ def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> caps
     away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
     centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
     radius = safe_norm(centre[:, :2])
-    on_axis = (radius == 0)[:, None]
+    on_axis = (radius < 1e-12)[:, None]  # m; nearer to it a turn about it is none, and its derivative overflows
     radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
     # In the half-plane of axis and centre: across, along.
     beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]

@@ -263,7 +263,7 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     group, scale = layout.cones[which], rows.scales[which]
     u = _blocks(group, x) * scale
     square = sum_of_few(u[:, 1:] ** 2)[:, 0]
-    slides = square > 0
+    slides = square > 1e-24  # m²/s⁴; less is rest, without a direction whose derivative could overflow
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
     mu, normal = scale[:, 0], u[:, 0]
     stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))

@@ -1,4 +1,7 @@
-"""Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order."""
+"""Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order.
+
+Connect and weld ask for J̇ v less, by which points and turns of moving bodies accelerate while no joint does. MJX lacks it.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ from jaxtyping import Array, Float
 from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.law import impedance
-from mjxgrad.dynamics import spatial, tree
+from mjxgrad.dynamics import kinematics, maps, spatial, tree
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.rows import Block, contact_jacobian, per_row
 
@@ -36,6 +39,7 @@ def _block(
     jacobian: Float[Array, "constraints k nv"],
     residual: Float[Array, "constraints k"],
     inverse_weight: Float[Array, "constraints k"],
+    drift: Float[Array, "constraints k"] | None = None,
 ) -> Block:
     """Return the rows of constraints with k rows each, whose impedance follows the norm of their residual."""
     each = residual.shape[1]
@@ -51,6 +55,7 @@ def _block(
         margin=zero,
         friction_loss=zero,
         is_active=per_row(jnp.asarray(data.eq_active)[ids] != 0, each),
+        drift=None if drift is None else drift.reshape(-1),
     )
 
 
@@ -86,11 +91,24 @@ def _translation(
     return first - second
 
 
+def _accelerations(model: mjx.Model, data: mjx.Data, points: _Ends, bodies: np.ndarray) -> tuple[_Ends, _Ends, _Ends]:
+    """Return angular velocities, angular accelerations and accelerations of both ends while no joint accelerates."""
+    data = kinematics.com_vel(model, data)
+    of_bodies = maps.combine(tree.moving_dofs(model), maps.scale(data.qvel, data.cdof_dot))
+    lever = points - data.subtree_com[model.body_rootid[bodies]]
+    spin, speed = jnp.split(data.cvel[bodies], 2, axis=-1)
+    angular, linear = jnp.split(of_bodies[bodies], 2, axis=-1)
+    speed = speed + jnp.cross(spin, lever)
+    return spin, angular, linear + jnp.cross(angular, lever) + jnp.cross(spin, speed)
+
+
 def _connect(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     points = _points(model, data, ids, model.eq_data[ids][:, :6].reshape(-1, 2, 3))
     bodies = _ends(model, ids)[2]
     weight = jnp.repeat(jnp.sum(model.body_invweight0[bodies, 0], axis=1)[:, None], 3, axis=1)
-    return _block(model, data, ids, _translation(model, data, points, bodies), points[:, 0] - points[:, 1], weight)
+    moved = _accelerations(model, data, points, bodies)[2]
+    jacobian, residual = _translation(model, data, points, bodies), points[:, 0] - points[:, 1]
+    return _block(model, data, ids, jacobian, residual, weight, moved[:, 0] - moved[:, 1])
 
 
 def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
@@ -116,9 +134,15 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     rate = spatial.multiply(spatial.multiply(back[:, None], axis), first[:, None])[..., 1:]
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
     weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
+    spin, angular, moved = _accelerations(model, data, points, bodies)
+    # With q' = ω q / 2 the rate of q₂* q₁ is q₂* (ω₁ - ω₂) q₁ / 2, and that once more:
+    own, other, change = (jnp.pad(x, ((0, 0), (1, 0))) for x in (spin[:, 0], spin[:, 1], angular[:, 0] - angular[:, 1]))
+    change += 0.5 * (spatial.multiply(own - other, own) - spatial.multiply(other, own - other))
+    twist = 0.5 * scale * spatial.multiply(spatial.multiply(back, change), first)[:, 1:]
+    drift = jnp.concatenate([moved[:, 0] - moved[:, 1], twist], axis=1)
     jacobian = jnp.concatenate([_translation(model, data, points, bodies), rate], axis=1)
     residual = jnp.concatenate([points[:, 0] - points[:, 1], error], axis=1)
-    return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1))
+    return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1), drift)
 
 
 def _polynomial(

@@ -4,14 +4,13 @@ Drop-ins for MJX's stages. Whatever a model has beyond actuators of hinges and s
 and dampers, is left to MJX: each function says what.
 """
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import cholesky, kinematics, maps, spatial, tree
+from mjxgrad._mjx import compensate_gravity, fluid_force, mjx
+from mjxgrad.dynamics import cholesky, kinematics, maps, mended, spatial, tree
 from mjxgrad.dynamics.maps import contract, pick
 
 _Disable = mujoco.mjtDisableBit
@@ -19,8 +18,6 @@ _Joint = mujoco.mjtJoint
 _ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _ON_AXES = (_Joint.mjJNT_HINGE, _Joint.mjJNT_SLIDE)
 _BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-# MJX's norm counts as zero where every entry is below this (the absolute tolerance of `allclose`).
-_CUT_OFF = 1e-8
 
 
 def _drives_axes(model: mjx.Model) -> bool:
@@ -33,7 +30,7 @@ def _drives_axes(model: mjx.Model) -> bool:
 def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find lengths and moments of actuators; as `mjx.transmission`, to which all but hinges and slides are left."""
     if not model.nu or not _drives_axes(model):
-        return mjx.transmission(model, data)
+        return mended.transmission(model, data)
     gear, joint = model.actuator_gear[:, 0], model.actuator_trnid[:, 0]
     drives = (model.jnt_dofadr[joint][:, None] == np.arange(model.nv)).astype(float)
     length = gear * pick(model.jnt_qposadr[joint], data.qpos)
@@ -50,24 +47,38 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         rate = contract("tv,v->t", data._impl.ten_J, data.qvel)
         data = data.tree_replace({"_impl.ten_velocity": rate})  # pyright: ignore[reportAssignmentType]
     data = kinematics.rne(model, passive(model, kinematics.com_vel(model, data)))
-    return mjx.tendon_bias(model, data) if model.ntendon else data
+    return mended.tendon_bias(model, data) if model.ntendon else data
 
 
 def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find spring and damper forces; a drop-in for `mjx.passive` whose springs have their derivative at rest.
 
-    Tendons, gravity compensation and media are left to MJX.
+    Gravity compensation and media are left to MJX.
     """
     flags = model.opt.disableflags
-    compensates = model.flg_gravcomp and not flags & _Disable.mjDSBL_GRAVITY
-    if model.ntendon or compensates or model.opt._impl.has_fluid_params:
-        return _restore_derivative(model, mjx.passive(model, data))
     none = jnp.zeros_like(data.qvel)
-    # MJX leaves out both where either is disabled.
+    # MJX leaves out all where either is disabled.
     if flags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
         return data.replace(qfrc_passive=none, qfrc_gravcomp=none)
     force = _springs(model, data.qpos) - model.dof_damping * data.qvel
-    return data.replace(qfrc_passive=force, qfrc_gravcomp=none)
+    if model.ntendon:
+        force += contract("tv,t->v", data._impl.ten_J, _tendon_forces(model, data))
+    compensation = none
+    if model.flg_gravcomp and not flags & _Disable.mjDSBL_GRAVITY:
+        compensation = compensate_gravity(model, data)
+        force += compensation * (1 - model.jnt_actgravcomp[model.dof_jntid])
+    if model.opt._impl.has_fluid_params:
+        force += fluid_force(model, data)
+    return data.replace(qfrc_passive=force, qfrc_gravcomp=compensation)
+
+
+def _tendon_forces(model: mjx.Model, data: mjx.Data) -> Float[Array, " tendons"]:
+    """Return the pull of springs and dampers; at an end of the lengths without force the spring's derivative is one-sided."""
+    shortest, longest = model.tendon_lengthspring.T
+    # Not MJX's strict comparison: where both ends are one, that leaves a spring at rest without stiffness.
+    stretch = jnp.where(data.ten_length <= shortest, data.ten_length - shortest, 0.0)
+    stretch = jnp.where(data.ten_length >= longest, data.ten_length - longest, stretch)
+    return -model.tendon_stiffness * stretch - model.tendon_damping * data._impl.ten_velocity
 
 
 def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -87,33 +98,16 @@ def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]
     return jnp.concatenate(forces)
 
 
-def _restore_derivative(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Return data whose `qfrc_passive` has the derivative of rotational springs at their reference.
-
-    MJX writes the torque of a ball or free joint's spring with a norm that it cuts off near zero, and returns a derivative of
-    zero there, as if the spring had gone. The torque itself is zero at the reference, so adding the difference of the analytic
-    torque and its own frozen value restores the derivative and leaves the force.
-    """
-    free = model.jnt_type == _Joint.mjJNT_FREE
-    joints = np.nonzero(free | (model.jnt_type == _Joint.mjJNT_BALL))[0]
-    if not joints.size or model.opt.disableflags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
-        return data
-    addresses = (model.jnt_qposadr + 3 * free)[joints][:, None] + np.arange(4)
-    dofs = (model.jnt_dofadr + 3 * free)[joints][:, None] + np.arange(3)
-    turn = spatial.multiply(spatial.conjugate(model.qpos_spring[addresses]), data.qpos[addresses])
-    torque = -model.jnt_stiffness[joints][:, None] * spatial.logarithm(turn)
-    is_cut = jnp.all(jnp.abs(turn[:, 1:]) <= _CUT_OFF, axis=1, keepdims=True)
-    missing = jnp.where(is_cut, torque - jax.lax.stop_gradient(torque), 0.0)
-    return data.replace(qfrc_passive=data.qfrc_passive.at[dofs].add(missing))
-
-
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Find actuator forces; a drop-in for `mjx.fwd_actuation`.
 
     For motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
     """
-    if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION or not _is_plain(model):
-        return mjx.fwd_actuation(model, data)
+    if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION:
+        return mended.fwd_actuation(model, data)
+    if not _is_plain(model):
+        find = _with_tendon_limits if np.any(model.tendon_actfrclimited) else mended.fwd_actuation
+        return find(model, data)
     control = data.ctrl
     if not model.opt.disableflags & _Disable.mjDSBL_CLAMPCTRL:
         control = _clamp(control, model.actuator_ctrllimited, model.actuator_ctrlrange)
@@ -123,13 +117,34 @@ def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         constant, on_length, on_velocity = model.actuator_biasprm[:, :3].T
         bias = constant + on_length * data.actuator_length
         force += jnp.where(is_servo, bias + on_velocity * data._impl.actuator_velocity, 0.0)
+    return _actuated(model, data.replace(act_dot=jnp.zeros_like(data.act)), force)
+
+
+def _with_tendon_limits(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find forces of which those on a tendon are limited together: MJX divides by their sum, though it be zero."""
+    tendons = np.flatnonzero(model.tendon_actfrclimited)
+    limits = ("tendon_actfrclimited", "actuator_forcelimited")
+    data = mended.fwd_actuation(model.replace(**{x: np.zeros_like(getattr(model, x)) for x in limits}), data)
+    pulls = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON) & (model.actuator_trnid[:, 0] == tendons[:, None])
+    total = contract("tu,u->t", jnp.asarray(pulls, data.actuator_force.dtype), data.actuator_force)
+    least, most = model.tendon_actfrcrange[tendons].T
+    is_within = (total >= least) & (total <= most)
+    share = jnp.where(is_within, 1.0, jnp.clip(total, least, most) / jnp.where(is_within, 1.0, total))
+    force = data.actuator_force * jnp.prod(jnp.where(pulls, share[:, None], 1.0), axis=0)
+    return _actuated(model, data, force)
+
+
+def _actuated(model: mjx.Model, data: mjx.Data, force: Float[Array, " nu"]) -> mjx.Data:
+    """Return data with the forces of actuators within their limits, and what they do to joints within theirs."""
     force = _clamp(force, model.actuator_forcelimited, model.actuator_forcerange)
     total = contract("uv,u->v", data._impl.actuator_moment, force)
+    if model.flg_gravcomp:
+        total += data.qfrc_gravcomp * model.jnt_actgravcomp[model.dof_jntid]
     limited = model.jnt_actfrclimited
     if limited.any():
         bounds = pick(model.dof_jntid, model.jnt_actfrcrange)
         total = _clamp(total, limited[model.dof_jntid], bounds)
-    return data.replace(act_dot=jnp.zeros_like(data.act), actuator_force=force, qfrc_actuator=total)
+    return data.replace(actuator_force=force, qfrc_actuator=total)
 
 
 def _is_plain(model: mjx.Model) -> bool:

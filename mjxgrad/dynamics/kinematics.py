@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import maps, spatial, tree
+from mjxgrad.dynamics import maps, mended, spatial, tree
 from mjxgrad.dynamics.maps import combine, contract, pick
 from mjxgrad.dynamics.orientation import orientation
 
@@ -40,7 +40,7 @@ def up_to_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = com_pos(model, kinematics(model, data))
     if not model.ntendon:
         return crb(model, data)
-    return mjx.tendon_armature(model, crb(model, mjx.tendon(model, data)))
+    return mended.tendon_armature(model, crb(model, mended.tendon(model, data)))
 
 
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -71,28 +71,41 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
 
-def batch_last(function: Callable, batch: int | None = None) -> Callable:
+def batch_last(function: Callable) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank. `batch` is for the recursion,
-    the size of the trailing axis that the arguments have already.
+    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank.
     """
+
+    def flat(*args: PyTree) -> PyTree:
+        # Leaves alone: the forward mode of `custom_vmap` takes a None among its arguments for an array (jax 0.10.2), and
+        # `jax.hessian` is forward mode under `jax.vmap`.
+        leaves, structure = jax.tree.flatten(args)
+        return _batch_last(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), None)(*leaves)
+
+    return flat
+
+
+def _batch_last(function: Callable, batch: int | None) -> Callable:
+    """Return what `batch_last` does for a function of arrays; `batch` is the size of the trailing axis that they have."""
     # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
     # `jax.lax.cond` asks for where its condition differs between members of the batch.
     batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
     @batched.def_vmap
-    def rule(size, is_batched, *args):
+    def rule(size, is_batched, *leaves):
+        if not any(is_batched):  # asked for by the forward mode of `custom_vmap` where tangents alone are batched
+            result = function(*leaves)
+            return result, jax.tree.map(lambda _: False, result)
+
         def back(x: Array) -> Array:
             split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
             return jnp.moveaxis(split, -1, 0)
 
-        leaves, structure = jax.tree.flatten(args)
-        moved = _moved_last(leaves, jax.tree.leaves(tuple(is_batched)), size)
+        moved = _moved_last(list(leaves), list(is_batched), size)
         if batch is not None:
             moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
-        merged = jax.tree.unflatten(structure, moved)
-        result = batch_last(function, size if batch is None else batch * size)(*merged)
+        result = _batch_last(function, size if batch is None else batch * size)(*moved)
         return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
     return batched

@@ -1,7 +1,7 @@
 """Constraint rows, kind by kind: contacts, limits and friction loss; `equality` has the others.
 
 A row has residual r, rate J v, and asks for a_ref = -B J v - K d(r) r, with weight D = d / ((1 - d) Â), Â the inverse inertia
-of the row estimated at the reference pose.
+of the row estimated at the reference pose. Where bodies are held together it asks for J̇ v less, as in C MuJoCo.
 """
 
 import dataclasses
@@ -38,6 +38,7 @@ class Block(eqx.Module):
         margin: distance at which the row begins (m or rad).
         friction_loss: largest force of a friction loss row.
         is_active: whether the row takes part.
+        drift: J̇ v, what the rate changes by without joint accelerations (m/s² or rad/s²); None where it does not count.
         rows_each: how many consecutive rows begin and end together, those of a contact or of a limit; 0 if none ever does.
         is_pyramid: whether these are the edges of a pyramid, whose mean is the normal row; otherwise the first one is.
         is_contact: whether these are contacts.
@@ -52,6 +53,7 @@ class Block(eqx.Module):
     margin: _PerRow
     friction_loss: _PerRow
     is_active: Bool[Array, " rows"]
+    drift: _PerRow | None = None
     rows_each: int = eqx.field(static=True, default=0, kw_only=True)
     is_pyramid: bool = eqx.field(static=True, default=False, kw_only=True)
     is_contact: bool = eqx.field(static=True, default=False, kw_only=True)
@@ -59,6 +61,9 @@ class Block(eqx.Module):
 
 def joined(blocks: list[Block]) -> Block:
     """Return all rows as one block; which of them begin and end together it no longer says."""
+    if any(block.drift is not None for block in blocks):
+        still = [jnp.zeros_like(x.residual) if x.drift is None else x.drift for x in blocks]
+        blocks = [dataclasses.replace(x, drift=drift) for x, drift in zip(blocks, still, strict=True)]
     leaves = {
         field.name: jax.tree.map(lambda *x: jnp.concatenate(x), *(getattr(block, field.name) for block in blocks))
         for field in dataclasses.fields(Block)
@@ -73,7 +78,8 @@ def law(model: mjx.Model, qvel: Float[Array, " nv"], block: Block) -> tuple[_Per
     rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
     present = block.impedance.present
-    return -damping * rate - stiffness * present * residual, weight_of(block, present)
+    drift = 0.0 if block.drift is None else jnp.where(block.is_active, block.drift, 0.0)
+    return -damping * rate - stiffness * present * residual - drift, weight_of(block, present)
 
 
 def weight_of(block: Block, impedance: _PerRow) -> _PerRow:
@@ -350,7 +356,8 @@ def _ball_limit(model: mjx.Model, data: mjx.Data, joints: np.ndarray) -> tuple[R
     quaternion = data.qpos[model.jnt_qposadr[joints][:, None] + np.arange(4)]
     turn = spatial.logarithm(quaternion / safe_norm(quaternion)[:, None])
     angle = safe_norm(turn)
-    axis = turn / jnp.where(angle > 0, angle, 1.0)[:, None]
+    # Without an axis there is no limit near; a smaller angle, squared, is nothing in single precision.
+    axis = turn / jnp.where(angle > 1e-12, angle, 1.0)[:, None]
     select = np.zeros((len(joints), 3, model.nv))
     select[np.arange(len(joints))[:, None], np.arange(3), model.jnt_dofadr[joints][:, None] + np.arange(3)] = 1
     rows = DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1))

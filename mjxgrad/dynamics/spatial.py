@@ -21,6 +21,8 @@ _Vectors = Float[Array, "n 3"]
 # Below this squared angle the truncated series are exact to double precision: the first term left out of either is
 # smaller than (1e-4)**3 / 46080 = 2e-17.
 _SERIES = 1e-4
+# Square of a length without direction: its power of -3/2, which the derivative has, must be finite in single precision.
+_NOTHING = 1e-20
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 # Entries of a symmetric matrix in the order in which MuJoCo keeps those of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -133,9 +135,9 @@ def rotation_matrix(q: Float[Array, "n 4"]) -> _Matrices:
 
 
 def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Return items of norm one; zero stays zero, with derivative one."""
+    """Return items of norm one; those shorter than 1e-10 stay as they are, with derivative one."""
     square = dot(q, q)
-    return scale(jax.lax.rsqrt(jnp.where(square == 0, 1.0, square)), q)
+    return scale(jax.lax.rsqrt(jnp.where(square < _NOTHING, 1.0, square)), q)
 
 
 def inertia_about(offset: _Vectors, mass: Float[Array, " n"], central: _Matrices) -> Float[Array, "n 10"]:

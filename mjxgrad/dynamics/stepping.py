@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, cholesky, forces, implicit, kinematics
+from mjxgrad.dynamics import assembly, cholesky, forces, implicit, kinematics, mended
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows
@@ -164,14 +164,14 @@ def _forward(
         rows, shares = onsets.begin(model, data, blocks, onset, after, without=averaged)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
-        data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
+        data = mended.sensor_vel(model, mended.sensor_pos(model, data))
     if smoothing is None:
         data = _minimum(
             model, data, *_system(model, data, rows), _start(model, data), onsets.partial(model, data, rows, shares)
         )
     else:
         data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
-    return mjx.sensor_acc(model, data) if model.nsensor else data
+    return mended.sensor_acc(model, data) if model.nsensor else data
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -331,7 +331,7 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
     """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
     # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.
     bare = model.tree_replace({"opt.disableflags": model.opt.disableflags | _Disable.mjDSBL_EULERDAMP})
-    moved = mjx.euler(bare, data)
+    moved = mended.euler(bare, data)
     qvel = data.qvel + model.opt.timestep * acceleration
     drift = qvel if velocity is None else velocity
     qpos = integrate_position(model, data.qpos, drift, model.opt.timestep)

@@ -47,7 +47,7 @@ ZOO = """
   <actuator><motor joint="a"/><motor joint="s" gear="2"/></actuator>
 </mujoco>
 """
-# MuJoCo in C adds the centripetal term of connect and weld to their rows, MJX does not: these are compared with MJX.
+# MuJoCo in C takes the acceleration of turning bodies off what connect and weld ask for, MJX does not.
 _WELDED = """
     <body name="p" pos="1 2 1"><freejoint/><geom size=".05" conaffinity="0"/></body>
     <body name="q" pos="1.2 2 1"><freejoint/><geom type="box" size=".05 .04 .03" conaffinity="0"/>

@@ -51,24 +51,29 @@ def test_published_scenes_move_as_in_c(name, settle):
     ("cone", "integrator"), [_CASES[1], *(pytest.param(*case, marks=_SLOW) for case in (_CASES[0], *_CASES[2:]))]
 )
 def test_all_kinds_of_rows_move_as_in_c(cone, integrator):
-    """Condim 1, 3, 4, 6, limits of hinge, ball, slide and tendon, friction loss, couplings.
+    """Condim 1, 3, 4, 6, limits of hinge, ball, slide and tendon, friction loss, couplings, tumbling bodies held together.
 
     C stops an elliptic solve at an improvement of 1e-13, that is at forces known to about its root; hence 1e-6.
     """
-    assert _largest_difference(*zoo(cone, integrator), steps=30) < 1e-6
+    assert _largest_difference(*zoo(cone, integrator, welded=True), steps=30) < 1e-6
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 @_SLOW
 def test_rows_are_those_of_mjx(cone):
-    """Every field of every row; a few units of rounding of numbers up to 1e4."""
+    """Every field of every row; a few units of rounding of numbers up to 1e4.
+
+    But what the 12 rows of connect and weld ask for: MJX lacks the acceleration of turning bodies that C has.
+    """
     model, data = zoo(cone, welded=True)
     mjx_model = mjx.put_model(model)
     ready = jax.jit(lambda d: mjx.fwd_position(mjx_model, d))(mjx.put_data(model, data))
     ours = jax.jit(lambda d: assembly.make_constraint(mjx_model, d))(ready)._impl
     theirs = jax.jit(lambda d: mjx.make_constraint(mjx_model, d))(ready)._impl
     for name in ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frictionloss"):
-        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-13, atol=1e-12, err_msg=name)
+        first = 12 if name == "efc_aref" else 0
+        found, expected = (getattr(rows, name)[first:] for rows in (ours, theirs))
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-12, err_msg=name)
 
 
 @_SLOW
