@@ -26,7 +26,6 @@ _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
-_BEYOND = 1.01  # ends of what is spanned, for stages of Runge-Kutta that lie at the ends themselves
 _TOLERANCE, _ITERATIONS = 1e-14, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 
 _Arrays = Mapping[str, np.ndarray]
@@ -260,7 +259,7 @@ class _Linearisation:
         columns = []
         middle = events.centres - events.gaps
         for to, width, move in zip(middle, events.widths, events.moves.T, strict=True):
-            ends = [self._moved(model, row, (to + end) * move) for end in (_BEYOND * width, -_BEYOND * width)]
+            ends = [self._moved(model, row, (to + end) * move) for end in (width, -width)]
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 

@@ -12,8 +12,8 @@ q±_i is the present position moved along P_i until its gap is ±w_i. So D_i hol
 each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
 of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
-- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way, and is in contact with all of them or
-  none at the ends of a window about -hv/2. That window stands in for the one about zero.
+- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, half as wide
+  again, holds all of them, with as much less weight.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
@@ -37,6 +37,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
+_STAGES = 1.5  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
 _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
 _USUAL_WIDTH, _ENDLESS = 1e-3, 1e3  # m or rad, of an impedance that has none, and what counts as none
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
@@ -98,8 +99,8 @@ class Surfaces:
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            # Its stages meet the surface at gaps of 0, -hv/2 and -hv.
-            centres = -0.5 * self.timestep * rate
+            # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
+            centres, widths = -0.5 * self.timestep * rate, _STAGES * widths
         widths = np.maximum(widths, least)
         chosen = (np.abs(gaps - centres) < widths) & jumps
         if not chosen.any():
