@@ -75,7 +75,7 @@ class Surfaces:
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
-        spanned = 1.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
+        spanned = 1.3 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
         travel = spanned * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least

@@ -8,6 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
+from mjxgrad.native.engine import Engine
 from mjxgrad.native.events import Surfaces, levers_of
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
@@ -161,3 +162,25 @@ def test_a_runge_kutta_step_spans_all_of_its_stages():
         assert (_events(ball, [gap - 0.1], [-2.0]) is not None) == is_event
     found = _compared(mg.load_scene(ball), 0, (0.0, 0.03), 120, [-2.0], read=1)
     np.testing.assert_allclose(found.mean[0, 1], found.slope[1], atol=0.02)
+
+
+def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
+    """A ball that a servo's box pushes along the floor: MuJoCo's own slope at 2 ms is twice its limit's, an artefact of the step."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
+        <body pos="-.3 0 .1"><joint name="p" type="slide" axis="1 0 0" damping="1"/><geom type="box" size=".05 .2 .05" mass="1"/>
+        </body></worldbody><actuator><position joint="p" kp="200"/></actuator></mujoco>"""
+    )
+    model.opt.tolerance, steps, targets = 1e-12, 300, np.linspace(0.5, 0.52, 65)
+    start = {"time": np.zeros((65, 1)), "qpos": np.tile(model.qpos0, (65, 1)), "qvel": np.zeros((65, 7)), "act": np.zeros((65, 0))}
+
+    def controls(refined):
+        return np.repeat(targets[:, None, None], steps * refined, axis=1)
+
+    followed = (np.zeros((65, 14)), np.ones((65, steps, 1)))
+    slope = Engine(model).follow("slope", {}, start, {"ctrl": controls(1)}, followed)
+    own = np.polyfit(targets, slope["qpos"][:, -1, 0], 1)[0]
+    model.opt.timestep /= 16
+    limit = np.polyfit(targets, Engine(model).run({}, start, {"ctrl": controls(16)})["qpos"][:, -1, 0], 1)[0]
+    assert own > 1.8 * limit
+    np.testing.assert_allclose(slope["change"][:, -1, 0].mean(), limit, rtol=0.1)

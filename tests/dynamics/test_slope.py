@@ -1,0 +1,36 @@
+"""`gradient="slope"` of MJX's step: MuJoCo's motion to the bit, and the derivative whose mean is the slope of its outcome."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.diagnostics import compare_to_slope, phases
+
+BALL = """<mujoco><option gravity="0 0 0" timestep="0.002"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
+    <joint type="slide" axis="0 0 1" {limit}/><geom size=".1" mass="1" {contact}/></body></worldbody></mujoco>"""
+
+
+def _ends(scene, gradient):
+    def end(place):
+        start = mg.initial_state(scene, place[None], jnp.array([-2.0]))
+        return mg.rollout(scene, start, horizon=120, gradient=gradient, engine="mjx").qpos[-1, 0]
+
+    places = phases((0.0, 0.03), 96)
+    outcomes, derivatives = jax.jit(jax.vmap(jax.value_and_grad(end)))(jnp.asarray(places))
+    return places, np.asarray(outcomes), np.asarray(derivatives)
+
+
+@pytest.mark.parametrize(
+    ("limit", "contact"), [("", ""), ('range="-.1 1" limited="true"', 'contype="0" conaffinity="0"')], ids=["contact", "limit"]
+)
+def test_the_mean_derivative_of_a_bounce_is_its_slope_and_the_motion_is_mujocos(limit, contact):
+    """-e⁻², nearly: contact at the critical damping leaves e⁻² of the speed."""
+    scene = mg.load_scene(BALL.format(limit=limit, contact=contact))
+    places, outcomes, derivatives = _ends(scene, "slope")
+    _, own, discrete = _ends(scene, "discrete")
+    np.testing.assert_array_equal(outcomes, own)
+    found = compare_to_slope(places, outcomes, [derivatives, discrete], ("slope", "discrete"))
+    np.testing.assert_allclose(found.mean[0], found.slope, atol=0.02)
+    assert abs(found.mean[1] - found.slope) > 0.5  # a tooth's
