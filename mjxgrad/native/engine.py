@@ -210,7 +210,7 @@ class _Linearisation:
             size = max(np.abs(change).max(), np.abs(push).max(initial=0.0), 1e-30)
             nv, felt = model.nv, np.zeros(0)
             if events is not None:
-                felt = events.rows @ change[:nv]
+                felt = events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
                 rest = np.concatenate([change[:nv] - events.moves @ felt, change[nv:]])
             else:
                 rest = change
@@ -237,8 +237,9 @@ class _Linearisation:
         self._small(model, clear, found)
         if events is not None:
             matrix = found["state"]
-            change = self._spanned(model, row, events) - matrix[:, : model.nv] @ events.moves
-            matrix[:, : model.nv] += change @ events.rows
+            nv, change = model.nv, self._spanned(model, row, events) - matrix[:, : model.nv] @ events.moves
+            matrix[:, :nv] += change @ events.rows
+            matrix[:, nv : 2 * nv] += self.surfaces.lead * change @ events.rows
 
     def _events(self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray) -> tuple[Events | None, np.ndarray]:
         """Return what a step may begin or end, and the state from which small differences stay on one side of each surface."""

@@ -12,8 +12,8 @@ q±_i is the present position moved along P_i until its gap is ±w_i. So D_i hol
 each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
 of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
-- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, half as wide
-  again, holds all of them, with as much less weight.
+- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
+  wider, holds all of them, with as much less weight; it moves with the velocity, too, so J stands for (J, hJ/2) there.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
-_STAGES = 1.5  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
+_STAGES = 1.2  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
 _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
 _USUAL_WIDTH, _ENDLESS = 1e-3, 1e3  # m or rad, of an impedance that has none, and what counts as none
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
@@ -75,8 +75,9 @@ class Surfaces:
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
-        spanned = 1.3 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
-        travel = spanned * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
+        # How far ahead of the start of a step its stages lie, in the mean (s).
+        self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+        travel = (0.5 * self.timestep + 2 * self.lead) * np.max(np.abs(speeds), axis=0, initial=0.0)
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
@@ -98,9 +99,9 @@ class Surfaces:
         rows, gaps, least, jumps = self._gaps(data)
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
-        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        if self.lead:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
-            centres, widths = -0.5 * self.timestep * rate, _STAGES * widths
+            centres, widths = -self.lead * rate, _STAGES * widths
         widths = np.maximum(widths, least)
         chosen = (np.abs(gaps - centres) < widths) & jumps
         if not chosen.any():
