@@ -113,7 +113,7 @@ def check(
     as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
-    budget: float = 120.0,
+    budget: float = 12.0,
     seed: int = 0,
 ) -> int:
     """Say whether and how a scene can be differentiated; the exit status is 1 where there are faults.

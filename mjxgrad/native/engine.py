@@ -253,7 +253,26 @@ class _Linearisation:
         off = events.gaps - surfaces
         off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
         shift = np.where(np.abs(off) < near, np.where(off < 0, -near, near) - off, 0.0)
-        return events, self._moved(model, row, events.moves @ shift)
+        clear = self._moved(model, row, events.moves @ shift)
+        if self.surfaces.lead:
+            for move, width in zip(events.moves.T, near / 4, strict=True):
+                clear = self._off_stages(model, clear, width * move)
+        return events, clear
+
+    def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.
+
+        Accelerations move the stages, so that their places are not known beforehand.
+        """
+        for _ in range(4):
+            near, far = (
+                self._difference(model, *(self._moved(model, row, side * width * change) for side in (1, -1))) / width
+                for width in (1, 4)
+            )
+            if np.linalg.norm(near - far) <= 0.1 * np.linalg.norm(far):
+                break
+            row = self._moved(model, row, 8 * change)
+        return row
 
     def _spanned(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> Float[np.ndarray, "size events"]:
         """Return D, the differences that span each event."""

@@ -46,7 +46,7 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
-_MOVED = 0.7  # share of the budget for which motions are followed, about
+_MOVED = 0.6  # share of the budget for which motions are followed, about
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def check(
     *,
     derivatives: bool = True,
     engine: Engine = "mujoco",
-    budget: int | float = 20.0,
+    budget: int | float = 12.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Verdict:

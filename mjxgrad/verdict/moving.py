@@ -28,7 +28,7 @@ from mjxgrad.task import finite_cost
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
 """Which derivative of MuJoCo's motion; "fine" is the motion at a time step `REFINED` times shorter, without derivatives."""
-REFINED = 8
+REFINED = 4
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's code of the first level: half the time to compile (hopper, jax 0.10.2: 12 s in place of 24) and as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}

@@ -161,7 +161,9 @@ def test_a_runge_kutta_step_spans_all_of_its_stages():
     for gap, is_event in ((-0.3e-3, True), (4.3e-3, True), (-0.5e-3, False), (4.5e-3, False)):
         assert (_events(ball, [gap - 0.1], [-2.0]) is not None) == is_event
     found = _compared(mg.load_scene(ball), 0, (0.0, 0.03), 120, [-2.0], read=1)
-    np.testing.assert_allclose(found.mean[0, 1], found.slope[1], atol=0.02)
+    off, error = abs(found.mean[0, 1] - found.slope[1]), found.standard_error[0, 1]
+    assert off < 2 * error + 0.03  # of -2.6, which a tooth has: some meet the window twice, and scatter
+    assert error < 0.1
 
 
 def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():

@@ -335,7 +335,7 @@ def test_what_is_recommended_is_what_was_measured(slope, discrete, expected):
 
 def test_a_slope_of_the_time_step_alone_is_named():
     (found,) = [one.text for one in measured_findings(line_of(1.0, 1.0, fine=0.5)) if "shorter" in one.text]
-    assert "At 2 of 2 readings the slope is another at a time step 8 times shorter" in found
+    assert "At 2 of 2 readings the slope is another at a time step 4 times shorter" in found
     assert not [one for one in measured_findings(line_of(1.0, 1.0)) if "shorter" in one.text]
 
 
