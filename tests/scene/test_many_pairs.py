@@ -16,7 +16,7 @@ def _balls(count: int) -> str:
 
 def test_too_many_pairs_are_refused_with_their_number():
     with pytest.raises(SceneError, match=r"at most 20000 pairs .* got about 44850"):
-        mg.load_scene(_balls(300))
+        mg.load_scene(_balls(300), engine="mjx")
 
 
 # Two limbs on a trunk, and a box that is fixed to it; a weight in the air; two balls. Masks are those of MuJoCo, or named.
@@ -44,7 +44,7 @@ def test_pairs_are_counted_as_mjx_lists_them(flag, exclude):
 def test_pairs_that_are_excluded_or_left_out_do_not_count(monkeypatch):
     monkeypatch.setattr(load, "MOST_PAIRS", 2)
     with pytest.raises(SceneError, match=r"at most 2 pairs .* got about 3"):
-        mg.load_scene(_balls(3))
+        mg.load_scene(_balls(3), engine="mjx")
     apart = "</worldbody><contact><exclude body1='one' body2='other'/></contact>"
     named = _balls(3).replace("<body", "<body name='one'", 1).replace("<body p", "<body name='other' p", 1)
     assert len(mg.load_scene(named.replace("</worldbody>", apart)).pairs) == 2

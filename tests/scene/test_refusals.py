@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import LeaveOut, SceneError, SceneWarning, load_scene
 
@@ -135,10 +136,28 @@ REFUSED = {
 def test_refusal_names_the_culprit_and_the_remedy(feature):
     source, culprit, remedy = REFUSED[feature]
     with pytest.raises(SceneError) as error:
-        load_scene(source)
+        load_scene(source, engine="mjx")
     message = str(error.value)
     assert culprit in message
     assert remedy in message
+
+
+@pytest.mark.parametrize("feature", [feature for feature in REFUSED if feature != "flex"])
+def test_what_mjx_lacks_c_mujoco_steps_as_it_is_in_the_file(feature):
+    source, culprit, _ = REFUSED[feature]
+    with pytest.warns(SceneWarning, match="C MuJoCo steps it"):
+        scene = load_scene(source)
+    assert scene.engine == "mujoco"
+    assert culprit in scene.summary()
+    model = mujoco.MjModel.from_xml_string(source)
+    data, ctrl = mujoco.MjData(model), np.linspace(0.1, 0.3, model.nu)
+    course = mg.rollout(scene, mg.initial_state(scene), jnp.tile(jnp.asarray(ctrl), (5, 1)))
+    for qpos in course.qpos[1:]:
+        data.ctrl = ctrl
+        mujoco.mj_step(model, data)
+        np.testing.assert_array_equal(qpos, data.qpos)
+    with pytest.raises(ValueError, match="scene that C MuJoCo steps"):
+        mg.step(scene.model, scene.data)
 
 
 # Two geoms on bodies of their own, and what MJX names them by.
@@ -159,7 +178,7 @@ def test_contact_by_a_search_on_distance_fields_is_refused_unless_asked_for(kind
     with pytest.raises(
         SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*leave_out.*distance_fields=True"
     ):
-        load_scene(_pair(kinds))
+        load_scene(_pair(kinds), engine="mjx")
     with pytest.warns(SceneWarning, match="search on distance fields instead of exact.*derivative"):
         assert len(load_scene(_pair(kinds), distance_fields=True).pairs) == 1
 

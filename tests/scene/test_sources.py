@@ -104,7 +104,7 @@ def test_several_unsupported_features_are_named_at_once():
         'name="g"', 'name="g" surfacevel="1 0 0 0 0 0"'
     )
     with pytest.raises(SceneError, match="for 2 reasons") as error:
-        load_scene(source)
+        load_scene(source, engine="mjx")
     assert "integrator='implicit'" in str(error.value)
     assert "geom 'g'" in str(error.value)
 
