@@ -36,7 +36,7 @@ def cost(trajectory):  # yours: here how far the first coordinate comes (m or ra
 
 
 low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON, onset=mg.Onset())
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON)
 
 
 def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
@@ -53,7 +53,7 @@ result = mg.optimise(
     num_steps=30,
     log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
 )
-course = mg.rollout(scene, task.state, controls(result.params["knots"]), onset=mg.Onset())
+course = mg.rollout(scene, task.state, controls(result.params["knots"]))
 print("cost", cost(course), "from", task.run(controls(start)).cost)
 mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 '''
@@ -152,7 +152,8 @@ def sweep(
     stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
     noise: float = 0.1,
     samples: int = 256,
-    gradient: Literal["onset", "discrete", "event"] = "onset",
+    gradient: Literal["slope", "discrete"] = "slope",
+    engine: Literal["mjx", "mujoco"] | None = None,
     seed: int = 0,
     html: Path = Path("sweep.html"),
 ) -> None:
@@ -167,7 +168,8 @@ def sweep(
         stiffness: of contacts in 1/s², beside the file's own: 1e2 to 1e6 unless given.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
         samples: rollouts of each estimate; the truth takes eight times as many.
-        gradient: onset, or in MuJoCo's motion discrete or event.
+        gradient: the slope of the outcome, or the discrete one of each step.
+        engine: mjx, or mujoco for C MuJoCo, which has nothing to compile and is slower; without it what the scene can have.
         seed: of what is random.
         html: the page to write.
     """
@@ -186,6 +188,7 @@ def sweep(
         start=start,
         horizon=horizon,
         gradient=gradient,
+        engine=engine,
     )
     print(found)
     html.write_text(found.as_html(), encoding="utf-8")

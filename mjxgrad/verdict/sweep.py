@@ -21,12 +21,12 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
-from mjxgrad._rollout import Trajectory, initial_state
+from mjxgrad._rollout import Engine, Trajectory, initial_state
 from mjxgrad.contact import Softness
 from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
-from mjxgrad.dynamics import Onset
+from mjxgrad.dynamics import Gradient
 from mjxgrad.dynamics.kinematics import kinematics
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
@@ -49,7 +49,8 @@ def scene_task(
     *,
     start: str | None = None,
     horizon: int | None = None,
-    gradient: str = "onset",
+    gradient: Gradient = "slope",
+    engine: Engine | None = None,
     seed: int = 0,
 ) -> SceneTask:
     """Make a task of a scene by names.
@@ -61,24 +62,25 @@ def scene_task(
             reach:hand/ball (their distance, m). None is a random mix of where the heaviest body ends up.
         start: a key frame; None is the reference pose, at rest.
         horizon: steps; None is half a second, but 50 to 300 steps.
-        gradient: "onset", for contacts that begin within the step; or one of `step`, in MuJoCo's motion.
+        gradient: of MuJoCo's motion, see `rollout`.
+        engine: see `rollout`.
         seed: of the mix.
 
     Raises:
         ValueError: in one sentence, if there is no such file, function, body or key frame.
     """
-    model, state = scene.mj_model, initial_state(scene)
+    model = scene.mj_model
+    state = initial_state(scene) if start is None else initial_state(scene, keyframe=start)
     if start is not None:
         key, _ = _found(model, start, "key")
-        state = initial_state(scene, model.key_qpos[key], model.key_qvel[key], model.key_act[key])
         scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key_ctrl[key], state.qpos.dtype))
     if cost is None:
         outcomes = _outcomes(scene, None, np.random.default_rng(seed))[1]
         cost = lambda trajectory: outcomes(trajectory)[0]  # noqa: E731
     cost = _named_cost(scene, cost) if isinstance(cost, str) else cost
     usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
-    task = SceneTask(scene, state, cost, usual if horizon is None else horizon, onset=Onset())
-    return task if gradient == "onset" else task.with_gradient(gradient)  # pyright: ignore[reportArgumentType]
+    horizon = usual if horizon is None else horizon
+    return SceneTask(scene, state, cost, horizon, gradient=gradient, engine=engine)
 
 
 def load_function(name: str) -> Callable[..., Any]:
@@ -280,7 +282,7 @@ def sweep(
         num_reference: rollouts of the truth.
         seed: of all that is random.
         log: called with what is being done.
-        **task_settings: start, horizon and gradient of `scene_task`.
+        **task_settings: start, horizon, gradient and engine of `scene_task`.
 
     Raises:
         ValueError: as `scene_task` and `bias_variance` do, or if a stiffness is not positive.

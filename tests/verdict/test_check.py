@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import time
 from pathlib import Path
 
@@ -31,7 +32,7 @@ BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></def
 # A ball so small that between a hit and a miss lies nothing to be sampled; no gravity, so that its height is that of its start.
 WALL = """<mujoco><option timestep=".005" gravity="0 0 0"/><worldbody>
   <geom name="wall" type="box" pos="1 0 1" size=".05 1 .1"/><body name="ball" pos=".2 0 1.08">
-  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom name="ball" size=".00001" mass=".2"/>
+  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom name="ball" size=".00005" mass=".2"/>
   </body></worldbody><keyframe><key name="throw" qvel="3 0"/></keyframe></mujoco>"""
 
 
@@ -233,25 +234,25 @@ def test_what_outlasts_the_budget_is_given_up_and_named():
     assert recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None).estimator == "alpha_order"
 
 
-def _moved(engine, kind, lengths=(5, 20)):
+def _moved(engine, kind, lengths=(5, 20), end=math.inf):
     """Return a ball's bounces from three speeds, pushed along a line."""
     scene = mg.load_scene(ball(height=0.06))
-    mover = Mover(scene, 3, lambda t: jnp.stack([t.qpos[-1, 0], t.qvel[-1, 0]]), engine=engine)
+    mover = Mover(scene, 3, lambda t: jnp.stack([t.qpos[-1, 0], t.qvel[-1, 0]]), end, engine)
     states = jax.tree.map(lambda leaf: np.repeat(np.array(leaf)[None], 3, axis=0), mg.initial_state(scene))
     states.qvel[:] = [[-1.0], [-2.0], [0.5]]
     direction = Direction(np.array([0.3]), np.array([1.0]), 0.1 * np.ones((20, 1)))
-    return mover.move(kind, states, np.zeros((3, 20, 1)), direction, lengths), mover
+    return mover.move(kind, states, np.zeros((3, 20, 1)), direction, lengths)
 
 
 def test_both_engines_move_alike():
-    by_c, by_mjx = (_moved(engine, "discrete")[0] for engine in ("mujoco", "mjx"))
+    by_c, by_mjx = (_moved(engine, "discrete") for engine in ("mujoco", "mjx"))
     for name in ("outcomes", "derivatives", "growth"):
         np.testing.assert_allclose(getattr(by_c, name), getattr(by_mjx, name), rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_a_fine_motion_is_that_of_a_shorter_time_step():
     scene = mg.load_scene(ball(height=0.06), timestep=0.002 / REFINED)
-    for speed, found in zip((-1.0, -2.0, 0.5), _moved("mujoco", "fine")[0].outcomes, strict=True):
+    for speed, found in zip((-1.0, -2.0, 0.5), _moved("mujoco", "fine").outcomes, strict=True):
         course = mg.rollout(
             scene, mg.initial_state(scene, qvel=np.array([speed])), horizon=20 * REFINED, engine="mujoco"
         )
@@ -259,10 +260,8 @@ def test_a_fine_motion_is_that_of_a_shorter_time_step():
 
 
 def test_no_batch_is_begun_after_the_end():
-    _, mover = _moved("mujoco", "fine")
-    mover.end = 0.0
     with pytest.raises(TimeoutError):
-        mover.move("slope", None, None, None, [1])
+        _moved("mujoco", "fine", end=0.0)
 
 
 def test_hit_or_miss_is_named_with_its_pair(wall):
