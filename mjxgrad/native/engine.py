@@ -184,7 +184,9 @@ class _Linearisation:
             for k, (gap, width) in enumerate(zip(events.gaps, events.widths, strict=True)):
                 ends = [self._moved(model, row, (end - gap) * events.moves[:, k]) for end in (width, -width)]
                 spanned[:, k] = self._difference(model, *ends) / (2 * width)
-            matrix[:, : model.nv] += (spanned - matrix[:, : model.nv] @ events.moves) @ events.rows
+            jump, nv = (spanned - matrix[:, : model.nv] @ events.moves) @ events.rows, model.nv
+            matrix[:, :nv] += jump
+            matrix[:, nv : 2 * nv] += self.surfaces.lead * jump
 
     def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
         """Write differences of small width by all that is wanted."""

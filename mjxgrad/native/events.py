@@ -14,6 +14,8 @@ of rank one per event, as saltation matrices are, so an event costs two more ste
 
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
+- **Stages.** RK4 asks four times whether a contact acts: at q, twice at q + h v/2, and at q + h v. So r + h/2 J v is taken in place
+  of r, which velocities move, too, and w is a fifth larger, to hold the first and the last.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are moved
@@ -50,7 +52,7 @@ class Events:
 
     Attributes:
         rows: J, the rate of each gap by joint velocity.
-        gaps: distance less margin at present (m or rad).
+        gaps: distance less margin at present (m or rad); of RK4 half a step later.
         widths: half the travel about zero that is spanned (m or rad).
         moves: P, the displacement that changes one gap by one and leaves the others.
     """
@@ -69,7 +71,8 @@ class Surfaces:
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
-        travel = 0.5 * self.timestep * np.max(np.abs(speeds), axis=0, initial=0.0)
+        self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+        travel = (0.5 * self.timestep + 2 * self.lead) * np.max(np.abs(speeds), axis=0, initial=0.0)
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
@@ -90,7 +93,8 @@ class Surfaces:
             return None
         rows, gaps, least = self._gaps(data)
         rates = np.maximum(np.abs(rows @ before), np.abs(rows @ after))
-        widths = np.maximum(0.5 * self.timestep * rates, least)
+        gaps = gaps + self.lead * (rows @ before)
+        widths = np.maximum((0.5 * self.timestep + 0.2 * self.lead) * rates, least)
         chosen = np.abs(gaps) < widths
         return _moved_apart(rows / self.lengths, gaps, widths, chosen, self.lengths) if chosen.any() else None
 
