@@ -178,6 +178,9 @@ class _Linearisation:
             clear = self._moved(
                 model, row, events.moves @ np.where(np.abs(events.gaps) < near, side - events.gaps, 0.0)
             )
+            if self.surfaces.lead:
+                for move, width in zip(events.moves.T, near / 4, strict=True):
+                    clear = self._off_stages(model, clear, width * move)
         self._small(model, clear, found)
         if events is not None:
             matrix, spanned = found["state"], np.zeros((len(found["state"]), len(events.gaps)))
@@ -187,6 +190,18 @@ class _Linearisation:
             jump, nv = (spanned - matrix[:, : model.nv] @ events.moves) @ events.rows, model.nv
             matrix[:, :nv] += jump
             matrix[:, nv : 2 * nv] += self.surfaces.lead * jump
+
+    def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return a state near which no stage of RK4 meets a surface: there differences of any width are alike."""
+        for _ in range(4):  # RK4's stages, whose places acceleration moves, so that they are not known beforehand
+            near, far = (
+                self._difference(model, *(self._moved(model, row, side * width * change) for side in (1, -1))) / width
+                for width in (1, 4)
+            )
+            if np.linalg.norm(near - far) <= 0.1 * np.linalg.norm(far):
+                break
+            row = self._moved(model, row, 8 * change)
+        return row
 
     def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
         """Write differences of small width by all that is wanted."""
