@@ -70,11 +70,12 @@ def test_the_slope_of_rk4_knows_that_each_of_its_stages_may_touch():
 
 
 def test_a_wrong_derivative_and_a_process_that_ends_are_failures():
-    right: dict = {"A": 0.0, "B": 0.0, "motion": 0.0, "finite": True, "flagged": False, "warned": False}
+    right: dict = {"A": 0.0, "B": 0.0, "motion": 0.0, "flagged": False, "warned": False}
     assert robots.failures("c_double", right) == []
     assert robots.failures("c_double", right | {"B": 2e-4}) == ["B is off by 0.0002"]
     assert robots.failures("mjx_single", right | {"motion": 0.01}) == ["motion is off by 0.01 without a warning"]
-    assert robots.failures("mjx_single", right | {"finite": False}) == ["NaN without a flag"]
+    assert robots.failures("mjx_single", right | {"A": np.nan}) == ["A is off by nan"]
+    assert robots.failures("mjx_single", right | {"A": np.nan, "flagged": True}) == []
     (found,) = (one for _, one in robots.measured("load", ["missing.xml"], 60.0))
     assert found["nv"] == 0
 
