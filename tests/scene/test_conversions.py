@@ -280,3 +280,14 @@ def test_frictionless_contacts_beside_elliptic_ones_have_rows_of_both_kinds():
     assert [int(t) for t in scene.data._impl.efc_type] == [int(t) for t in expected]
     np.testing.assert_array_equal(scene.data._impl.contact.efc_address, [0, 1, 5])
     assert scene.data._impl.efc_J.shape == (9, 12)
+
+
+def test_a_touch_sensor_where_nothing_can_touch_reads_zero():
+    """MJX puts the forces of all contacts together for it, and fails of none; so does dm_control's cartpole."""
+    scene = mg.load_scene(
+        '<mujoco><worldbody><body><joint/><geom size=".1"/><site name="skin" size=".2"/></body></worldbody>'
+        '<sensor><touch site="skin"/></sensor></mujoco>'
+    )
+    state = mg.initial_state(scene)
+    trajectory = mg.rollout(scene, state, horizon=1, observe=lambda model, data: data.sensordata)
+    np.testing.assert_array_equal(trajectory.observations, 0.0)
