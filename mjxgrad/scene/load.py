@@ -32,6 +32,7 @@ from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
+_MUSCLE_WIDTH = 1e-6  # of control less activation; its fifth power is taken
 MOST_PAIRS = 20_000
 """Pairs of geoms beyond which loading takes minutes and a scene is refused."""
 _LISTENING = threading.Lock()  # there is one handler of warnings for all threads
@@ -114,7 +115,7 @@ def load_scene(
         _refuse_many_pairs(mj_model, name, wish)
         conversions = _make_simulable(mj_model, name, wish, distance_fields)
         stepped = copy.deepcopy(mj_model)
-        conversions += list(drop_sensors(stepped))
+        conversions += list(drop_sensors(stepped)) + _blunt_muscles(stepped)
     except SceneError as error:
         if engine == "mjx" or original.nflex:
             raise
@@ -257,6 +258,16 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
         given, model.opt.tolerance = f"{model.opt.tolerance:g}", _FLOAT32_TOLERANCE
         conversions.append(Conversion("tolerance", given, f"{_FLOAT32_TOLERANCE:g}", "float32 resolves no more"))
     return conversions
+
+
+def _blunt_muscles(model: mujoco.MjModel) -> list[Conversion]:
+    """Give muscles that switch their time constant at once a width; MJX divides by it, and by 1e-15 for none."""
+    sharp = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE) & (model.actuator_dynprm[:, 2] < _MUSCLE_WIDTH)
+    if jnp.result_type(float) != jnp.float32 or not sharp.any():
+        return []
+    model.actuator_dynprm[sharp, 2] = _MUSCLE_WIDTH
+    reason = "narrower than matters; without one MJX's derivative overflows single precision, to NaN"
+    return [Conversion(f"width in dynprm of {int(sharp.sum())} muscles", "0", f"{_MUSCLE_WIDTH:g}", reason)]
 
 
 def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mjx.Model, mjx.Data]:

@@ -291,3 +291,15 @@ def test_a_touch_sensor_where_nothing_can_touch_reads_zero():
     )
     data = jax.jit(forward)(scene.model, scene.data)
     np.testing.assert_array_equal(data.sensordata, [0.0])
+
+
+def test_a_muscle_has_a_derivative_in_single_precision():
+    """MJX divides by the width of its switch, 1e-15 for none, and takes the fifth power, which overflows."""
+    source = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+        <actuator><muscle joint="j" lengthrange="0 1"/></actuator></mujoco>"""
+    with jax.enable_x64(False):
+        scene = load_scene(source)
+        data = scene.data.replace(act=jnp.array([0.1]), ctrl=jnp.array([0.3]))
+        found = jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0])(data.act)
+    # The rate is (u - a) / (0.01 (0.5 + 1.5 a)), whose derivative by a is -(0.5 + 1.5 u) / (0.01 (0.5 + 1.5 a)^2).
+    np.testing.assert_allclose(found, -0.95 / (0.01 * 0.65**2), rtol=1e-5)
