@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow bench throughput costs identify-bench gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow bench throughput costs identify-bench robots gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -62,6 +62,9 @@ costs: .venv/.installed  ## measure what onset, event gradient and smoothing cos
 
 identify-bench: .venv/.installed  ## measure identification against mujoco.sysid, answers included
 	@$(BIN)/python -m experiments.identification_bench $(ARGS)
+
+robots: .venv/.installed  ## measure motion and derivatives of the robots of ten packages (downloads 0.4 GB)
+	@$(BIN)/python -m experiments.robots $(ARGS)
 
 gallery: .venv/.installed  ## write runs/index.html, a page over all results with moving pictures
 	@$(BIN)/python -m experiments gallery

@@ -267,6 +267,10 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
         # MJX insists on a collision function even for pairs whose contact is disabled.
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
+        # Nor can it put the forces of no contact together for sensors, which read zero.
+        of_contact = np.isin(model.sensor_type, [mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT])
+        model.sensor_needstage[of_contact] = mujoco.mjtStage.mjSTAGE_NONE
+        model.sensor_type[of_contact] = mujoco.mjtSensor.mjSENS_CLOCK
     try:
         # Of several processes each has its own; MJX would take the first of all.
         with np.errstate(over="raise"):

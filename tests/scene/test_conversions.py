@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
+from mjxgrad.dynamics import forward
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.scene import SceneWarning, load_scene
 
@@ -280,3 +281,25 @@ def test_frictionless_contacts_beside_elliptic_ones_have_rows_of_both_kinds():
     assert [int(t) for t in scene.data._impl.efc_type] == [int(t) for t in expected]
     np.testing.assert_array_equal(scene.data._impl.contact.efc_address, [0, 1, 5])
     assert scene.data._impl.efc_J.shape == (9, 12)
+
+
+def test_a_touch_sensor_where_nothing_can_touch_reads_zero():
+    """MJX puts the forces of all contacts together for it, and fails of none; so does dm_control's cartpole."""
+    scene = load_scene(
+        '<mujoco><worldbody><body><joint/><geom size=".1"/><site name="skin" size=".2"/></body></worldbody>'
+        '<sensor><touch site="skin"/></sensor></mujoco>'
+    )
+    data = jax.jit(forward)(scene.model, scene.data)
+    np.testing.assert_array_equal(data.sensordata, [0.0])
+
+
+def test_a_muscle_has_a_derivative_in_single_precision():
+    """MJX divides by the width of its switch, 1e-15 for none, and takes the fifth power, which overflows."""
+    source = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+        <actuator><muscle joint="j" lengthrange="0 1"/></actuator></mujoco>"""
+    with jax.enable_x64(False):
+        scene = load_scene(source)
+        data = scene.data.replace(act=jnp.array([0.1]), ctrl=jnp.array([0.3]))
+        found = jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0])(data.act)
+    # The rate is (u - a) / (0.01 (0.5 + 1.5 a)), whose derivative by a is -(0.5 + 1.5 u) / (0.01 (0.5 + 1.5 a)^2).
+    np.testing.assert_allclose(found, -0.95 / (0.01 * 0.65**2), rtol=1e-5)
