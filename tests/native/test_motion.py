@@ -117,7 +117,7 @@ def test_what_is_given_to_each_step_acts_alike_in_both_engines():
 
 
 def test_wrong_inputs_are_refused(scene):
-    with pytest.raises(ValueError, match="inputs must be among qfrc_applied, .* got 'ctrl'"):
+    with pytest.raises(ValueError, match=r"inputs must be among qfrc_applied, .* got 'ctrl'"):
         _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"ctrl": np.zeros((2, 2))})
     with pytest.raises(ValueError, match=r"inputs\['qfrc_applied'\] must have shape \(2, \d\), one row per step"):
         _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"qfrc_applied": np.zeros(3)})
