@@ -135,8 +135,3 @@ def test_an_episode_that_diverges_is_charged_as_if_all_stayed(environment, begun
 def test_costs_of_observations_are_refused(task):
     with pytest.raises(ValueError, match="task must have a cost of positions, velocities and controls"):
         from_task(dataclasses.replace(task, observe=lambda model, data: data.qpos))
-
-
-def test_an_engine_without_derivatives_is_refused(task):
-    with pytest.raises(ValueError, match=r"task must be stepped by .mjx., got 'mujoco'"):
-        from_task(task.with_engine("mujoco"))
