@@ -219,7 +219,7 @@ _ORDER = (CONTINUOUS, SLOPE, DISCRETE)
 
 
 def answer(outcome: Outcome) -> str:
-    """Say how often the derivative is the slope, without and with the event."""
+    """Say how often the derivative is the slope, by both derivatives."""
     fine = outcome.grid.isel(timestep=outcome.grid.timestep.values <= _FINE)
     judged = int(fine.judged.sum())
     if not judged:
@@ -245,7 +245,7 @@ def verdict(outcome: Outcome) -> str:
         return sentence
     close = [int(((coarse.error <= _COARSE_TOLERANCE) & coarse.judged).sel(arm=arm).sum()) for arm in _ORDER]
     return (
-        f"{sentence} At {1e3 * _COARSE:g} ms it is within {_COARSE_TOLERANCE:.0%} at {close[0]} and {close[1]} (event) of "
+        f"{sentence} At {1e3 * _COARSE:g} ms it is within {_COARSE_TOLERANCE:.0%} at {close[0]} and {close[1]} (slope) of "
         f"{int(coarse.judged.sum())}."
     )
 

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
-from mjxgrad.dynamics.events import contacts_of
 from pydantic import Field
 
 import mjxgrad as mg
@@ -269,12 +268,13 @@ def substepped_step(
 def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:
     """Whether some distance changes its sign, judged by distances at the step's beginning and velocities at its end."""
     # Contacts and kinematics of a stepped data are those of the state before; its position is not.
-    blocks = assembly.gather(model, after.replace(qpos=before.qpos))
-    if not any(block.rows_each for block in blocks):
-        return jnp.zeros((), bool)
-    distance, normal = contacts_of(blocks, model.nv)
-    later = distance + model.opt.timestep * normal @ after.qvel
-    return jnp.any((distance < 0) != (later < 0))
+    found = jnp.zeros((), bool)
+    for block in assembly.gather(model, after.replace(qpos=before.qpos)):
+        if block.rows_each:
+            distance, rates = block.residual[:: block.rows_each], block.map.rates(after.qvel).reshape(-1, block.rows_each)
+            rate = jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
+            found |= jnp.any((distance < 0) != (distance + model.opt.timestep * rate < 0))
+    return found
 
 
 _DERIVATIVES: dict[str, Derivative] = {

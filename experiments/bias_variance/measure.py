@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, Float, PyTree
-from mjxgrad.verdict.programs import compiler_options
 from scipy import stats
 
 import mjxgrad as mg
@@ -24,6 +23,7 @@ from experiments.workspace import Workspace
 from mjxgrad.diagnostics import BiasVariance, bias_variance, mean_interval
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
+from mjxgrad.verdict.moving import compiler_options
 from mjxgrad.verdict.sweep import Knob
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.

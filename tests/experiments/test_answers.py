@@ -312,7 +312,7 @@ CASES = [
     (
         "bounce",
         bounced(4, **{"continuous onset": 4, "slope": 3, "discrete": 1}),
-        "Right at 4 (continuous onset), 3 (event) and 1 (discrete) of 4 settings.",
+        "Right at 4 (continuous onset), 3 (slope) and 1 (discrete) of 4 settings.",
     ),
     (
         "artificial_discontinuity",
@@ -370,7 +370,7 @@ CASES = [
     ),
     (
         "learning",
-        taught(discrete=[9.0, 9, 9], event=[1.0, 2, 3], late=("discrete",)),
+        taught(discrete=[9.0, 9, 9], slope=[1.0, 2, 3], late=("discrete",)),
         "Soonest: first order by the slope; worth most: first order without an onset, 9.00 (unproven).",
     ),
     (

@@ -36,7 +36,7 @@ def test_a_lucky_coarse_step_is_not_the_fastest(course):
 
 def test_the_verdict_names_the_fastest_and_what_never_is_right(course):
     assert verdict(Outcome((course,))) == (
-        "With MuJoCo's default contact the first below 2% is event (time step 0.001 s): 1.5% in 0.3 s of processor time; "
+        "With MuJoCo's default contact the first below 2% is slope (time step 0.001 s): 1.5% in 0.3 s of processor time; "
         "adaptive, differentiated stays above 20% at every setting."
     )
 

@@ -300,7 +300,7 @@ def test_methods_are_listed_by_their_labels_one_a_line():
         "zeroth order (zero noise): baseline = zero_noise",
     ]
     strokes = runner._shown(config.load_runs("billiards", [])[0].settings)
-    assert strokes["methods"][1:3] == ["first order, slope: gradient = event", "first order, margin: margin = 0.4"]
+    assert strokes["methods"][1:3] == ["first order, slope: gradient = slope", "first order, margin: margin = 0.4"]
     assert strokes["video.speed"] == "0.5"
 
 
