@@ -23,7 +23,9 @@ def _ends(scene, gradient):
 
 
 @pytest.mark.parametrize(
-    ("limit", "contact"), [("", ""), ('range="-.1 1" limited="true"', 'contype="0" conaffinity="0"')], ids=["contact", "limit"]
+    ("limit", "contact"),
+    [("", ""), ('range="-.1 1" limited="true"', 'contype="0" conaffinity="0"')],
+    ids=["contact", "limit"],
 )
 def test_the_mean_derivative_of_a_bounce_is_its_slope_and_the_motion_is_mujocos(limit, contact):
     """-e⁻², nearly: contact at the critical damping leaves e⁻² of the speed."""

@@ -245,5 +245,3 @@ def test_what_a_step_cannot_take_is_refused():
     model, data = _scene()
     with pytest.raises(ValueError, match="length must be one value for a step, got shape \\(2,\\)"):
         mg.step(model, data, smoothing=mg.Smoothing([1e-3, 2e-3]))
-    with pytest.raises(ValueError, match="gradient must be 'discrete' with smoothing"):
-        mg.step(model, data, gradient="slope", smoothing=mg.Smoothing(1e-3))

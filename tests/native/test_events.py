@@ -174,7 +174,12 @@ def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
         </body></worldbody><actuator><position joint="p" kp="200"/></actuator></mujoco>"""
     )
     model.opt.tolerance, steps, targets = 1e-12, 300, np.linspace(0.5, 0.52, 65)
-    start = {"time": np.zeros((65, 1)), "qpos": np.tile(model.qpos0, (65, 1)), "qvel": np.zeros((65, 7)), "act": np.zeros((65, 0))}
+    start = {
+        "time": np.zeros((65, 1)),
+        "qpos": np.tile(model.qpos0, (65, 1)),
+        "qvel": np.zeros((65, 7)),
+        "act": np.zeros((65, 0)),
+    }
 
     def controls(refined):
         return np.repeat(targets[:, None, None], steps * refined, axis=1)
