@@ -392,8 +392,8 @@ def verdict(outcome: Outcome) -> str:
     return (
         f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
-        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is right at "
-        f"{within[NATIVE]:.0%} by C MuJoCo and {within[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {within[DISCRETE]:.0%}. "
+        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is right "
+        f"at {within[NATIVE]:.0%} by C MuJoCo and {within[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {within[DISCRETE]:.0%}. "
         f"Single derivatives scatter by {np.median(spread):.2f} of the slope with an onset, "
         f"{np.median(_pooled(outcome, 'spread', NATIVE)):.2f} by C MuJoCo."
     )

@@ -53,8 +53,8 @@ class SceneOutcome:
     points: Points  # of its grid
     # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that of the
     # discrete gradient along a change of the start (`derivative`) and of the model's parameters
-    # (`derivative_by_parameters`), and that of the slope at MuJoCo's motion (`slope_derivative`); whether numbers that are not finite
-    # left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
+    # (`derivative_by_parameters`), and that of the slope at MuJoCo's motion (`slope_derivative`); whether numbers that are
+    # not finite left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
     # (`untold`), whether the gradient is not finite or explodes where `Trajectory.diverged` is false
     # (`gradient_unflagged_by_rollout`), and `soundness` finds nothing wrong either (`missed`); difference of the final
     # positions from those of C MuJoCo over what a body flies (`apart_from_c`), and largest kinetic energy over what there

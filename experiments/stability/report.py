@@ -141,7 +141,8 @@ def tables(outcome: Outcome) -> list[Table]:
             ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),
             derivatives,
             "Points by what the derivative is. C MuJoCo’s is a central difference; it is unjudged where two widths disagree. "
-            "Those of mjxgrad are judged by central differences of mjxgrad in float64, the slope at MuJoCo's motion by the restitution.",
+            "Those of mjxgrad are judged by central differences of mjxgrad in float64, the slope at MuJoCo's motion by the "
+            "restitution.",
         ),
         Table(
             ("scene", "precision", "reason", "points", "for instance"),

@@ -1,16 +1,17 @@
 r"""The slope of C MuJoCo's outcome: derivatives of a step that know of the contacts and limits about to begin or end.
 
 MuJoCo decides once per step whether a contact or limit acts, by the sign of its gap r (distance less margin). The step is
-therefore a smooth map with jumps at r = 0, and its Jacobian A₀, by differences of any small width, does not see them. Yet a change
-of the start moves each crossing to another step, and the slope of the outcome has that in it. Where trajectories that differ in
-phase fill the gap evenly, as in flight, the expected derivative of a step is that over the travel of one step about r = 0:
+therefore a smooth map with jumps at r = 0, and its Jacobian A₀, by differences of any small width, does not see them. Yet a
+change of the start moves each crossing to another step, and the slope of the outcome has that in it. Where trajectories that
+differ in phase fill the gap evenly, as in flight, the expected derivative of a step is that over the travel of one step about
+r = 0:
 
     A = A₀ (1 - P J) + D J,        D_i = (f(q⁺_i) - f(q⁻_i)) / 2w_i,        J P = 1,
 
 for the events i, the rows with |r_i| < w_i. J holds their normal rows, P displacements of which each changes one gap alone, and
-q±_i is the present position moved along P_i until its gap is ±w_i. So D_i holds the jump and the mean derivative to both sides, and
-each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a matrix
-of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
+q±_i is the present position moved along P_i until its gap is ±w_i. So D_i holds the jump and the mean derivative to both sides,
+and each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a
+matrix of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight; it moves with the velocity, too, so J stands for (J, hJ/2) there.
@@ -18,8 +19,8 @@ of rank one per event, as saltation matrices are, so an event costs two more ste
   impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
-  Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are moved
-  together, as one.
+  Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
+  moved together, as one.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Of parameters that do move surfaces (sizes, places) events are not spanned. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.

@@ -158,8 +158,8 @@ def check(
         cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
             their start. None looks at random mixes of where bodies end up, and how fast.
         derivatives: measure them; False looks at motions alone.
-        engine: "mujoco" measures by C MuJoCo, with nothing to compile; "mjx" by the step that a GPU would run, which is to be given
-            a budget of minutes.
+        engine: "mujoco" measures by C MuJoCo, with nothing to compile; "mjx" by the step that a GPU would run, which is to be
+            given a budget of minutes.
         budget: how long it may take in s once the scene is loaded, about. Slow scenes are followed for fewer steps; what does not
             fit is left out, and the verdict says what.
         seed: of all that is random.

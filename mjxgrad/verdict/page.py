@@ -21,7 +21,8 @@ h1 { font-size: 1.35rem; line-height: 1.3; margin: .2rem 0 1rem; overflow-wrap: 
 figure { margin: 0 0 1rem; } figcaption { color: var(--soft); font-size: .9rem; }
 svg { width: 100%; max-width: 34rem; height: auto; display: block; }
 svg text { font: 12px system-ui, sans-serif; fill: var(--ink); }
-svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); } svg .ink { fill: var(--ink); }
+svg .axis { stroke: var(--line); } svg .plain { fill: var(--plain); } svg .smooth { fill: var(--smooth); }
+svg .ink { fill: var(--ink); }
 svg .slope { stroke: var(--soft); fill: none; opacity: .6; } svg .jump { stroke: var(--soft); stroke-dasharray: 4 3; }
 table { border-collapse: collapse; font-size: .9rem; } td, th { padding: .2rem .7rem .2rem 0; text-align: right; }
 td:first-child, th:first-child { text-align: left; } .scroll { overflow-x: auto; } video { width: 100%; }

@@ -432,7 +432,10 @@ def test_an_impedance_without_a_width_begins_where_mujocos_does():
 
 @pytest.mark.slow
 def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
-    """The same push at 4 ms with the slope at MuJoCo's motion, which chatter multiplies; a free flight grows by its duration at most."""
+    """The same push at 4 ms with the slope at MuJoCo's motion, which chatter multiplies.
+
+    A free flight grows by its duration at most.
+    """
     scene = mg.load_scene(_PUSHED.format(timestep=1e-3, kind="sphere", turning=""))
     controls = jnp.linspace(0.7, 0.98, 32)[:, None, None] * jnp.ones((240, 1))
 

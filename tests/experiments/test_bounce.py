@@ -64,7 +64,8 @@ def outcome():
 
 
 def test_the_verdict_counts_where_the_derivatives_hold(outcome):
-    # Two damping ratios and two impedances at each time step; only the onset is within 5 %, the slope at MuJoCo's motion within 30.
+    # Two damping ratios and two impedances at each time step; only the onset is within 5 %, the slope at MuJoCo's motion
+    # within 30.
     assert verdict(outcome) == (
         "Up to 0.5 ms the mean derivative is within 5% of the slope at 4 (continuous onset), 0 (slope) and 0 (discrete) of 4 "
         "contacts and time steps. At 2 ms it is within 30% at 4 and 4 (slope) of 4."

@@ -16,7 +16,8 @@ from mjxgrad.native.engine import engine_of
 _SOLVER = 'tolerance="1e-14" iterations="200"'
 SCENES = {
     "free box, pyramids": f"""<mujoco><option {_SOLVER}/><worldbody><geom type="plane" size="2 2 .1"/>
-        <body pos="0 0 .098" euler="1 2 3"><freejoint/><geom type="box" size=".1 .15 .1" mass="1"/></body></worldbody></mujoco>""",
+        <body pos="0 0 .098" euler="1 2 3"><freejoint/><geom type="box" size=".1 .15 .1" mass="1"/></body>
+        </worldbody></mujoco>""",
     "ball joint, rolling, elliptic": f"""<mujoco><option cone="elliptic" {_SOLVER}/><worldbody>
         <geom type="plane" size="2 2 .1" condim="6"/><body pos="0 0 .3"><joint type="ball"/><geom size=".05" pos=".1 0 -.1"/>
         <body pos=".2 0 -.201"><joint type="ball"/><geom type="ellipsoid" size=".1 .08 .1" condim="6"/></body></body>
@@ -24,13 +25,13 @@ SCENES = {
     "muscle, tendon, filter": f"""<mujoco><option {_SOLVER}/><worldbody><body name="a"><joint name="j" axis="0 1 0" range="-1 1"
         damping=".1"/><geom type="capsule" size=".05" fromto="0 0 0 .3 0 0"/><body pos=".3 0 0"><joint name="k" axis="0 1 0"
         frictionloss=".01"/><geom type="capsule" size=".04" fromto="0 0 0 .3 0 0"/></body></body></worldbody>
-        <tendon><fixed name="t" limited="true" range="-.2 .2"><joint joint="j" coef=".5"/><joint joint="k" coef="-.3"/></fixed></tendon>
-        <actuator><muscle joint="j" lengthrange="-1 1"/><general joint="k" dyntype="filter" dynprm=".05" gainprm="3"/>
+        <tendon><fixed name="t" limited="true" range="-.2 .2"><joint joint="j" coef=".5"/><joint joint="k" coef="-.3"/></fixed>
+        </tendon><actuator><muscle joint="j" lengthrange="-1 1"/><general joint="k" dyntype="filter" dynprm=".05" gainprm="3"/>
         <position tendon="t" kp="5" ctrlrange="-.1 .1"/></actuator></mujoco>""",
     "RK4 and a slider-crank": f"""<mujoco><option integrator="RK4" {_SOLVER}/><worldbody><body><joint name="j" axis="0 0 1"/>
         <geom type="capsule" size=".03" fromto="0 0 0 .2 0 0"/><site name="crank" pos=".2 0 0"/></body><site name="slider"
-        pos=".6 0 0" zaxis="1 0 0"/></worldbody><actuator><position cranksite="crank" slidersite="slider" cranklength=".3" kp="50"/>
-        </actuator></mujoco>""",
+        pos=".6 0 0" zaxis="1 0 0"/></worldbody><actuator>
+        <position cranksite="crank" slidersite="slider" cranklength=".3" kp="50"/></actuator></mujoco>""",
 }
 
 

@@ -18,11 +18,14 @@ STICK = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .
     <geom type="capsule" fromto="-.25 0 0 .25 0 0" size=".03"/></body></worldbody></mujoco>"""
 # Both feet land at once, beside knees at their limits, and each hardly moves without the other.
 LEGS = """<mujoco><default><geom friction=".9"/><joint axis="0 1 0" armature=".01" damping=".1"/></default><worldbody>
-    <geom type="plane" size="5 5 .1"/><body pos="0 0 1.03"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint/>
+    <geom type="plane" size="5 5 .1"/><body pos="0 0 1.03"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+    <joint/>
     <geom type="capsule" size=".05" fromto="0 0 0 0 0 .4"/>
-    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 .1 0 0 .1 -.5"/><body pos="0 .1 -.5"><joint range="-150 0"/>
+    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 .1 0 0 .1 -.5"/>
+    <body pos="0 .1 -.5"><joint range="-150 0"/>
     <geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body>
-    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 -.1 0 0 -.1 -.5"/><body pos="0 -.1 -.5"><joint range="-150 0"/>
+    <body><joint range="-150 0"/><geom type="capsule" size=".04" fromto="0 -.1 0 0 -.1 -.5"/>
+    <body pos="0 -.1 -.5"><joint range="-150 0"/>
     <geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body></body></worldbody></mujoco>"""
 
 
@@ -167,7 +170,10 @@ def test_a_runge_kutta_step_spans_all_of_its_stages():
 
 
 def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
-    """A ball that a servo's box pushes along the floor: MuJoCo's own slope at 2 ms is twice its limit's, an artefact of the step."""
+    """A ball that a servo's box pushes along the floor.
+
+    MuJoCo's own slope at 2 ms is twice its limit's, an artefact of the step.
+    """
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
         <body pos="-.3 0 .1"><joint name="p" type="slide" axis="1 0 0" damping="1"/><geom type="box" size=".05 .2 .05" mass="1"/>

@@ -32,8 +32,8 @@ BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></def
 # A ball so small that between a hit and a miss lies nothing to be sampled; no gravity, so that its height is that of its start.
 WALL = """<mujoco><option timestep=".005" gravity="0 0 0"/><worldbody>
   <geom name="wall" type="box" pos="1 0 1" size=".05 1 .1"/><body name="ball" pos=".2 0 1.08">
-  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom name="ball" size=".00005" mass=".2"/>
-  </body></worldbody><keyframe><key name="throw" qvel="3 0"/></keyframe></mujoco>"""
+  <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+  <geom name="ball" size=".00005" mass=".2"/></body></worldbody><keyframe><key name="throw" qvel="3 0"/></keyframe></mujoco>"""
 
 
 def ball(timestep=0.002, height=0.3, gear=1, contact=""):
@@ -298,7 +298,7 @@ def test_sentences_are_short(wall):
 
 
 def line_of(slope, discrete, growth=1.0, fine=1.0):
-    """Outcomes that rise by 1 along a line at two times, by `fine` at a shorter step, and derivatives that are said to be theirs."""
+    """Outcomes that rise by 1 along a line at two times, by `fine` at a shorter step, and derivatives said to be theirs."""
     places = phases((-1.0, 1.0), 64)
     outcomes = np.repeat(places[:, None], 2, axis=1)[:, :, None]
     filled = [np.broadcast_to(np.reshape(one, (-1, 1, 1)), outcomes.shape) for one in (slope, discrete)]
