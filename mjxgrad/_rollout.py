@@ -205,8 +205,9 @@ def rollout(
             believed: contacts that chatter may multiply them at every switch. It takes as long as a derivative in forward mode.
         inputs: what else is given to each step, one row per step, by MuJoCo's names: `qfrc_applied`, `xfrc_applied`,
             `mocap_pos`, `mocap_quat`, `eq_active`. Differentiable, but for the last. What is not named stays as in `scene.data`.
-        engine: "mjx" or "mujoco": C MuJoCo on all cores of the processor, with nothing to compile, differentiable once. Its motion
-            has no onset, to the solver's tolerance; what has no meaning there is refused. None is the scene's own, `scene.engine`.
+        engine: "mjx" or "mujoco": C MuJoCo on all cores of the processor, with nothing to compile, differentiable once. Its
+            motion has no onset, to the solver's tolerance; what has no meaning there is refused. None is the scene's own,
+            `scene.engine`.
 
     Returns:
         The trajectory, with `horizon + 1` states.
@@ -248,7 +249,7 @@ def rollout(
         )
         added = jnp.zeros((horizon, nu), state.qvel.dtype) if noise is None else jnp.asarray(noise)
         if base is None:
-            return _native_loop(scene, state, controls, params, added, applied, gradient, velocity_limit)
+            return _native_loop(scene, state, controls, params, added, applied, gradient, velocity_limit)  # pyright: ignore[reportArgumentType]
         return _native_trajectory(scene, state, base + added, applied, gradient, velocity_limit)
     scene.check_mjx()
     policy = controls if callable(controls) else None

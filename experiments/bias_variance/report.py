@@ -201,6 +201,7 @@ def landscape(outcome: Outcome):
     """Cost against angle for each stiffness, without noise and under it."""
     figure, axes = subplots(1, 2, height=4.0, sharey=True)
     found, table = outcome.landscape, outcome.table
+    assert found is not None
     colours = iter(theme.shades(int((~table.is_default).sum())))
     looks = [
         {"color": theme.DEFAULT, "ls": (0, (4, 1.5)), "label": "default"}

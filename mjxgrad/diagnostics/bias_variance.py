@@ -155,7 +155,7 @@ class BiasVariance(eqx.Module):
     def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
         """What was swept, by name and value: stiffness, a plain array, or else the places in the list."""
         given = self.softness.stiffness if isinstance(self.softness, Softness) else self.softness
-        if eqx.is_array(given) and given.ndim == 1:
+        if eqx.is_array(given) and given.ndim == 1:  # pyright: ignore[reportOptionalMemberAccess]
             return "softness" if given is self.softness else "stiffness, 1/s²", np.asarray(given, float)
         return "number", np.arange(1.0, len(self.cost) + 1)
 
@@ -165,7 +165,8 @@ class BiasVariance(eqx.Module):
         Of several parameters they are norms, with intervals on the safe side (see `BiasConstrained`). What `_is_biased` is so
         beyond chance over the whole table.
         """
-        is_one, found = self.params.shape[1] == 1, {"finite_share": self.first.finite_fraction}
+        is_one = self.params.shape[1] == 1
+        found: dict[str, Any] = {"finite_share": self.first.finite_fraction}
         levels = self.confidence, 1 - (1 - self.confidence) / self.cost.size
 
         def add(name: str, value: ArrayLike, error: ArrayLike, count: ArrayLike) -> None:
@@ -198,7 +199,7 @@ class BiasVariance(eqx.Module):
             half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
             truth, *biases = (f"{one[x]:.3g}{half[x]}" for x in ("truth", *(f"{name}_bias" for name in names)))
             biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
-            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])
+            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
             variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
             at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
             lines.append([label, at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
@@ -303,9 +304,9 @@ def bias_variance(
         messages = [str(warning.message) for warning in caught if issubclass(warning.category, SceneWarning)]
         told.append(tuple(dict.fromkeys(messages)))
     # By the noise where it is known: the derivatives by the parameters follow from it, and α-order asks for it.
-    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
+    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances  # pyright: ignore[reportPossiblyUnboundVariable]
     wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
-    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
+    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1  # pyright: ignore[reportPossiblyUnboundVariable]
     # But on a line the reference comes from more runs of the same program: there is nothing else to compile.
     plan = Plan(num_samples, chunk_size, with_zero_noise=not is_line or baseline == "zero_noise", **wanted)
     batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
@@ -321,7 +322,7 @@ def bias_variance(
         first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
         mixed = (None, None)
         if batch is not None:
-            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)
+            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)  # pyright: ignore[reportArgumentType]
         found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
         if is_line:
             size = max(2, chunk_size or DEFAULT_CHUNK_SIZE)

@@ -110,7 +110,7 @@ def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[Bool[Array, ""], _Po
         value, slope = jax.jvp(gain, (share,), (jnp.ones_like(share),))
         is_curved = slope < -_FLAT
         share = share - jnp.where(is_curved, value / jnp.where(is_curved, slope, -1.0), 0.0)
-    return does_touch, radius * at(share)
+    return does_touch, radius * at(share)  # pyright: ignore[reportArgumentType]
 
 
 def _bends(a: _Point, b: _Point, radius: _Scalar) -> Bool[Array, ""]:

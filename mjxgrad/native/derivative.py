@@ -1,7 +1,7 @@
 """Rollouts of C MuJoCo under `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`.
 
-The motion is one call; the Jacobians of all its steps are another, once the motion is known, and a recursion in tangent space takes
-a change of the start to the end. JAX transposes that recursion, so forward and reverse mode are one formula.
+The motion is one call; the Jacobians of all its steps are another, once the motion is known, and a recursion in tangent space
+takes a change of the start to the end. JAX transposes that recursion, so forward and reverse mode are one formula.
 """
 
 import functools
@@ -45,7 +45,7 @@ def roll_out(
         return _callback(engine.run, shapes, numbers, start, inputs)
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
-    def _derivative(primals, tangents):
+    def _derivative(primals, tangents) -> tuple[dict[str, Array], dict[str, Array]]:
         numbers, start, inputs = primals
         found = call(*primals)
         by_number, by_start, by_input = tangents
@@ -112,7 +112,7 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
 
 
 def _or_zero(tangent) -> Array:
-    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent  # pyright: ignore[reportArgumentType]
 
 
 def to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:

@@ -80,7 +80,7 @@ class Engine:
         with self.lock, _quietly():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
             steps = inputs["ctrl"].shape[1]
-            rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in (start | inputs).items()})
+            rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
             found = {k: np.zeros((len(rows), *shape)) for k, shape in self.shapes(wanted, sizes).items()}
@@ -111,7 +111,7 @@ class Engine:
             num_steps, model = inputs["ctrl"].shape[1], self.mj_model
             sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "change": 2 * model.nv + model.na}
             found = {name: np.zeros((len(models), num_steps, size)) for name, size in sizes.items()}
-            first = self._rows(start | {name: value[:, 0] for name, value in inputs.items()})
+            first = self._rows({**start, **{name: value[:, 0] for name, value in inputs.items()}})
 
             def work(piece: tuple[int, np.ndarray]) -> None:
                 one = _Linearisation(self, self.data[piece[0]], gradient)
@@ -200,6 +200,7 @@ class _Linearisation:
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
         plain, model = self.models
+        assert model is not None
         parts, row, change = [self.places[name] for name in START[1:]], row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():

@@ -130,9 +130,9 @@ def load_scene(
         model, data = _put(stepped, name, max_contacts)
     if unsupported:
         model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS})
-    if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:
+    if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name, unsupported)
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name, unsupported)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]

@@ -148,12 +148,12 @@ class Scene(eqx.Module):
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
         chosen = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
-        model, derived = self.model.replace(**changed).tree_replace(chosen), {}
+        model, derived = self.model.replace(**changed).tree_replace(chosen), {}  # pyright: ignore[reportArgumentType]
         if constants.CAUSES & fields.keys():
             # These alone: what else is known of the model stays so while it is traced.
             derived = jax.jit(constants.constants_of)(model)
         elif "geom_size" in fields:
-            derived = {"geom_rbound": constants.bounding_radii(model)}
+            derived = {"geom_rbound": constants.bounding_radii(model)}  # pyright: ignore[reportArgumentType]
         return eqx.tree_at(lambda s: s.model, self, model.replace(**derived | changed))
 
     @property

@@ -166,7 +166,12 @@ class Mover:
             def run(qpos: Array, qvel: Array, act: Array, ctrl: Array) -> tuple:
                 state = State(qpos, qvel, act, jnp.zeros((), dtype), jnp.zeros_like(qvel))
                 course = rollout(
-                    with_contact(scene, contact), state, ctrl, gradient=kind, engine="mjx", checkpoint=False
+                    with_contact(scene, contact),
+                    state,
+                    ctrl,
+                    gradient=kind,  # pyright: ignore[reportArgumentType]
+                    engine="mjx",
+                    checkpoint=False,
                 )
                 return course.qpos[1:], course.qvel[1:], jnp.asarray(course.act)[1:]
 

@@ -80,7 +80,7 @@ def scene_task(
     cost = _named_cost(scene, cost) if isinstance(cost, str) else cost
     usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
     horizon = usual if horizon is None else horizon
-    return SceneTask(scene, state, cost, horizon, gradient=gradient, engine=engine)
+    return SceneTask(scene, state, cost, horizon, gradient=gradient, engine=engine)  # pyright: ignore[reportCallIssue]
 
 
 def load_function(name: str) -> Callable[..., Any]:
@@ -197,7 +197,7 @@ class Knob:
         if not task.num_controls:
             return parameter_noise(Partial(_thrown, task, along), self.noise, dim=1)
         half = jnp.asarray(half_range(scene), like)
-        return Push(task, self.noise * half, dim=1, direction=half * along)
+        return Push(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
 
     def __str__(self) -> str:
         kind = "actuator" if self.task.num_controls else "joint"
@@ -231,7 +231,7 @@ class Sweep:
             if f"{name}_bias" in table:
                 width = table[f"{name}_bias_high"] - table[f"{name}_bias_low"]
                 is_off = table[f"{name}_is_biased"] & (abs(table[f"{name}_bias"]) > _NONE * truth)
-                good = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()
+                good: list[bool] = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()  # pyright: ignore[reportAssignmentType]
                 until = good.index(False) if False in good else len(good)
                 where = (
                     f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else f"at {sum(good)} of {len(good)}"
