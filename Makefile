@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow bench throughput costs identify-bench robots gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow bench throughput engines costs identify-bench robots gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -56,6 +56,9 @@ bench: .venv/.installed  ## measure speed and memory against mjx.step
 
 throughput: .venv/.installed  ## measure a sweep over softness in one program against ten, and its memory
 	@$(BIN)/python -m experiments.benchmarks throughput $(ARGS)
+
+engines: .venv/.installed  ## measure a gradient by C MuJoCo, by MJX and by hand
+	@$(BIN)/python -m experiments.benchmarks engines $(ARGS)
 
 costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
 	@$(BIN)/python -m experiments.benchmarks costs $(ARGS)

@@ -121,6 +121,12 @@ def main(arguments: list[str] | None = None) -> None:
     costs.add_argument("--repeats", type=int, default=7)
     costs.add_argument("--only", default="", help="word that cases must hold, besides the plain ones")
     costs.set_defaults(run=_costs)
+    engines = commands.add_parser("engines", help="a gradient by C MuJoCo, by MJX and by hand")
+    engines.add_argument("--scene", nargs="*", choices=list(_SCENES), default=["hopper", "quadruped", "humanoid"])
+    engines.add_argument("--batch", type=int, nargs="*", default=[1, 16, 256])
+    engines.add_argument("--steps", type=int, default=50)
+    engines.add_argument("--repeats", type=int, default=3)
+    engines.set_defaults(run=_engines)
     throughput = commands.add_parser("throughput", help="a sweep over softness in one program against ten")
     throughput.add_argument("--samples", type=int, default=1000)
     throughput.set_defaults(run=_throughput)
@@ -389,6 +395,48 @@ def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespa
             f"{name:14} {case:34} {middle:8.1f} ms ({low:.1f} to {high:.1f})  ratio {middle / 1e3 / base:.2f}",
             flush=True,
         )
+
+
+def _engines(options: argparse.Namespace) -> None:
+    """Print seconds of a gradient by the start's velocities and all controls, of each engine and of what people write by hand."""
+    announce(f"{options.steps} steps, float32")
+    for name in options.scene:
+        model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # MuJoCo's own differences refuse RK4
+        scene = mg.load_scene(model)
+        for batch in options.batch:
+            random = np.random.default_rng(0)
+            speeds = jnp.asarray(0.3 * random.normal(size=(batch, scene.model.nv)), scene.data.qpos.dtype)
+            controls = jnp.asarray(0.1 * random.normal(size=(batch, options.steps, scene.model.nu)), speeds.dtype)
+
+            def cost(speeds: jax.Array, controls: jax.Array, engine: str, scene: mg.Scene = scene) -> jax.Array:
+                start = mg.initial_state(scene, qvel=speeds)
+                return jnp.sum(mg.rollout(scene, start, controls, gradient="slope", engine=engine).qpos[-1])  # pyright: ignore[reportArgumentType]
+
+            for engine in ("mujoco", "mjx"):
+                program = jax.jit(jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1))))
+                first, *runs = [_seconds(program, speeds, controls) for _ in range(options.repeats + 1)]
+                print(
+                    f"{name:12} {batch:4} {engine:8} first {first:7.2f} s, then {statistics.median(runs):8.3f} s",
+                    flush=True,
+                )
+            took = _by_hand(scene.mj_model, np.asarray(speeds, float), np.asarray(controls, float))
+            print(f"{name:12} {batch:4} mjd_transitionFD in a Python loop {took:8.3f} s", flush=True)
+
+
+def _by_hand(model: mujoco.MjModel, speeds: np.ndarray, controls: np.ndarray) -> float:
+    """Return how long a loop of steps and of MuJoCo's own differences takes (s); without the recursion that a gradient needs."""
+    data, started = mujoco.MjData(model), time.perf_counter()
+    size = 2 * model.nv + model.na
+    matrix, by_control = np.zeros((size, size)), np.zeros((size, model.nu))
+    for speed, rows in zip(speeds, controls, strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = speed
+        for row in rows:
+            data.ctrl[:] = row
+            mujoco.mjd_transitionFD(model, data, 1e-6, True, matrix, by_control, None, None)
+            mujoco.mj_step(model, data)
+    return time.perf_counter() - started
 
 
 def _throughput(options: argparse.Namespace) -> None:
