@@ -6,7 +6,6 @@ from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, fi
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, contacts_needed, unused
-from mjxgrad.diagnostics.onset import OnsetResolution, onset_resolution
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
@@ -22,7 +21,6 @@ __all__ = [
     "Landscape",
     "Missed",
     "OmissionCheck",
-    "OnsetResolution",
     "Rollouts",
     "Seconds",
     "SlopeComparison",
@@ -44,7 +42,6 @@ __all__ = [
     "growth",
     "jumps_along",
     "mean_interval",
-    "onset_resolution",
     "phases",
     "root_mean_square_interval",
     "soundness",

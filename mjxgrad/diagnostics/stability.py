@@ -32,7 +32,6 @@ from mjxgrad.contact.warnings import (
     name_pairs,
     steepest,
 )
-from mjxgrad.diagnostics.onset import LARGEST_JUMP, STEPS_NEEDED
 from mjxgrad.scene import Scene
 
 LEAST_FRICTION = 0.01
@@ -46,6 +45,8 @@ _LEGEND = (
     "of the pair act at once. steps: that a bounce lasts. asked: time constant in the file, where refsafe replaces it."
 )
 _SPEED_COLUMNS = ("depth", "rise, steps")
+# Steps across the rise of the impedance from which its force is resolved, and the impedance up to which it begins continuously.
+STEPS_NEEDED, LARGEST_JUMP = 2.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -289,7 +290,7 @@ class StabilityReport:
         unit = " m" if spring.kind == "contact" else ""
         return (
             f"at {at} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            "onset=mg.Onset(), as tasks do by default, or an impedance from 0 over a width of at least "
+            'gradient="slope", as tasks do by default, or an impedance from 0 over a width of at least '
             f"{STEPS_NEEDED * speed * self.timestep:.2g}{unit}"
         )
 
