@@ -122,10 +122,10 @@ def _drawing(line: Line, time: int, outcome: int) -> str:
         for value in (low, high):
             marks.append(f'<text x="{_LEFT - 6}" y="{up(value) + 4:.1f}" text-anchor="end">{value:.{digits}g}</text>')
         marks.append(f'<text x="{_WIDTH - _RIGHT}" y="{top - 6}" text-anchor="end">{label}</text>')
-    marks.append(f'<text x="{_LEFT}" y="14">dots: MuJoCo; line: its limit of short time steps</text>')
+    marks.append(f'<text x="{_LEFT}" y="14">dots: MuJoCo, line: shorter time steps</text>')
     label = _TOP + _PANEL + _GAP - 6
-    marks.append(f'<text class="plain" x="{_LEFT}" y="{label}">gradient="discrete"</text>')
-    marks.append(f'<text class="smooth" x="{_LEFT + 150}" y="{label}">gradient="slope"</text>')
+    marks.append(f'<text class="plain" x="{_LEFT}" y="{label}">discrete</text>')
+    marks.append(f'<text class="smooth" x="{_LEFT + 110}" y="{label}">slope</text>')
     marks.append(f'<text x="{_LEFT}" y="{_HEIGHT - 6}">place on the line, −1 to 1</text>')
     return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'
 
