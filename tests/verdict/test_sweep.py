@@ -176,10 +176,10 @@ def test_costs_by_name_are_what_c_mujoco_says(folder):
         ),
         (["block.xml", "--cost", "reach:block"], "reach is of two, as reach:hand/ball, got 'block'"),
         (["block.xml", "--cost", "hight:block"], "cost must be file.py:function, module:function, or of a body as"),
-        (["block.xml", "--start", "far"], "there is no key 'far' in the scene, but key: near"),
+        (["block.xml", "--start", "far"], "keyframe must be one of ['near'] in this scene, got 'far'"),
         (["block.xml", "--stiffness", "0"], "stiffness must be positive and finite, got 0.0"),
         (["block.xml", "--html", "nowhere/page.html"], "there is no folder nowhere"),
-        (["block.xml", "--gradient", "slop"], 'Choose from: "onset", "discrete", "event"'),
+        (["block.xml", "--gradient", "slop"], 'Choose from: "slope", "discrete"'),
     ],
 )
 def test_what_cannot_be_swept_is_said_in_one_sentence(folder, monkeypatch, capsys, arguments, said):
