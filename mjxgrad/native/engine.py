@@ -113,12 +113,14 @@ class Engine:
             found = {name: np.zeros((len(models), num_steps, size)) for name, size in sizes.items()}
             first = self._rows({**start, **{name: value[:, 0] for name, value in inputs.items()}})
 
+            # Speeds are not known before, so margins reach as far as those of twice the start's, or of a fall.
+            fall = num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity)
+            speeds = np.maximum(2 * np.abs(start["qvel"]), fall)
+
             def work(piece: tuple[int, np.ndarray]) -> None:
                 one = _Linearisation(self, self.data[piece[0]], gradient)
                 for i in piece[1].tolist():
-                    # Speeds are not known before, so margins reach as far as those of twice the start's, or of a fall.
-                    fall = np.full(model.nv, num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity))
-                    one.use(models, i, np.maximum(2 * np.abs(start["qvel"][i]), fall)[None])
+                    one.use(models, i, speeds)
                     course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
                     one.follow(first[i], *course, {k: v[i] for k, v in found.items()})
 
@@ -181,20 +183,20 @@ class _Linearisation:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
         num_steps = len(rows) // len(models)
         for i in index.tolist():
-            trajectory = i // num_steps
-            if models[trajectory] is not self.models[0]:
-                alike = [k for k, one in enumerate(models) if one is models[trajectory]]
-                self.use(models, trajectory, speeds[alike].reshape(-1, self.engine.mj_model.nv))
+            self.use(models, i // num_steps, speeds)
             if np.isfinite(rows[i]).all():
                 self._one(self.models[1], rows[i].copy(), {name: value[i] for name, value in found.items()})
 
-    def use(self, models: list, index: int, speeds: np.ndarray) -> None:
-        """Take a model for what follows, in which states move so fast."""
+    def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
+        """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
+        if models[index] is self.models[0]:
+            return
         model = copy.deepcopy(models[index])
         model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
         self.models = (models[index], model)
         if self.gradient == "slope":
-            self.surfaces = Surfaces(model, self.engine.levers, speeds)
+            alike = [k for k, one in enumerate(models) if one is models[index]]
+            self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
             self.far = mujoco.MjData(self.surfaces.model)
 
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:

@@ -1,6 +1,7 @@
 """Derivatives through C MuJoCo: those of its steps are `mjd_transitionFD`'s, and rollouts are differentiable both ways."""
 
 import copy
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -220,3 +221,19 @@ def test_a_change_that_is_followed_is_the_forward_derivative(gradient):
     qvel, change = jax.jvp(end, (jnp.zeros(12),), (jnp.asarray(direction),))
     np.testing.assert_allclose(found["qvel"][0], qvel, atol=1e-9)
     np.testing.assert_allclose(found["change"][0, :, 6:], change, atol=1e-5 * np.abs(change).max())
+
+
+def test_single_precision_has_the_same_derivative_at_rest_and_upright():
+    """A box that stands on the floor, in reverse mode: C MuJoCo computes in double, JAX rounds the rest."""
+
+    def slopes():
+        scene = mg.load_scene(SCENES["free box, pyramids"].replace('euler="1 2 3"', ""), engine="mujoco")
+        state = mg.initial_state(scene)
+        end = lambda v: mg.rollout(scene, dataclasses.replace(state, qvel=v), horizon=5, gradient="slope").qpos[-1]  # noqa: E731
+        return np.asarray(jax.jacrev(end)(jnp.zeros_like(state.qvel)))
+
+    double = slopes()
+    with jax.enable_x64(False):
+        single = slopes()
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, double, atol=1e-5 * np.abs(double).max())
