@@ -1,5 +1,9 @@
 """The slope of C MuJoCo's outcome: closed forms, secants of the outcome, and what events are."""
 
+from pathlib import Path
+
+import equinox as eqx
+import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +13,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.native.engine import Engine
-from mjxgrad.native.events import Surfaces, levers_of
+from mjxgrad.native.events import Surfaces, _moved_apart, levers_of
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
     <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
@@ -188,3 +192,24 @@ def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
     limit = np.polyfit(targets, Engine(model).run({}, start, {"ctrl": controls(16)})["qpos"][:, -1, 0], 1)[0]
     assert own > 1.8 * limit
     np.testing.assert_allclose(slope["change"][:, -1, 0].mean(), limit, rtol=0.1)
+
+
+def test_a_hopper_that_lands_on_its_limits_has_its_slope():
+    """gymnasium's, by Euler steps: what moves its foot would carry knee and hip off their limits, were they not held."""
+    file = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+    model = mujoco.MjModel.from_xml_path(str(file))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    scene = mg.load_scene(model)
+    scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.full(3, 0.1))  # motors press into the limits
+    found = _compared(scene, 1, (0.05, 0.07), 160, [0.5, 0, 0, 0, 0, 0])
+    off = np.abs(found.mean[0] - found.slope)
+    assert (off <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope)).all(), (found.mean[0], found.slope)
+
+
+def test_a_row_that_would_be_carried_across_zero_is_held():
+    """Of a foot moved by a height and a knee, (1, 1/2): the knee turns by 0.4 of the gap, unless its limit lies nearer."""
+    rows, widths = np.array([[1.0, 0.5], [0.0, -1.0]]), np.full(2, 1e-3)
+    for gap, moves in ((-1e-4, [1.0, 0.0]), (-1e-3, [0.8, 0.4])):
+        chosen = np.array([True, False])
+        found = _moved_apart(rows, np.array([0.0, gap]), np.zeros(2), widths, chosen, np.ones(2))
+        np.testing.assert_allclose(found.moves[:, 0], moves, atol=1e-12)
