@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow bench throughput engines costs identify-bench robots gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow mujoco4 bench throughput engines costs identify-bench robots gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -50,6 +50,13 @@ test: .venv/.installed  ## set all up and run the tests
 
 test-slow: .venv/.installed  ## the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+MUJOCO ?= >=4.0.1
+mujoco4: .venv/.installed  ## run C's engine, check and sweep beside a later MuJoCo, whose maths MJX lacks
+	@test -d .cache/mujoco4 || { $(PYTHON) -m venv .cache/mujoco4 && grep -v ^mujoco .ci/constraints.txt > .cache/others.txt; }
+	@.cache/mujoco4/bin/python -m pip install --quiet --disable-pip-version-check --constraint .cache/others.txt \
+	    --editable '.[test]' 'mujoco$(MUJOCO)'
+	@.cache/mujoco4/bin/python -m pytest -n 2 --dist worksteal tests/native tests/verdict $(PYTEST_ARGS)
 
 bench: .venv/.installed  ## measure speed and memory against mjx.step
 	@$(BIN)/python -m experiments.benchmarks bench $(ARGS)

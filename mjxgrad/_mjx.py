@@ -6,6 +6,7 @@ them there. Only those two lines are dropped: anything else said while importing
 """
 
 import contextlib
+import importlib.metadata
 import io
 import sys
 
@@ -30,8 +31,11 @@ try:
 finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
+MJX_VERSION = importlib.metadata.version("mujoco-mjx")
+
 __all__ = [
     "COLLISION_FUNCTIONS",
+    "MJX_VERSION",
     "compensate_gravity",
     "contact_groups",
     "counts",

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._mjx import counts, make_efc_address, make_efc_type, mjx
+from mjxgrad._mjx import MJX_VERSION, counts, make_efc_address, make_efc_type, mjx
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import (
@@ -114,6 +114,11 @@ def load_scene(
         if engine == "mujoco":
             raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
         _refuse_many_pairs(mj_model, name, wish)
+        if mujoco.__version__.split(".")[:2] != MJX_VERSION.split(".")[:2]:
+            raise SceneError(
+                f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
+                "pip install 'mjxgrad[mjx]' for MJX's step"
+            )
         conversions = _make_simulable(mj_model, name, wish, distance_fields)
         stepped = copy.deepcopy(mj_model)
         conversions += list(drop_sensors(stepped))
@@ -129,7 +134,8 @@ def load_scene(
     with jax.ensure_compile_time_eval():  # also where a function that is traced loads its own scene
         model, data = _put(stepped, name, max_contacts)
     if unsupported:
-        model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS})
+        touching = {name: getattr(original, name) for name in ("geom_contype", "geom_conaffinity", "geom_type")}
+        model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS, **touching})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name, unsupported)  # pyright: ignore[reportArgumentType]

@@ -311,8 +311,9 @@ def _contacts(scene: Scene) -> str:
     rows = [(name_pairs(pairs), *cells) for cells, pairs in groups.items()]
     count = len(scene.pairs)
     title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
-    slots, every = scene.data._impl.ncon, sum(map(len, candidates(scene.model).values()))
-    title += f"; room for {slots} contacts of {every}" if slots < every else f", at {every} points"
+    if not scene.unsupported:
+        slots, every = scene.data._impl.ncon, sum(map(len, candidates(scene.model).values()))
+        title += f"; room for {slots} contacts of {every}" if slots < every else f", at {every} points"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
     legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact"
     legend += "; stable while h²k + 2hb < 4" if is_euler else ""

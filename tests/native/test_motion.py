@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -121,3 +122,20 @@ def test_wrong_inputs_are_refused(scene):
         _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"ctrl": np.zeros((2, 2))})
     with pytest.raises(ValueError, match=r"inputs\['qfrc_applied'\] must have shape \(2, \d\), one row per step"):
         _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"qfrc_applied": np.zeros(3)})
+
+
+def test_softness_acts_on_a_scene_that_mjx_lacks():
+    """A cylinder dropped onto a box, ten times as stiff as in the file: the motion of a file that says so."""
+    xml = """<mujoco><worldbody><geom type="box" size=".2 .2 .1"/><body pos="0 0 .21"><freejoint/>
+      <geom type="cylinder" size=".05 .1" {}/></body></worldbody></mujoco>"""
+    with pytest.warns(mg.scene.SceneWarning, match="C MuJoCo steps it"):
+        scene = mg.load_scene(xml.format(""))
+    stiff = scene.with_softness(mg.Softness(stiffness=25e3, damping_ratio=1.0))
+    damping = 2 * np.sqrt(25e3)
+    model = mujoco.MjModel.from_xml_string(xml.format(f'solref="-25000 {-damping}" priority="1"'))
+    np.testing.assert_allclose(stiff.contact_parameters().stiffness, 25e3)
+    data = mujoco.MjData(model)
+    for qpos in mg.rollout(stiff, mg.initial_state(stiff), horizon=40).qpos[1:]:
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(qpos, data.qpos, atol=1e-9)
+    assert np.abs(data.qpos - mg.rollout(scene, mg.initial_state(scene), horizon=40).qpos[-1]).max() > 1e-4
