@@ -5,11 +5,13 @@ depend on is not wanted. Files are measured in processes of their own, where a c
 its first key frame or reference pose, moved by a thousandth, with small velocities and controls within their ranges: there no
 limit or contact is exactly at its surface, where a derivative has two values.
 
+- `mjx_motion`: the motion of one step of MJX's engine, in double precision, against `mj_step` of the file itself.
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
   own A and B from that function, so there the comparison is of what JAX makes of them.
-- `slope_single`: 50 steps by C's engine. The mean derivative, gradient="slope", against the slope of the motion over 33 starts;
-  "unresolved" where their error bars are too wide to tell.
+- `slope_single`: 50 steps by C's engine. The mean derivative, gradient="slope", against the slope of the motion over 33 to 513
+  starts. "consistent": within two standard errors, which are wide; "ill-defined": apart, but over so few steps' phases that there
+  is no slope to speak of; "flagged": off where `Trajectory.explodes` says so.
 
 Each result is a line of JSON in runs/robots/, and a second call goes on from there.
 """
@@ -47,11 +49,13 @@ _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: of 1e-12 as much as 2e-3 of A was left, for stiff contact.
 _SOLVE, _WIDTH = 1e-15, 1e-6
 _HORIZON, _INTERVAL = 50, (-0.25, 0.25)
-_PHASES = (33, 129)  # starts, and how many where that is off: the error bar of 33 is itself uncertain
+_PHASES = (33, 129, 513)  # starts, and how many where fewer do not tell
+_FEWEST_TEETH = 4  # steps' phases that starts must cover
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
 # condition of contact, stiff rows on light bodies, up to 1e5; C's engine computes in double precision in any case.
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
-PARTS = (*_LIMITS, "slope_single")
+_MOTION = "mjx_motion"
+PARTS = (*list(_LIMITS)[:2], "slope_single", _MOTION, *list(_LIMITS)[2:])
 _Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
 _Results = dict[str, dict[str, dict[str, Any]]]  # by part and path
 
@@ -127,52 +131,71 @@ def _far(ours: Any, theirs: np.ndarray, least: float = np.finfo(float).tiny) -> 
     return float(np.abs(ours - theirs).max(initial=0.0) / np.abs(theirs).max(initial=least))
 
 
+def moved_once(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
+    """Return how far MJX's step is off C MuJoCo's, and whether it was flagged."""
+    start = start_of(model, scene.data.qpos.dtype)
+    after = by_differences(model, start)[0]
+    state = mg.initial_state(scene, *start[:3])
+    course = eqx.filter_jit(mg.rollout)(scene, state, start[3][None], engine="mjx")
+    ends = (course.final.qpos, course.final.qvel, course.final.act)
+    return {"motion": max(map(_far, ends, after, (1.0, 1.0, 1.0))), "flagged": bool(course.diverged)}
+
+
 @eqx.filter_jit
-def _outcomes(scene: mg.Scene, start: _Start, weights: jax.Array, line: tuple, places: jax.Array) -> tuple:
-    """Return a weighted sum of how far positions have moved and its derivative along a line; NaN where flagged."""
+def _outcomes(
+    scene: mg.Scene, start: _Start, weights: jax.Array, line: tuple, places: jax.Array, measure_growth: bool
+) -> tuple:
+    """Return a weighted sum of how far positions have moved, NaN where flagged, whether it explodes, and its derivative."""
     qpos, qvel, act, ctrl = (jnp.asarray(x, places.dtype) for x in start)
 
-    def final(place: jax.Array) -> jax.Array:
+    def final(place: jax.Array) -> tuple[jax.Array, jax.Array]:
         controls = jnp.broadcast_to(ctrl + place * line[1], (_HORIZON, ctrl.size))
         state = mg.initial_state(scene, qpos, qvel + place * line[0], act)
-        course = mg.rollout(scene, state, controls, engine="mujoco", gradient="slope")
+        how = {"engine": "mujoco", "gradient": "slope", "measure_growth": measure_growth}
+        course = mg.rollout(scene, state, controls, **how)
         moved = position_change(scene.model, qpos, course.final.qpos)
-        return jnp.where(course.diverged, jnp.nan, weights @ moved)
+        return jnp.where(course.diverged, jnp.nan, weights @ moved), course.explodes
 
-    return jax.vmap(jax.value_and_grad(final))(places)
+    return jax.vmap(jax.value_and_grad(final, has_aux=True))(places)
 
 
-def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outcomes and derivatives along a line of velocities (1/s) and of controls (a tenth of their range)."""
+def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray, *, measure_growth: bool = False) -> tuple:
+    """Return outcomes, flags and derivatives along a line of velocities (1/s) and of controls (a tenth of their range)."""
     dtype, random = scene.data.qpos.dtype, np.random.default_rng(1)
     ranges = np.where(model.actuator_ctrllimited, np.ptp(model.actuator_ctrlrange, axis=1), 1.0)
     weights = random.normal(size=model.nv) / math.sqrt(model.nv)
     line = (random.normal(size=model.nv), 0.4 * ranges * random.normal(size=model.nu))
     given = jax.tree.map(lambda x: jnp.asarray(x, dtype), (weights, line, places))
-    return jax.tree.map(np.asarray, _outcomes(scene, start_of(model, dtype), *given))
+    (outcomes, flags), derivatives = _outcomes(scene, start_of(model, dtype), *given, measure_growth)
+    return np.asarray(outcomes), np.asarray(flags), np.asarray(derivatives)
 
 
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
     names, shown = "slope mean standard_error resolution num_teeth irregularity spread num_finite", {"steps": "off"}
     for count in _PHASES:
-        if shown["steps"] == "off":
-            outcomes, gradients = _along(model, scene, places := phases(_INTERVAL, count))
+        if shown["steps"] in ("off", "consistent"):
+            outcomes, _, gradients = _along(model, scene, places := phases(_INTERVAL, count))
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
-            shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()}
-            lost = int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))
-            shown |= {"starts": count, "lost": lost, "steps": "off" if lost else judged(shown)}
+            shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
+            shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
+    if shown["steps"] == "off" or shown["lost"]:
+        _, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
+        shown["lost"] = int(np.sum(np.isfinite(outcomes[0]) & ~np.isfinite(gradients) & ~flags))
+        shown["steps"] = "flagged" if flags.any() else shown["steps"]
     return shown
 
 
 def judged(shown: dict[str, float]) -> str:
     """Say whether a mean derivative is the slope within two standard errors or 5 %, if these are small enough to tell."""
     bar, size = 2 * shown["standard_error"], max(abs(shown["slope"]), abs(shown["mean"]))
-    if not math.isfinite(size):
+    if shown["num_finite"] < shown["starts"] / 2:
         return "diverged"
-    if abs(shown["mean"] - shown["slope"]) > max(bar, 0.05 * abs(shown["slope"]), shown["resolution"]):
+    if not math.isfinite(size):
         return "off"
-    return "right" if bar <= max(size / 4, shown["resolution"]) else "unresolved"
+    if not abs(shown["mean"] - shown["slope"]) <= max(bar, 0.05 * abs(shown["slope"]), shown["resolution"]):
+        return "ill-defined" if shown["num_teeth"] < _FEWEST_TEETH else "off"
+    return "right" if bar <= max(size / 4, shown["resolution"]) else "consistent"
 
 
 def load(path: str, *, newton: bool = False) -> mujoco.MjModel:
@@ -199,18 +222,20 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
         scene = mg.load_scene(model)
     if part == "slope_single":
         return many_steps(model, scene)
-    found: dict[str, Any] = {"engine": scene.engine, "why": scene.unsupported, "load": time.perf_counter() - begin}
+    found = {"engine": scene.engine, "why": scene.unsupported, "load": time.perf_counter() - begin}
     found["warned"] = any("instead of" in str(one.message) for one in told)
     if part == "c_single":
         _along(model, scene, np.zeros(1))
         found["seconds"] = round(time.perf_counter() - begin, 1)
+    if part == _MOTION:
+        return found | moved_once(model, scene)
     return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
 
 
 def serve(part: str, connection: Any) -> None:
     """Measure files whose paths come in, until this process is ended."""
     mujoco.set_mju_user_warning(lambda _: None)
-    jax.config.update("jax_enable_x64", part.endswith("double"))
+    jax.config.update("jax_enable_x64", not part.endswith("single"))
     while True:
         path, begin = connection.recv(), time.perf_counter()
         try:
@@ -273,13 +298,13 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
     if "error" in found:
         return [found["error"]]
     if found.get("lost"):
-        return [f"NaN without a flag at {found['lost']} of {found['starts']} starts"]
+        return [f"NaN without a flag at {found['lost']} starts"]
     if (verdict := found.get("steps")) == "off":
         return [f"{found['mean']:.3g} beside a slope of {found['slope']:.3g} ± {2 * found['standard_error']:.2g}"]
     if verdict or found["flagged"]:
         return []
-    largest, farthest = _LIMITS[part]
-    wrong = [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found[name] <= largest]
+    largest, farthest = _LIMITS.get(part, _LIMITS["mjx_double"])
+    wrong = [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found.get(name, 0.0) <= largest]
     moves = f"motion is off by {found['motion']:.1g} without a warning"
     return wrong + [moves] * (not found["motion"] <= farthest and not found["warned"])
 
@@ -293,7 +318,7 @@ def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
         wrong = {part: "; ".join(failures(part, one)) for part, one in parts.items()}
         file = path.removeprefix(f"{_CACHE}/")
         row = {"package": file.partition("/")[0], "file": file, "engine": first.get("engine"), "why": first.get("why")}
-        row |= {part: not wrong[part] if part in wrong else None for part in _LIMITS}
+        row |= {part: not wrong[part] if part in wrong else None for part in PARTS if part != "slope_single"}
         row |= {"50 steps": parts.get("slope_single", {}).get("steps"), "seconds": first.get("seconds")}
         found.append(row | {"failed": "; ".join(f"{part}: {text}" for part, text in wrong.items() if text)})
     return found
@@ -301,12 +326,12 @@ def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
 
 def table(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per package, and one for all."""
-    lines, words = [], ("right", "unresolved", "diverged", "off")
+    lines, words = [], ("right", "consistent", "ill-defined", "flagged", "diverged", "off")
     for package in [*dict.fromkeys(row["package"] for row in found), "all"]:
         own = [row for row in found if package in (row["package"], "all")]
         line: dict[str, Any] = {"package": package, "files": len(own), "taken": sum(bool(row["engine"]) for row in own)}
         line |= {f"by {name}": sum(row["engine"] == name for row in own) for name in ("mjx", "mujoco")}
-        for part in _LIMITS:
+        for part in (one for one in PARTS if one != "slope_single"):
             checked = [row[part] for row in own if row[part] is not None]
             line[part] = f"{sum(checked)} of {len(checked)}"
         line |= {f"slope {word}": sum(row["50 steps"] == word for row in own) for word in words}

@@ -1,5 +1,6 @@
 """Many steps: a scan with a lean carry, checkpointed, that says when it has gone wrong."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
@@ -240,17 +241,14 @@ def rollout(
     applied = _applied(scene, inputs, horizon)
     engine = scene.engine if engine is None else engine
     if engine != "mjx":
-        given = {"observe": observe, "onset": onset, "smoothing": smoothing, "measure_growth": measure_growth}
-        _check_engine(engine, [name for name, value in given.items() if value is not None and value is not False])
-        base = (
-            None
-            if callable(controls)
-            else jnp.broadcast_to(scene.data.ctrl if sequence is None else sequence, (horizon, nu))
-        )
+        given = {"observe": observe, "onset": onset, "smoothing": smoothing}
+        _check_engine(engine, [name for name, value in given.items() if value is not None])
+        base = None if callable(controls) else scene.data.ctrl if sequence is None else sequence
         added = jnp.zeros((horizon, nu), state.qvel.dtype) if noise is None else jnp.asarray(noise)
-        if base is None:
-            return _native_loop(scene, state, controls, params, added, applied, gradient, velocity_limit)  # pyright: ignore[reportArgumentType]
-        return _native_trajectory(scene, state, base + added, applied, gradient, velocity_limit)
+        chosen = controls if base is None else base + added
+        found = _by_mujoco(scene, state, chosen, params, added, applied, gradient, velocity_limit)  # pyright: ignore[reportArgumentType]
+        growth = _native_growth(scene, state, found.ctrl, applied, gradient) if measure_growth else None
+        return dataclasses.replace(found, growth=growth)
     scene.check_mjx()
     policy = controls if callable(controls) else None
     resting = jnp.broadcast_to(scene.data.ctrl, (horizon, nu))
@@ -390,8 +388,37 @@ def _check_engine(engine: str, given: list[str]) -> None:
         raise ValueError(f'engine="mujoco" is MuJoCo\'s own motion, got {" and ".join(given)}: leave it out')
 
 
+def _by_mujoco(
+    scene: Scene,
+    state: State,
+    controls: Policy | Float[Array, "horizon nu"],
+    params: PyTree,
+    noise: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
+) -> Trajectory:
+    """Return what C MuJoCo makes of controls, noise included, or of a policy; from the first bad step on the last good state."""
+    if not callable(controls):
+        return _native_course(scene, state, controls, applied, gradient, velocity_limit)
+
+    def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
+        state, first_bad = carry
+        index, disturbance, forces = given
+        ctrl = _one_each(controls(params, state), scene.model.nu) + disturbance
+        forces = jax.tree.map(lambda x: x[None], forces)
+        one = _native_course(scene, state, ctrl[None], forces, gradient, velocity_limit)
+        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
+        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
+        return (moved, first_bad), (state, ctrl)
+
+    steps = jnp.arange(len(noise), dtype=jnp.int32)
+    (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), (steps, noise, applied))
+    return _course(jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), states, final), ctrl, first_bad)
+
+
 @eqx.filter_jit
-def _native_trajectory(
+def _native_course(
     scene: Scene,
     state: State,
     ctrl: Float[Array, "horizon nu"],
@@ -399,7 +426,6 @@ def _native_trajectory(
     gradient: Gradient,
     velocity_limit: float | None,
 ) -> Trajectory:
-    """Return what C MuJoCo makes of controls; from the first bad step on the last good state."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
     is_finite = jnp.isfinite(ctrl)  # MuJoCo takes another for zero
     given = {
@@ -415,58 +441,34 @@ def _native_trajectory(
     time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
     states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
     is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
-    diverged, first_bad = jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32)
-    kept = jnp.where(diverged, jnp.minimum(jnp.arange(len(ctrl) + 1), first_bad), jnp.arange(len(ctrl) + 1))
-    states = jax.tree.map(lambda x: x[kept], states)
-    return Trajectory(
-        qpos=states.qpos,
-        qvel=states.qvel,
-        ctrl=ctrl,
-        observations=None,
-        final=jax.tree.map(lambda x: x[-1], states),
-        diverged=diverged,
-        first_bad_step=jnp.where(diverged, first_bad, -1),
-        act=states.act,
+    first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
+    kept = jnp.arange(len(ctrl) + 1)
+    kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
+    return _course(jax.tree.map(lambda x: x[kept], states), ctrl, first_bad)
+
+
+def _course(states: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
+    final = jax.tree.map(lambda x: x[-1], states)
+    return Trajectory(states.qpos, states.qvel, ctrl, None, final, first_bad >= 0, first_bad, act=states.act)  # pyright: ignore[reportCallIssue]
+
+
+def _native_growth(
+    scene: Scene, state: State, ctrl: Array, applied: dict[str, Array], gradient: Gradient
+) -> Float[Array, ""]:
+    """Return how many times longer a change of the start becomes; it has no derivative."""
+    given = (scene, state, ctrl, applied)
+    scene, state, ctrl, applied = jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, given
     )
 
+    def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        start = dataclasses.replace(state, qpos=qpos, qvel=qvel)
+        found = _native_course(scene, start, ctrl, applied, gradient, None)
+        return found.qpos, found.qvel
 
-def _native_loop(
-    scene: Scene,
-    state: State,
-    policy: Policy,
-    params: PyTree,
-    noise: Float[Array, "horizon nu"],
-    applied: dict[str, Array],
-    gradient: Gradient,
-    velocity_limit: float | None,
-) -> Trajectory:
-    """Return what C MuJoCo makes of a policy, which is asked before each step."""
-
-    def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
-        state, first_bad = carry
-        index, disturbance, forces = given
-        ctrl = _one_each(policy(params, state), scene.model.nu) + disturbance
-        forces = jax.tree.map(lambda x: x[None], forces)
-        one = _native_trajectory(scene, state, ctrl[None], forces, gradient, velocity_limit)
-        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
-        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
-        return (moved, first_bad), (state.qpos, state.qvel, state.act, ctrl)
-
-    steps = jnp.arange(len(noise), dtype=jnp.int32)
-    (final, first_bad), course = jax.lax.scan(advance, (state, jnp.int32(-1)), (steps, noise, applied))
-    qpos, qvel, act = (
-        jnp.concatenate([x, last[None]]) for x, last in zip(course, (final.qpos, final.qvel, final.act), strict=False)
-    )
-    return Trajectory(
-        qpos=qpos,
-        qvel=qvel,
-        ctrl=course[3],
-        observations=None,
-        final=final,
-        diverged=first_bad >= 0,
-        first_bad_step=first_bad,
-        act=act,
-    )
+    _, change = jax.jvp(course, (state.qpos, state.qvel), _direction(state))
+    size = jnp.linalg.norm(jnp.concatenate(change, axis=1), axis=1).max()
+    return jnp.where(jnp.isfinite(size), jnp.maximum(size, 1.0), jnp.inf)
 
 
 def _is_crowded(model: mjx.Model, data: mjx.Data, onset: Onset | None, smoothing: Smoothing | None) -> Bool[Array, ""]:

@@ -179,6 +179,7 @@ class _Linearisation:
         self.engine, self.data, self.gradient, self.places = engine, data, gradient, engine.places
         self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
 
+    @np.errstate(invalid="ignore", over="ignore")
     def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: np.ndarray, found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
         num_steps = len(rows) // len(models)
@@ -199,6 +200,7 @@ class _Linearisation:
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
             self.far = mujoco.MjData(self.surfaces.model)
 
+    @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
         plain, model = self.models
@@ -209,7 +211,7 @@ class _Linearisation:
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            events, clear = self._events(model, row, ends[1])
+            events, spanned, clear = self._events(model, row, ends[1])
             size = max(np.abs(change).max(), np.abs(push).max(initial=0.0), 1e-30)
             nv, felt = model.nv, np.zeros(0)
             if events is not None:
@@ -223,7 +225,7 @@ class _Linearisation:
                 sides[-1][self.places["ctrl"]] += side * push
             change = self._difference(model, *sides) * size / (2 * _WIDTH)
             if events is not None:
-                change += self._spanned(model, row, events) @ felt
+                change += spanned @ felt
             for place, end in zip(parts, ends, strict=True):
                 row[place] = end
             row[self.places["time"]] += model.opt.timestep
@@ -236,22 +238,26 @@ class _Linearisation:
         if not np.isfinite(after).all():
             return
         row[self.places["warmstart"]] = self.data.qacc_warmstart
-        events, clear = self._events(model, row, after)
+        events, spanned, clear = self._events(model, row, after)
         self._small(model, clear, found)
         if events is not None:
             matrix = found["state"]
-            nv, change = model.nv, self._spanned(model, row, events) - matrix[:, : model.nv] @ events.moves
+            nv, change = model.nv, spanned - matrix[:, : model.nv] @ events.moves
             matrix[:, :nv] += change @ events.rows
             matrix[:, nv : 2 * nv] += self.surfaces.lead * change @ events.rows
 
-    def _events(self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray) -> tuple[Events | None, np.ndarray]:
-        """Return what a step may begin or end, and the state from which small differences stay on one side of each surface."""
+    def _events(
+        self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
+    ) -> tuple[Events | None, np.ndarray, np.ndarray]:
+        """Return what a step may begin or end, D, and the state about which small differences cross no surface."""
+        nothing = (None, np.zeros((0, 0)), row)
         if self.gradient != "slope" or not np.isfinite(after).all():
-            return None, row
+            return nothing
         mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
         events = self.surfaces.events(self.far, row[self.places["qvel"]], after)
-        if events is None:
-            return None, row
+        spanned = None if events is None else self._spanned(model, row, events)
+        if events is None or not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
+            return nothing
         near, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
         off = events.gaps - surfaces
         off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
@@ -260,7 +266,7 @@ class _Linearisation:
         if self.surfaces.lead:
             for move, width in zip(events.moves.T, near / 4, strict=True):
                 clear = self._off_stages(model, clear, width * move)
-        return events, clear
+        return events, spanned, clear
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.

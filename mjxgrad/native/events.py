@@ -16,7 +16,7 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight; it moves with the velocity, too, so J stands for (J, hJ/2) there.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
-  impedance's width (0.06 mm by default). v' and ε bound what contacts that chatter multiply.
+  impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
@@ -40,7 +40,7 @@ from jaxtyping import Bool, Float
 _LEAST_WIDTH = 0.06  # of the impedance's width
 _STAGES = 1.2  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
 _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
-_USUAL_WIDTH, _ENDLESS = 1e-3, 1e3  # m or rad, of an impedance that has none, and what counts as none
+_USUAL_WIDTH = 1e-3  # m or rad; wider impedances, of soft limits, reach states that come to no surface
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
 _FARTHEST = 10.0
 _LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON.value)
@@ -128,7 +128,7 @@ class Surfaces:
         margin = np.concatenate([np.full(len(first), self.contact_reach), np.full(len(limits), self.limit_reach)])
         address = np.concatenate([first, limits])
         first_impedance, _, width, *_ = np.concatenate(solimp).T
-        width = np.where((width > 0) & (width < _ENDLESS), width, _USUAL_WIDTH)
+        width = np.where(width > 0, np.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
         return (
             rows,

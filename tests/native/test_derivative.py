@@ -12,6 +12,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad.dynamics.kinematics import integrate_position
 from mjxgrad.native.engine import engine_of
+from mjxgrad.tasks import scene_path
 
 # MuJoCo's own tolerance would leave more in each difference than it is to be compared to.
 _SOLVER = 'tolerance="1e-14" iterations="200"'
@@ -237,3 +238,32 @@ def test_single_precision_has_the_same_derivative_at_rest_and_upright():
         single = slopes()
     assert single.dtype == np.float32
     np.testing.assert_allclose(single, double, atol=1e-5 * np.abs(double).max())
+
+
+def test_growth_is_that_of_the_other_engine_and_has_no_derivative():
+    scene = mg.load_scene(scene_path("double_pendulum"))
+
+    def swung(torque, engine):
+        controls = jnp.tile(jnp.array([torque, 0.0]), (30, 1))
+        course = mg.rollout(scene, mg.initial_state(scene), controls, engine=engine, measure_growth=True)
+        return course.qpos[-1, 0], (course.growth, course.explodes)
+
+    (by_c, by_mjx) = (jax.value_and_grad(swung, has_aux=True)(0.1, engine) for engine in ("mujoco", "mjx"))
+    np.testing.assert_allclose(by_c[0][1], by_mjx[0][1], rtol=1e-6)  # differences of 1e-6
+    np.testing.assert_allclose(by_c[1], by_mjx[1], rtol=1e-6)
+    assert not by_c[0][1][1]
+
+
+def test_derivatives_that_contacts_at_rounding_multiply_are_flagged():
+    """A sphere slides along the floor, at a gap that is zero to rounding and that no joint can change."""
+    scene = mg.load_scene("""<mujoco><option integrator="RK4" timestep="0.02"/><worldbody><geom type="plane" size="9 9 1"/>
+      <body><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint axis="0 0 1"/>
+        <geom pos="0 0 .5" size=".5"/><geom type="box" pos=".6 0 .5" size=".5 .1 .1" contype="0" conaffinity="0"/></body>
+      </worldbody></mujoco>""")
+    velocity = jnp.array([0.3, -0.1, 0.2])
+
+    def course(qvel):
+        return mg.rollout(scene, mg.initial_state(scene, qvel=qvel), horizon=50, engine="mujoco", measure_growth=True)
+
+    assert not course(velocity).diverged
+    assert course(velocity).explodes
