@@ -19,9 +19,9 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
 
 
-def num_compilers(*, besides: int = 0) -> int:
-    """Say how many programs to compile side by side: one per core but for some, as many as memory has room for."""
-    return max(1, min(num_cores() - besides, _MOST))
+def num_compilers() -> int:
+    """Say how many programs to compile side by side: one per core, as many as memory has room for."""
+    return min(num_cores(), _MOST)
 
 
 def in_threads(

@@ -22,7 +22,7 @@ from mjxgrad._rollout import (
 )
 from mjxgrad.contact import Softness
 from mjxgrad.devices import keep_compiled, over_devices
-from mjxgrad.diagnostics import check_omissions, check_stability
+from mjxgrad.diagnostics import check_stability
 from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.identification import identify
 from mjxgrad.linearisation import Linearisation, linearise
@@ -38,7 +38,7 @@ from mjxgrad.optimiser import (
     optimise,
 )
 from mjxgrad.policy import linear_policy, mlp_policy
-from mjxgrad.scene import LeaveOut, Scene, load_scene, sensor, site_position
+from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.task import SceneTask
 from mjxgrad.verdict import Verdict, check, sweep
 
@@ -46,7 +46,6 @@ __all__ = [
     "Convergence",
     "DivergedError",
     "History",
-    "LeaveOut",
     "Linearisation",
     "Objective",
     "Onset",
@@ -63,7 +62,6 @@ __all__ = [
     "Verdict",
     "baselines",
     "check",
-    "check_omissions",
     "check_stability",
     "check_trajectory",
     "closed_loop",

@@ -2,10 +2,10 @@
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
 from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare
+from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
-from mjxgrad.diagnostics.omissions import Missed, OmissionCheck, check_omissions, contacts_needed, unused
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
 from mjxgrad.diagnostics.soundness import Soundness, UnsoundGradientError, check_soundness, soundness
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
@@ -19,8 +19,6 @@ __all__ = [
     "Growth",
     "Jumps",
     "Landscape",
-    "Missed",
-    "OmissionCheck",
     "Rollouts",
     "Seconds",
     "SlopeComparison",
@@ -29,7 +27,6 @@ __all__ = [
     "UnsoundGradientError",
     "bias_interval",
     "bias_variance",
-    "check_omissions",
     "check_soundness",
     "check_stability",
     "compare",
@@ -45,5 +42,4 @@ __all__ = [
     "phases",
     "root_mean_square_interval",
     "soundness",
-    "unused",
 ]

@@ -2,12 +2,11 @@
 
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.load import load_scene
-from mjxgrad.scene.omissions import LeaveOut, Omission
+from mjxgrad.scene.omissions import Omission
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, sensor, site_position
 
 __all__ = [
     "Conversion",
-    "LeaveOut",
     "Omission",
     "Scene",
     "SceneError",

@@ -27,7 +27,7 @@ from mjxgrad.scene.conversions import (
     kinematics_alone,
     searched_contacts,
 )
-from mjxgrad.scene.omissions import LeaveOut, omit, omit_pairs, switch_off
+from mjxgrad.scene.omissions import switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
@@ -42,7 +42,6 @@ def load_scene(
     source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel,
     *,
     softness: Softness | None = None,
-    leave_out: LeaveOut | None = None,
     keep_everything: bool = False,
     timestep: float | None = None,
     max_contacts: int | None = None,
@@ -60,7 +59,6 @@ def load_scene(
     Args:
         source: path of an MJCF file, MJCF as a string, a `MjSpec` or a C model; neither is changed.
         softness: contact softness to set, instead of that in the file.
-        leave_out: contacts and limits to do without on top of that; see `LeaveOut`.
         keep_everything: leave out nothing, and keep the solver tolerance and the storage of
             matrices as in the file. The motion is the same to rounding.
         timestep: in s, instead of that in the file.
@@ -79,13 +77,10 @@ def load_scene(
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if the path is a folder.
         TypeError: if the source is none of these.
-        ValueError: if `timestep` or `max_contacts` is not positive, `leave_out` does not fit the scene or is given beside
-            `keep_everything`, or as `Softness.apply`.
+        ValueError: if `timestep` or `max_contacts` is not positive, or as `Softness.apply`.
         SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or, where MJX is asked for, so many geoms can touch
             that loading would take minutes, or MJX cannot simulate it; all unsupported features are named at once.
     """
-    if keep_everything and leave_out is not None:
-        raise ValueError("leave_out must be None with keep_everything=True, got both; give one of them")
     if softness is not None and not isinstance(softness, Softness):
         raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
     if max_contacts is not None and max_contacts < 1:
@@ -108,27 +103,27 @@ def load_scene(
     if mj_model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
-    unsupported, wish = "", leave_out or LeaveOut()
+    unsupported = ""
     original = copy.deepcopy(mj_model)
     try:
         if engine == "mujoco":
             raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
-        _refuse_many_pairs(mj_model, name, wish)
+        _refuse_many_pairs(mj_model, name)
         if mujoco.__version__.split(".")[:2] != MJX_VERSION.split(".")[:2]:
             raise SceneError(
                 f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
                 "pip install 'mjxgrad[mjx]' for MJX's step"
             )
-        conversions = _make_simulable(mj_model, name, wish, distance_fields)
+        conversions = _make_simulable(mj_model, name, distance_fields)
         stepped = copy.deepcopy(mj_model)
         conversions += list(drop_sensors(stepped))
     except SceneError as error:
         if engine == "mjx" or original.nflex:
             raise
         mj_model, stepped, conversions, unsupported = original, kinematics_alone(original), [], str(error)
-    omitted, omissions = omit(stepped, leave_out) if leave_out is not None else ((), ())
+    omissions = ()
     if not keep_everything and not unsupported:
-        omissions += switch_off(stepped)
+        omissions = switch_off(stepped)
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped) if not unsupported or count_pairs(mj_model) > MOST_PAIRS else contact_pairs(mj_model)
     with jax.ensure_compile_time_eval():  # also where a function that is traced loads its own scene
@@ -138,7 +133,7 @@ def load_scene(
         model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS, **touching})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, omitted, name, unsupported)  # pyright: ignore[reportArgumentType]
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
@@ -194,8 +189,8 @@ def _parse(read, argument: str | mujoco.MjSpec, name: str) -> tuple[mujoco.MjMod
         raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (error)
 
 
-def _refuse_many_pairs(model: mujoco.MjModel, name: str, leave_out: LeaveOut) -> None:
-    count = count_pairs(model) - len(leave_out.pairs)
+def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
+    count = count_pairs(model)
     if count > MOST_PAIRS:
         raise SceneError(
             f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
@@ -236,21 +231,16 @@ def count_pairs(model: mujoco.MjModel) -> int:
     return count + model.npair
 
 
-def _make_simulable(
-    mj_model: mujoco.MjModel, name: str, leave_out: LeaveOut, distance_fields: bool
-) -> list[Conversion]:
-    """Convert in place what can be converted; refuse the rest, but for pairs that are left out."""
+def _make_simulable(mj_model: mujoco.MjModel, name: str, distance_fields: bool) -> list[Conversion]:
+    """Convert in place what can be converted; refuse the rest."""
     conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
-    lean = copy.deepcopy(mj_model)
-    if leave_out.pairs:
-        omit_pairs(lean, leave_out)
-    refused = refusal_messages(lean, distance_fields=distance_fields)
+    refused = refusal_messages(mj_model, distance_fields=distance_fields)
     if len(refused) == 1:
         raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
     if refused:
         listed = "\n".join(f"  - {message}" for message in refused)
         raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
-    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model)), *searched_contacts(lean)]
+    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model)), *searched_contacts(mj_model)]
 
 
 def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:

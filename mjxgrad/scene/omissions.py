@@ -1,16 +1,14 @@
-"""What a step of a scene leaves out: what its motion does not need, and what a user lets it do without."""
+"""What a step of a scene leaves out because its motion does not need it, and why."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from mjxgrad._mjx import make_efc_type
-from mjxgrad.contact.parameters import ContactPair, contact_pairs, named_pairs
+from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.refusals import has_friction_loss, has_limits, has_medium
 
-_NUM_MASK_BITS = 31  # of a signed integer, the sign left alone
 _DISABLE = mujoco.mjtDisableBit
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
 
@@ -26,22 +24,6 @@ class Omission:
 
     what: str
     reason: str
-
-
-@dataclass(frozen=True)
-class LeaveOut:
-    """Contacts and limits that a scene is to do without, on your word.
-
-    Whether a motion needed them after all is what `mg.check_omissions` says; `mg.diagnostics.unused` lists what
-    recorded motions did not come near.
-
-    Attributes:
-        pairs: pairs of geoms by name that touch in no motion of interest.
-        limits: joints by name that reach their limits in no motion of interest.
-    """
-
-    pairs: tuple[tuple[str, str], ...] = ()
-    limits: tuple[str, ...] = ()
 
 
 def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
@@ -135,87 +117,3 @@ _TABLE: tuple[tuple[str, Callable[[mujoco.MjModel], str | None]], ...] = (
     ("outputs of a step that nobody reads",
      lambda m: "a compiled rollout carries only the state, so XLA removes them"),
 )  # fmt: skip
-
-
-def omit(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ...], tuple[Omission, ...]]:
-    """Leave out pairs and limits of a model, in place; return the pairs, and what was done in words.
-
-    Raises:
-        ValueError: if a name is unknown, a pair is listed as `<pair>` in the file, or there are too many different
-            pairs to leave out.
-    """
-    rows = len(make_efc_type(model))
-    everything, omitted = omit_pairs(model, wanted)
-    omissions = []
-    if omitted:
-        more = f" + {len(omitted) - 4} more" if len(omitted) > 4 else ""
-        listed = ", ".join(str(pair) for pair in omitted[:4]) + more
-        omissions.append(Omission(f"contact of {len(omitted)} of {len(everything)} pairs", f"as asked: {listed}"))
-    model.jnt_limited[[_limited_joint(model, name) for name in wanted.limits]] = 0
-    if wanted.limits:
-        omissions.append(Omission(f"{len(wanted.limits)} of the joint limits", f"as asked: {', '.join(wanted.limits)}"))
-    if omissions:
-        omissions.append(Omission("constraint rows", f"{len(make_efc_type(model))} remain of {rows}"))
-    return omitted, tuple(omissions)
-
-
-def omit_pairs(model: mujoco.MjModel, wanted: LeaveOut) -> tuple[tuple[ContactPair, ...], tuple[ContactPair, ...]]:
-    """Leave out pairs of a model, in place; return all that it had and those left out. Raises ValueError as `omit` does."""
-    everything = contact_pairs(model)
-    omitted = named_pairs(everything, wanted.pairs, "leave_out.pairs")
-    for pair in omitted:
-        if pair.explicit >= 0:
-            raise ValueError(
-                f"leave_out.pairs must not name a pair listed as <pair> in the MJCF, got {str(pair)!r}; remove it there"
-            )
-    if omitted:
-        keep_pairs(model, (pair for pair in everything if pair.explicit < 0 and pair not in omitted))
-    return everything, omitted
-
-
-def keep_pairs(model: mujoco.MjModel, kept: Iterable[ContactPair]) -> None:
-    """Set `contype` and `conaffinity` in place so that of all pairs only these collide, in the same order as before.
-
-    Geoms that collide with the same others share a bit: theirs is the type, the others have the affinity. Bits are given
-    out until every pair has one, first to those that settle most pairs. What MuJoCo filters by other rules (geoms of one
-    rigid body, of parent and child, excluded bodies) stays filtered, and explicit pairs, which `kept` has none of, stay as they
-    are. Raises ValueError if 31 bits do not suffice.
-    """
-    neighbours: dict[int, set[int]] = {}
-    for pair in kept:
-        neighbours.setdefault(pair.geom1, set()).add(pair.geom2)
-        neighbours.setdefault(pair.geom2, set()).add(pair.geom1)
-    alike: dict[frozenset[int], list[int]] = {}
-    for geom, others in neighbours.items():
-        alike.setdefault(frozenset(others), []).append(geom)
-    contype, conaffinity = np.zeros(model.ngeom, int), np.zeros(model.ngeom, int)
-    unsettled = {frozenset((geom, other)) for geom, others in neighbours.items() for other in others}
-    bit = 0
-    while unsettled:
-        if bit == _NUM_MASK_BITS:
-            raise ValueError(
-                f"leave_out must leave pairs that the {_NUM_MASK_BITS} bits of MuJoCo's collision masks can tell apart; "
-                "name fewer pairs or all of a geom"
-            )
-        settled = {others: unsettled & _between(geoms, others) for others, geoms in alike.items()}
-        others = max(settled, key=lambda one: len(settled[one]))
-        contype[alike[others]] |= 1 << bit
-        conaffinity[sorted(others)] |= 1 << bit
-        unsettled -= settled[others]
-        bit += 1
-    model.geom_contype[:], model.geom_conaffinity[:] = contype, conaffinity
-
-
-def _between(geoms: Iterable[int], others: Iterable[int]) -> set[frozenset[int]]:
-    return {frozenset((geom, other)) for geom in geoms for other in others}
-
-
-def _limited_joint(model: mujoco.MjModel, name: str) -> int:
-    joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-    if joint >= 0 and model.jnt_limited[joint]:
-        return joint
-    known = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) for j in range(model.njnt) if model.jnt_limited[j]]
-    raise ValueError(
-        f"leave_out.limits must name joints with limits, got {name!r}; "
-        f"those that have: {', '.join(filter(None, known)) or 'none'}"
-    )

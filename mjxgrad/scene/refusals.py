@@ -233,7 +233,7 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
 _SEARCH = (
     "exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
     searched_pairs,
-    "use capsules, spheres or boxes, exclude the pair by contype and conaffinity, <contact><exclude> or leave_out, or take MJX's "
+    "use capsules, spheres or boxes, exclude the pair by contype and conaffinity or <contact><exclude>, or take MJX's "
     "search by load_scene(..., distance_fields=True): its normal may be off by 10 degrees, its derivative by any factor, or NaN",
 )
 

@@ -51,7 +51,6 @@ class Scene(eqx.Module):
         omissions: what a step leaves out, and why.
         conversions: settings replaced by others, and why.
         pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
-        omitted_pairs: pairs whose contact is left out although the file has it, as `LeaveOut` asked.
         name: where the scene came from.
         unsupported: why MJX cannot step it, so that C MuJoCo does; empty where it can.
     """
@@ -62,7 +61,6 @@ class Scene(eqx.Module):
     omissions: tuple[Omission, ...] = eqx.field(static=True)
     conversions: tuple[Conversion, ...] = eqx.field(static=True)
     pairs: tuple[ContactPair, ...] = eqx.field(static=True)
-    omitted_pairs: tuple[ContactPair, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Engine, Trajectory
 from mjxgrad.contact.warnings import format_number
-from mjxgrad.diagnostics.omissions import contacts_needed
+from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.scene.load import count_pairs

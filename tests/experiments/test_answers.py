@@ -139,15 +139,6 @@ def shaken(found, slopes=()):
     return SimpleNamespace(by_shape=by_shape, slopes=slopes, settings=SimpleNamespace(threshold=0.05))
 
 
-def lighter(*ratios, changed=0):
-    """Scenes by what a step takes of its time without what no motion needs."""
-    variants = [
-        SimpleNamespace(step=SimpleNamespace(ratio=(x, x, x)), is_same_program=x == 1, is_unchanged=i >= changed)
-        for i, x in enumerate(ratios)
-    ]
-    return SimpleNamespace(scenes=[SimpleNamespace(find=lambda _, v=v: v) for v in variants])
-
-
 def priced(*costs, estimator=None):
     """Scenes by seconds per simulated second of a step that is right; none where the step is wrong."""
     from experiments.work_precision.outcome import MG, Estimate, Knobs, Point, Variant
@@ -321,12 +312,6 @@ CASES = [
     ),
     ("artificial_discontinuity", shaken({"box": 0.4, "ball": 0.0, "2 × 2 points": 0.9}), "Box and points."),
     ("artificial_discontinuity", shaken(dict.fromkeys(["a b c", "d e f", "g h"], 1.0) | {"ball": 0.0}), "3 of 4."),
-    (
-        "ablation",
-        lighter(0.69, 0.9, 1.0),
-        "What no motion needs costs up to 31% of a step; without it nothing changes.",
-    ),
-    ("ablation", lighter(0.69, 0.9, changed=2), "What no motion needs costs up to 31% of a step; 2 scenes change."),
     (
         "work_precision",
         priced(5e-4, 2e-3, estimator="first order, onset"),

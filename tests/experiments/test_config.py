@@ -78,7 +78,10 @@ def test_an_array_that_is_too_short_for_its_own_mistakes_alone_is_not_called_so(
     ("override", "sentence"),
     [
         ("experiment=bias_varianc", 'experiment: there is no experiment "bias_varianc"; did you mean "bias_variance"?'),
-        ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of ablation, '),
+        (
+            "experiment=surfing",
+            'experiment: there is no experiment "surfing"; choose one of artificial_discontinuity, ',
+        ),
         ("task=ball_wal", 'task: there is no "ball_wal"; did you mean "ball_wall"?'),
         ("task=juggling", 'task: there is no "juggling"; choose one of ball_wall, ramp'),
         ("seed=1.5", "seed: must be integer, got 1.5"),
@@ -107,11 +110,11 @@ def test_overrides_are_toml_and_a_bare_word_is_a_string(write):
 
 def test_bare_words_in_a_list_are_strings():
     """What is left of scenes=["hopper","reacher"] after a shell."""
-    (run,) = load_runs("ablation", ["scenes=[hopper,reacher]"])
-    assert run.settings.scenes == ("hopper", "reacher")
-    (found,) = mistakes("ablation", "scenes=[hoper]")
+    (run,) = load_runs("work_precision", ["scenes=[hopper,cube]"])
+    assert run.settings.scenes == ("hopper", "cube")
+    (found,) = mistakes("work_precision", "scenes=[hoper]")
     assert found == 'scenes[0]: there is no "hoper"; did you mean "hopper"?'
-    assert mistakes("ablation", "scenes=[hopper,hopper]") == ("scenes: must differ, got hopper more than once",)
+    assert mistakes("work_precision", "scenes=[hopper,hopper]") == ("scenes: must differ, got hopper more than once",)
 
 
 def test_a_point_may_have_a_coordinate_twice():
@@ -120,9 +123,9 @@ def test_a_point_may_have_a_coordinate_twice():
 
 
 def test_a_size_is_one_of_the_tables_of_its_file_and_single_values_win_over_it():
-    (run,) = load_runs("ablation", ["size=quick", "sizes.batch=7"])
-    assert (run.settings.sizes.batch, run.settings.sizes.horizon) == (7, 10)
-    assert mistakes("ablation", "size=quik", "sizes.bath=3") == (
+    (run,) = load_runs("work_precision", ["size=quick", "sizes.batch=7"])
+    assert (run.settings.sizes.batch, run.settings.sizes.repeats) == (7, 3)
+    assert mistakes("work_precision", "size=quik", "sizes.bath=3") == (
         'size: there is no "quik"; did you mean "quick"?',
         'sizes.bath: unknown key; did you mean "batch"?',
     )
@@ -177,8 +180,8 @@ def test_a_file_without_a_comment_has_no_question():
         (f"seed = {'9' * 5000}".encode(), "not TOML: a number is too long"),
         (VALID.encode() + b"stddev = 1\n", "not TOML: a key is given twice (at line 11, column 11)"),
         (b"experiment = ['bias_variance']", 'experiment: there is no experiment ["bias_variance"]; did you mean'),
-        (b"[experiment]", "experiment: there is no experiment {}; choose one of ablation"),
-        (b"", "experiment: required, and missing; choose one of ablation"),
+        (b"[experiment]", "experiment: there is no experiment {}; choose one of artificial_discontinuity"),
+        (b"", "experiment: required, and missing; choose one of artificial_discontinuity"),
         (b"deep = " + b"[" * 3000 + b"]" * 3000, "arrays or tables are nested too deeply"),
         (b"[" + b".".join([b"a"] * 3000) + b"]", "arrays or tables are nested too deeply"),
         (VALID.encode() + b'"" = 1', '"": unknown key'),

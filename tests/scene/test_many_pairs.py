@@ -41,14 +41,13 @@ def test_pairs_are_counted_as_mjx_lists_them(flag, exclude):
     assert bool(contact_pairs(model)) == ("contact" not in flag)
 
 
-def test_pairs_that_are_excluded_or_left_out_do_not_count(monkeypatch):
+def test_pairs_that_are_excluded_do_not_count(monkeypatch):
     monkeypatch.setattr(load, "MOST_PAIRS", 2)
     with pytest.raises(SceneError, match=r"at most 2 pairs .* got about 3"):
         mg.load_scene(_balls(3), engine="mjx")
     apart = "</worldbody><contact><exclude body1='one' body2='other'/></contact>"
     named = _balls(3).replace("<body", "<body name='one'", 1).replace("<body p", "<body name='other' p", 1)
     assert len(mg.load_scene(named.replace("</worldbody>", apart)).pairs) == 2
-    assert len(mg.load_scene(_balls(3), leave_out=mg.LeaveOut((("body1[0]", "body2[0]"),))).pairs) == 2
 
 
 def test_a_spec_loads_as_its_mjcf_does():

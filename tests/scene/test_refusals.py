@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.scene import LeaveOut, SceneError, SceneWarning, load_scene
+from mjxgrad.scene import SceneError, SceneWarning, load_scene
 
 PENDULUM = """
 <mujoco>
@@ -176,7 +176,7 @@ def _pair(kinds, contact="", mask=""):
 @pytest.mark.parametrize("kinds", SEARCHED)
 def test_contact_by_a_search_on_distance_fields_is_refused_unless_asked_for(kinds):
     with pytest.raises(
-        SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*leave_out.*distance_fields=True"
+        SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*<exclude>.*distance_fields=True"
     ):
         load_scene(_pair(kinds), engine="mjx")
     with pytest.warns(SceneWarning, match="search on distance fields instead of exact.*derivative"):
@@ -185,12 +185,11 @@ def test_contact_by_a_search_on_distance_fields_is_refused_unless_asked_for(kind
 
 @pytest.mark.parametrize(
     "how",
-    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}, {"leave_out": True}],
+    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}],
 )
 @pytest.mark.filterwarnings("error")
 def test_of_what_cannot_touch_no_search_is_refused(how):
-    leave_out = LeaveOut((("one", "other"),)) if how.pop("leave_out", False) else None
-    assert load_scene(_pair("cylinder ellipsoid", **how), leave_out=leave_out).pairs == ()
+    assert load_scene(_pair("cylinder ellipsoid", **how)).pairs == ()
 
 
 def test_a_cylinder_and_the_one_it_hangs_from_are_no_obstacle():
