@@ -1,9 +1,8 @@
 """Policies learned through contact: short windows with a value function, by first order, zeroth order, or a mixture."""
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
-from mjxgrad.learning.learn import Learned, learn
+from mjxgrad.learning.learn import Learned, Log, learn, to_csv
 from mjxgrad.learning.learner import Learner, Policy, Settings, apg
-from mjxgrad.learning.logs import Log, to_all, to_csv, to_tensorboard, to_tracker
 
 __all__ = [
     "Evaluation",
@@ -15,8 +14,5 @@ __all__ = [
     "apg",
     "evaluate",
     "learn",
-    "to_all",
     "to_csv",
-    "to_tensorboard",
-    "to_tracker",
 ]

@@ -18,7 +18,9 @@ References:
     ICLR 2022, arXiv:2204.07137 (SHAC). Onoda et al., arXiv:2604.18161 (IVW-H).
 """
 
+import csv
 import functools
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,9 +36,10 @@ from jaxtyping import Array, Float, Key, UInt32
 from mjxgrad._arrays import compile_once
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import Learner, Policy, Settings, begin
-from mjxgrad.learning.logs import Log
 from mjxgrad.learning.update import update
 from mjxgrad.optimiser import checkpoint as checkpoints
+
+Log = Callable[[int, dict[str, float]], Any]
 
 
 class Learned(eqx.Module):
@@ -84,7 +87,8 @@ def learn(
         key: consumed here; an array of several learns as many policies side by side, and what is returned gets an axis for them.
         num_updates: in all, those before a checkpoint included.
         settings: how; None are the defaults.
-        log: called as `log(update, metrics)` after every `log_every` updates with their means.
+        log: called after every `log_every` updates with their means: `to_csv("run.csv")`, or for a tracker
+            `lambda update, metrics: wandb.log(metrics, step=update)`.
         log_every: updates in one program; between them are logs and checkpoints.
         checkpoint: file to go on from if it is there, and to write after every `log_every` updates. The same settings,
             environment and key are needed; the result is that of an uninterrupted run to the bit, but for `seconds`.
@@ -150,6 +154,35 @@ def learn(
         if log is not None and is_first:
             log(int(learner.num_updates.max()), {name: _mean(values) for name, values in found.items()})
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
+
+
+def to_csv(path: str | os.PathLike[str]) -> Log:
+    """Return a `log` for `learn` and `mg.optimise` that writes a row per call, headed by the names of the first.
+
+    A file that is there is gone on with.
+
+    Raises:
+        ValueError: when called with other names than those in the file.
+    """
+    path = Path(path)
+
+    def log(step: int, metrics: dict[str, float]) -> None:
+        names = ["step", *metrics]
+        is_new = not path.exists() or not path.stat().st_size
+        if not is_new:
+            with path.open(newline="", encoding="utf-8") as file:
+                there = next(csv.reader(file))
+            if there != names:
+                raise ValueError(
+                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}: name another"
+                )
+        with path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            if is_new:
+                writer.writerow(names)
+            writer.writerow([step, *metrics.values()])
+
+    return log
 
 
 def _of_each(
