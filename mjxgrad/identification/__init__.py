@@ -15,7 +15,6 @@ from mjxgrad.identification.parameters import (
 from mjxgrad.identification.recording import Recording
 from mjxgrad.identification.result import Identification, Stopped
 from mjxgrad.identification.search import identify
-from mjxgrad.identification.sequences import identify_sequences
 
 __all__ = [
     "Identification",
@@ -29,7 +28,6 @@ __all__ = [
     "gains",
     "gear",
     "identify",
-    "identify_sequences",
     "inertia",
     "mass",
     "softness",

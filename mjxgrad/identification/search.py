@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import compile_once
 from mjxgrad._rollout import DivergedError
@@ -51,15 +51,13 @@ class Experiment:
         scene: with nominal values.
         recordings: to fit.
         held_out: to judge by.
-        apply: from the scene, all parameters as a vector and what `prepare` returned to the scene with them.
-        prepare: computed outside of the program from the parameters' values, before each call of it.
+        apply: from the scene and all parameters as a vector to the scene with them.
     """
 
     scene: Scene
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
-    apply: Callable[[Scene, Array, PyTree], Scene]
-    prepare: Callable[[np.ndarray], PyTree] = lambda values: None
+    apply: Callable[[Scene, Array], Scene]
 
 
 def identify(
@@ -119,7 +117,7 @@ def identify(
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     coordinates = Coordinates.of(parameters)
 
-    def put(scene: Scene, vector: Array, _: None) -> Scene:
+    def put(scene: Scene, vector: Array) -> Scene:
         values = coordinates.unravel(vector)
         changed = write_all(scene, parameters, values)
         return changed if apply is None else apply(changed, values)
@@ -212,23 +210,19 @@ class _Program:
             self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
         return self._compiled[function](*arguments)
 
-    def _residuals(
-        self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows, prepared: PyTree
-    ) -> Array:
-        scene = experiment.apply(experiment.scene, vector, prepared)
+    def _residuals(self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows) -> Array:
+        scene = experiment.apply(experiment.scene, vector)
         delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
         residual, diverged = residuals(scene, window, offset, delay, **self._settings)
         return jnp.where(diverged, jnp.inf, residual)
 
-    def _traced(
-        self, of_all: list[Windows], vector: Array, offsets: list[Array], prepared: list[PyTree]
-    ) -> list[tuple[Array, ...]]:
+    def _traced(self, of_all: list[Windows], vector: Array, offsets: list[Array]) -> list[tuple[Array, ...]]:
         found = []
         for i, experiment in enumerate(self.experiments):
 
-            def one(window: Windows, offset: Array | None, experiment=experiment, prepared=prepared[i]):
+            def one(window: Windows, offset: Array | None, experiment=experiment):
                 def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                    residual = self._residuals(experiment, vector, offset, window, prepared)
+                    residual = self._residuals(experiment, vector, offset, window)
                     return residual, residual
 
                 argnums = (0, 1) if self.free_start else (0,)
@@ -238,29 +232,26 @@ class _Program:
             found.append(jax.vmap(one)(of_all[i], offsets[i] if self.free_start else None))
         return found
 
-    def _sums(
-        self, of_all: list[Windows | None], vectors: Array, prepared: list[PyTree]
-    ) -> Float[Array, "points rows"]:
+    def _sums(self, of_all: list[Windows | None], vectors: Array) -> Float[Array, "points rows"]:
         """Return for each vector the sum of squares over all windows, up to each of their rows."""
-        there = [(e, w, p) for e, w, p in zip(self.experiments, of_all, prepared, strict=True) if w is not None]
-        num_rows = max(windows.index.shape[1] for _, windows, _ in there)
+        there = [(e, w) for e, w in zip(self.experiments, of_all, strict=True) if w is not None]
+        num_rows = max(windows.index.shape[1] for _, windows in there)
 
-        def of_window(experiment: Experiment, prepared: PyTree, vector: Array, window: Windows) -> Array:
-            squares = self._residuals(experiment, vector, None, window, prepared) ** 2
+        def of_window(experiment: Experiment, vector: Array, window: Windows) -> Array:
+            squares = self._residuals(experiment, vector, None, window) ** 2
             ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
             of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
             return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
 
         def of_one(vector: Array) -> Array:
-            parts = [jax.vmap(functools.partial(of_window, e, p, vector))(w).sum(axis=0) for e, w, p in there]
+            parts = [jax.vmap(functools.partial(of_window, e, vector))(w).sum(axis=0) for e, w in there]
             return jnp.cumsum(sum(parts))
 
         return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
     def __call__(self, point: Array) -> list[tuple[Array, ...]]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
-        prepared = [one.prepare(np.asarray(vector, float)) for one in self.experiments]
-        return self._run(self._traced, self.windows, vector, self.offsets(point), prepared)
+        return self._run(self._traced, self.windows, vector, self.offsets(point))
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
@@ -277,7 +268,7 @@ class _Program:
 
     def searched(self, num_points: int) -> Array | None:
         """Return the best of many points between the bounds, found as `particles` does; None if none explains the recordings."""
-        dtype, nothing = self.coordinates.nominal.dtype, [None for _ in self.experiments]
+        dtype = self.coordinates.nominal.dtype
         weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
         counts = np.zeros(max(there.shape[1] for there in weights))
         for there in weights:
@@ -286,7 +277,7 @@ class _Program:
 
         def sums_at(points: np.ndarray) -> np.ndarray:
             vectors = self.coordinates.values(jnp.asarray(points, dtype))
-            found = np.asarray(self._run(self._sums, self.windows, vectors, nothing), float)
+            found = np.asarray(self._run(self._sums, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
         best = best_point(sums_at, low, high, np.cumsum(counts), num_points)
@@ -304,7 +295,7 @@ class _Program:
     def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
         """Return the experiments' scenes with these values."""
         vector = jnp.asarray(values, self.coordinates.nominal.dtype)
-        return tuple(one.apply(one.scene, vector, one.prepare(values)) for one in self.experiments)
+        return tuple(one.apply(one.scene, vector) for one in self.experiments)
 
     def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
         """Return what is left of the recordings that were held out, at each point; None without any."""
@@ -314,8 +305,7 @@ class _Program:
         program, sums = jax.jit(self._sums), []
         for point in points:
             vector = jnp.asarray(point, self.coordinates.nominal.dtype)
-            given = (judged, vector[None], [one.prepare(point) for one in self.experiments])
-            sums.append(compile_once(program.lower(*given))(*given)[0, -1])
+            sums.append(compile_once(program.lower(judged, vector[None]))(judged, vector[None])[0, -1])
         first, last = (math.sqrt(float(x) / _num_numbers([one for one in judged if one is not None])) for x in sums)
         return first, last
 

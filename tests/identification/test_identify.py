@@ -62,6 +62,18 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     assert bounded.stopped is Stopped.CONVERGED
 
 
+def test_what_is_saved_mujoco_sysid_loads(cart, tmp_path):
+    sysid = pytest.importorskip("mujoco.sysid")
+    if not hasattr(sysid, "ParameterDict"):
+        pytest.skip("mujoco[sysid] is not installed")
+    parameters = {"gear": identification.gear(cart, "motor", bounds=(1.0, 5.0))}
+    result = mg.identify(cart, parameters, [Recording({"place": _course(gear=3.3)}, _DRIVE[:, None])])
+    result.save(tmp_path / "found.yaml")
+    loaded = sysid.ParameterDict.load_from_disk(tmp_path / "found.yaml")
+    np.testing.assert_array_equal(loaded["gear"].value, result.values["gear"])
+    np.testing.assert_array_equal([loaded["gear"].min_value, loaded["gear"].max_value], [[1.0], [5.0]])
+
+
 def test_a_search_comes_back_from_a_bound_that_a_step_went_beyond(cart):
     """Motion goes with 1/m: from 4 kg the first step for 2 kg leads to 0, that is to the bound at 1.9 kg."""
     mass = Parameter(4.0, 1.9, 5.0, identification.mass(cart, "cart").write)
