@@ -27,30 +27,19 @@ from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const
 from mjxgrad.identification import identify
 from mjxgrad.linearisation import Linearisation, linearise
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
-from mjxgrad.optimiser import (
-    Convergence,
-    History,
-    Optimisation,
-    Plateau,
-    Stopped,
-    TrustRegion,
-    estimated_gradient,
-    optimise,
-)
+from mjxgrad.optimiser import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.task import SceneTask
 from mjxgrad.verdict import Verdict, check, sweep
 
 __all__ = [
-    "Convergence",
     "DivergedError",
     "History",
     "Linearisation",
     "Objective",
     "Onset",
     "Optimisation",
-    "Plateau",
     "Scene",
     "SceneTask",
     "Smoothing",
@@ -58,7 +47,6 @@ __all__ = [
     "State",
     "Stopped",
     "Trajectory",
-    "TrustRegion",
     "Verdict",
     "baselines",
     "check",

@@ -19,10 +19,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
-from mjxgrad.objective import ActionNoise, Objective
+from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise
 from mjxgrad.objective.base import as_objective
 from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
-from mjxgrad.optimiser.step import parameter_stddev
 
 __all__ = ["cross_entropy", "mppi", "predictive_sampling"]
 
@@ -218,7 +217,7 @@ def search_stddev(
     whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
     if stddev is None:
-        stddev = parameter_stddev(objective, dim)
+        stddev = _parameter_stddev(objective, dim)
     if stddev is None:
         raise ValueError(
             f"stddev must be given for {type(objective).__name__}, whose noise is not on the parameters; "
@@ -230,6 +229,15 @@ def search_stddev(
     if not bool((width > 0).all()):
         raise ValueError(f"stddev must be positive, got {stddev}")
     return jnp.broadcast_to(width, (dim,))
+
+
+def _parameter_stddev(objective: Objective, dim: int) -> Float[Array, " dim"] | None:
+    """Return the standard deviation of the noise on each parameter, or None if the noise is elsewhere."""
+    if isinstance(objective, OpenLoop):
+        return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
+    if isinstance(objective, ParameterNoise):
+        return jnp.broadcast_to(objective.stddev, (dim,))
+    return None
 
 
 def _record(

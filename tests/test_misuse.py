@@ -76,6 +76,7 @@ FOUND = {
     "first(key=jax.random.split(key, 3))": "key must be one of jax.random.key, got an array of shape (3,)",
     "estimators.alpha_order(noisy, params, key, num_samples=8, rule='consistent')": "rule must be one of mg.estimators.rules",
     "estimators.rules.FixedAlpha(3.0)": "alpha must be from 0 to 1, got 3.0",
+    "optimise(annealing=0.5)": "annealing must be a schedule from step to scale, got 0.5; for a fixed scale",
     "optimise(estimator='first_order')": "estimator must be a function such as functools.partial(",
     "optimise(optimiser='adam')": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got 'adam'",
     "optimise(optimiser=optax.adam)": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got <function",

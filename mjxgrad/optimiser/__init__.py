@@ -1,22 +1,17 @@
-"""The loop around an estimator: optimisers, budgets, annealing, runs that can be resumed."""
+"""The loop around an estimator: optimisers, annealing, runs that can be resumed."""
 
-from mjxgrad.optimiser.annealing import Plateau
 from mjxgrad.optimiser.result import History, Optimisation, Record, Stopped
 from mjxgrad.optimiser.run import RunOptions, optimise, run
-from mjxgrad.optimiser.step import EstimatedGradientState, Method, TrustRegion, estimated_gradient
-from mjxgrad.optimiser.stopping import Convergence
+from mjxgrad.optimiser.step import EstimatedGradientState, Method, estimated_gradient
 
 __all__ = [
-    "Convergence",
     "EstimatedGradientState",
     "History",
     "Method",
     "Optimisation",
-    "Plateau",
     "Record",
     "RunOptions",
     "Stopped",
-    "TrustRegion",
     "estimated_gradient",
     "optimise",
     "run",

@@ -17,14 +17,11 @@ class Stopped(eqx.Enumeration):
 
     running = "it has not stopped"
     finished = "all steps were done"
-    converged = "the gradient or the cost met its tolerance"
     not_finite = "too many estimates in a row were not finite"
     nothing_felt = (
         "in several steps in a row all samples cost the same and no derivative differed from zero: nothing that the "
         "parameters change reaches the cost"
     )
-    max_rollouts = "another step would have exceeded the budget of rollouts"
-    max_seconds = "the budget of seconds was spent"
 
 
 # Of JAX in the loop, of NumPy afterwards.

@@ -1,4 +1,4 @@
-"""The loop that every method runs in: segments of steps on the device; budgets, logs and checkpoints between them."""
+"""The loop that every method runs in: segments of steps on the device; logs and checkpoints between them."""
 
 import dataclasses
 import functools
@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import compile_once, whole
@@ -21,13 +20,11 @@ from mjxgrad.estimators.estimate import Estimator, Reason
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.parameters import Restored
 from mjxgrad.optimiser import checkpoint
-from mjxgrad.optimiser.annealing import Annealing
 from mjxgrad.optimiser.result import Best, History, Optimisation, Record, Stopped
-from mjxgrad.optimiser.step import AnnealedObjective, GradientStep, Method, TrustRegion
-from mjxgrad.optimiser.stopping import Convergence, Recent, has_converged
+from mjxgrad.optimiser.step import AnnealedObjective, Annealing, GradientStep, Method
 
 # Progress shows in steps of five per cent; each costs one return from the device.
-DEFAULT_NUM_SEGMENTS = 20
+NUM_SEGMENTS = 20
 
 # Where nothing was felt and nothing moved, the next step differs by its noise alone. Three draws of it: a jump that one
 # sample in thirty meets goes unseen by three steps of 50 with a chance of 0.6 %.
@@ -48,40 +45,24 @@ class RunOptions(eqx.Module):
         evaluate_every: steps between two evaluations. The last point is always evaluated.
         patience: steps in a row whose estimate is not finite, or whose samples feel nothing (`Reason.nothing_felt`), before
             the run gives up; if such steps do not move the parameters either, three in a row are enough.
-        convergence: when to stop early.
-        max_rollouts: budget, per run. A step begins if one as dear as the last fits in, so it is kept by methods whose
-            steps cost the same, from the second step on: the first is always done.
-        max_seconds: budget of wall-clock time for all seeds together, without compilation; looked at after every
-            segment.
-        segment: steps in one program; a twentieth of all if not given.
-        log: called after every segment with the steps done and what `History` has of the last one, the mean over the
-            seeds that took it, and `best_cost`: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
-        checkpoint: file to save the run in after segments and to resume it from. A resumed run gives, on the same
-            device, bit for bit what the uninterrupted one would have given, its seconds apart.
-        checkpoint_every: segments between two saves. An interrupted run is saved in any case.
+        log: called after every twentieth of the steps with those done and what `History` has of the last one, the mean over
+            the seeds that took it, and `best_cost`: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
+        checkpoint: file to save the run in, as often, and to resume it from. A resumed run gives, on the same device, bit
+            for bit what the uninterrupted one would have given, its seconds apart.
+        checkpoint_every: twentieths of the steps between two saves. An interrupted run is saved in any case.
     """
 
     num_steps: int
     evaluate: Callable[[Float[Array, " dim"]], Float[Array, ""]] | None = None
     evaluate_every: int = 10
     patience: int = 10
-    convergence: Convergence | None = None
-    max_rollouts: int | None = None
-    max_seconds: float | None = None
-    segment: int | None = None
     log: Callable[[int, Mapping[str, float]], None] | None = None
     checkpoint: Path | None = eqx.field(default=None, converter=_as_path)
     checkpoint_every: int = 1
 
     def __check_init__(self):
-        for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every", "segment", "max_rollouts"):
-            if (value := getattr(self, name)) is not None:
-                whole(name, value)
-        # Rollouts are counted on the device in 32 bits, where a step beyond the budget must still fit in.
-        if self.max_rollouts is not None and self.max_rollouts >= 2**30:
-            raise ValueError(f"max_rollouts must be below 2**30, got {self.max_rollouts}; leave it out for no limit")
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise ValueError(f"max_seconds must be positive, got {self.max_seconds}")
+        for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every"):
+            whole(name, getattr(self, name))
         if self.checkpoint is not None and not self.checkpoint.parent.is_dir():
             folder = self.checkpoint.parent
             raise ValueError(f"checkpoint must be in a folder that exists, got {self.checkpoint}; make {folder} first")
@@ -89,7 +70,7 @@ class RunOptions(eqx.Module):
     @property
     def segment_size(self) -> int:
         """Return the number of steps in one program."""
-        return self.segment or math.ceil(self.num_steps / DEFAULT_NUM_SEGMENTS)
+        return math.ceil(self.num_steps / NUM_SEGMENTS)
 
 
 class Carry(eqx.Module):
@@ -102,12 +83,10 @@ class Carry(eqx.Module):
     params: Float[Array, " dim"]
     state: PyTree
     best: Best
-    recent: Recent
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]
     num_in_a_row: Int[Array, ""]
     num_still: Int[Array, ""]
-    num_rollouts: Int[Array, ""]
     stopped: Stopped
 
 
@@ -146,8 +125,7 @@ def optimise(
     estimator: Estimator,
     optimiser: optax.GradientTransformation,
     num_steps: int,
-    annealing: Annealing | Callable[[ArrayLike], ArrayLike] | None = None,
-    trust_region: TrustRegion | None = None,
+    annealing: Annealing | None = None,
     clip_norm: float | None = None,
     **options: Any,
 ) -> Optimisation:
@@ -168,17 +146,17 @@ def optimise(
     such as where a policy touches nothing, the run stops after a few steps with `Stopped.nothing_felt`.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
-    (0, 1], and `annealing` sets the scale, either as a schedule or by itself where the cost no longer improves.
+    (0, 1], and `annealing` is the schedule of the scale.
 
         noisy = mg.parameter_noise(function, stddev=0.3)
         mg.optimise(
             lambda scale: noisy.with_stddev(0.3 * scale), params, key,
             annealing=optax.exponential_decay(1.0, 100, 0.5, end_value=0.05), ...
         )
-        # Contact from soft to stiff, by itself:
+        # Contact from soft to stiff:
         mg.optimise(
             lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
-            annealing=mg.Plateau(factor=0.5, patience=10, minimum=0.01), ...
+            annealing=optax.exponential_decay(1.0, 10, 0.5, end_value=0.01), ...
         )
 
     With a bar of tqdm:
@@ -189,27 +167,25 @@ def optimise(
         objective: what to minimise, or with `annealing` a function from a scale to it.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
             dict or an equinox module. The function of `parameter_noise` and `evaluate` then take its form, and the
-            result has it. Estimators and trust regions see all its arrays as one vector.
+            result has it. Estimators see all its arrays as one vector.
         key: consumed here; with a leading axis, one per seed.
         estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
             `functools.partial`, or your own.
         optimiser: from optax; it is handed the mean cost under noise as `value`, too.
         num_steps: at most.
-        annealing: a schedule from step to scale, or a `Plateau`.
-        trust_region: how far a step may go.
+        annealing: a schedule from step to scale, such as one of optax.
         clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
-        **options: `evaluate`, `evaluate_every`, `patience`, `convergence`, `max_rollouts`, `max_seconds`, `segment`,
-            `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
+        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
 
     Returns:
         The last and the best parameters, the history, why it stopped and what was spent.
 
     Raises:
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
-            a trust region does not know its unit, or a checkpoint is damaged or of another run.
+            or a checkpoint is damaged or of another run.
     """
     vector, restore = flattened(params)
-    rule = GradientStep(of_vector(objective, restore), estimator, optimiser, annealing, trust_region, clip_norm)
+    rule = GradientStep(of_vector(objective, restore), estimator, optimiser, annealing, clip_norm)
     chosen = RunOptions(num_steps, **options)
     if restore is None:
         return run(rule, vector, key, chosen)
@@ -249,7 +225,7 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
         if options.checkpoint.exists():
             saved = checkpoint.load(options.checkpoint, saved, fingerprint)
 
-    saved, stopped = _loop(functools.partial(program.advance, numbers, key), saved, options, fingerprint)
+    saved = _loop(functools.partial(program.advance, numbers, key), saved, options, fingerprint)
     finish = compile_once(over_seeds(_finish, None, 0).lower(numbers, saved.carry))
     final_cost, best = finish(numbers, saved.carry)
     history = saved.history()
@@ -259,7 +235,7 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
         best_cost=best.cost,
         final_cost=final_cost,
         history=history,
-        stopped=stopped,
+        stopped=saved.carry.stopped,
         num_steps=np.asarray(saved.carry.num_steps),
         num_skipped=np.asarray(saved.carry.num_skipped),
         num_rollouts=history.num_rollouts[..., -1],
@@ -269,16 +245,11 @@ def run(method: Method, params: Float[Array, "..."], key: Key[Array, "..."], opt
     )
 
 
-def _loop(
-    advance: Callable[[Saved], Saved], saved: Saved, options: RunOptions, fingerprint: dict[str, Any]
-) -> tuple[Saved, Stopped]:
-    """Run segments until every run has stopped, and say why each did."""
-    on_disk, is_late = saved.seconds.size, False
+def _loop(advance: Callable[[Saved], Saved], saved: Saved, options: RunOptions, fingerprint: dict[str, Any]) -> Saved:
+    """Run segments until every run has stopped."""
+    on_disk = saved.seconds.size
     try:
         while np.any(saved.carry.stopped == Stopped.running):
-            is_late = options.max_seconds is not None and saved.seconds.sum() >= options.max_seconds
-            if is_late:
-                break
             saved = advance(saved)
             is_due = saved.seconds.size - on_disk >= options.checkpoint_every * options.segment_size
             if options.checkpoint is not None and is_due:
@@ -290,8 +261,7 @@ def _loop(
         # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
         if options.checkpoint is not None and saved.seconds.size > on_disk:
             checkpoint.save(options.checkpoint, saved, fingerprint)
-    is_cut = (saved.carry.stopped == Stopped.running) & is_late
-    return saved, jax.tree.map(lambda x, y: jnp.where(is_cut, x, y), Stopped.max_seconds, saved.carry.stopped)
+    return saved
 
 
 class _Program:
@@ -317,11 +287,10 @@ class _Program:
 
 
 def _start(static: PyTree, arrays: PyTree, params: Float[Array, " dim"]) -> Carry:
-    method, options = eqx.combine(arrays, static)
+    method, _ = eqx.combine(arrays, static)
     nan = jnp.full((), jnp.nan, params.dtype)
-    best, recent = Best(params, nan, nan + jnp.inf, nan), Recent.empty(options.convergence, params.dtype)
     zero, stopped = jnp.zeros((), jnp.int32), jax.tree.map(jnp.asarray, Stopped.running)
-    return Carry(params, method.init(params), best, recent, zero, zero, zero, zero, zero, stopped)
+    return Carry(params, method.init(params), Best(params, nan, nan + jnp.inf, nan), zero, zero, zero, zero, stopped)
 
 
 def _segment(
@@ -355,12 +324,10 @@ def _segment(
             params=params,
             state=state,
             best=carry.best.against(under_noise if options.evaluate is None else Best.measured(at, noise_free)),
-            recent=carry.recent.push(record),
             num_steps=carry.num_steps + 1,
             num_skipped=carry.num_skipped + ~record.is_taken,
             num_in_a_row=jnp.where(record.is_taken, 0, carry.num_in_a_row + 1),
             num_still=jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0),
-            num_rollouts=carry.num_rollouts + record.num_rollouts,
             stopped=carry.stopped,
         )
         moved = dataclasses.replace(moved, stopped=_stopped(options, moved, record, index))
@@ -372,15 +339,7 @@ def _segment(
 
 def _stopped(options: RunOptions, carry: Carry, record: Record, index: Int[Array, ""]) -> Stopped:
     """Say why a run stops after a step, if it does; the weightiest reason comes last."""
-    stopped = Stopped.running
-    if options.max_rollouts is not None:
-        # The next step is taken to cost what this one did.
-        is_spent = carry.num_rollouts + record.num_rollouts > options.max_rollouts
-        stopped = Stopped.where(is_spent, Stopped.max_rollouts, stopped)
-    stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, stopped)
-    # Where nothing is felt the gradient is zero and the cost stands still, which is no convergence.
-    is_converged = has_converged(options.convergence, carry.recent) & (carry.num_still == 0)
-    stopped = Stopped.where(is_converged, Stopped.converged, stopped)
+    stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, Stopped.running)
     enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
     stopped = Stopped.where(carry.num_still >= enough, Stopped.nothing_felt, stopped)
     return Stopped.where(carry.num_in_a_row >= options.patience, Stopped.not_finite, stopped)
@@ -400,9 +359,7 @@ def _fingerprint(
 ) -> dict[str, Any]:
     """Say what a resumed run must have in common with this one: the program itself, and all that it is given."""
     return {
-        **{name: getattr(options, name) for name in ("num_steps", "evaluate_every", "patience", "max_rollouts")},
-        "segment": options.segment_size,
-        "convergence": repr(options.convergence),
+        **{name: getattr(options, name) for name in ("num_steps", "evaluate_every", "patience")},
         "shape": list(params.shape),
         "dtype": str(params.dtype),
         "start": checkpoint.digest((params, key)),
