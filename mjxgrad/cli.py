@@ -1,15 +1,13 @@
-"""The command line: check and sweep a scene, find its parameters, begin a program, draw it, look at it, run experiments."""
+"""The command line: check and sweep a scene, find its parameters, begin a program, film it."""
 
 import functools
 import importlib
 import importlib.util
-import json
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -334,69 +332,6 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
     print(output)
 
 
-@app.command
-def view(scene: str) -> None:
-    """Open a scene in MuJoCo's viewer, or without a display in the browser, by mjviser where it is installed.
-
-    Args:
-        scene: an MJCF file.
-    """
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(_existing(scene))
-    has_display = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-    if has_display:
-        importlib.import_module("mujoco.viewer").launch(model)
-    elif importlib.util.find_spec("mjviser"):
-        importlib.import_module("mjviser").Viewer(model, mujoco.MjData(model)).run()
-    else:
-        raise CommandError(
-            "there is no display: pip install mjviser shows it in a browser, mjxgrad render makes a video"
-        )
-
-
-@app.command
-def run(
-    config: str,
-    *overrides: str,
-    output: Path = Path("runs"),
-    force: Annotated[bool, cyclopts.Parameter(negative="")] = False,
-) -> int:
-    """Run an experiment of a checkout.
-
-    Args:
-        config: a TOML file, or the name of one in experiments/.
-        overrides: settings to change, key=value in TOML syntax.
-        output: folder for results.
-        force: run even if nothing has changed.
-    """
-    return _experiments()(["run", config, *overrides, "--output", str(output), *["--force"] * force])
-
-
-@app.command(name="list")
-def list_experiments(*, as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False) -> int:
-    """List the experiments of a checkout.
-
-    Args:
-        as_json: write their names as JSON.
-    """
-    main_of_experiments = _experiments()
-    if not as_json:
-        return main_of_experiments(["list"])
-    print(json.dumps(sorted(path.stem for path in _checkout().glob("experiments/*.toml"))))
-    return 0
-
-
-@app.command
-def gallery(*, output: Path = Path("runs")) -> int:
-    """Write one page over all results of experiments, index.html.
-
-    Args:
-        output: folder of results.
-    """
-    return _experiments()(["gallery", "--output", str(output)])
-
-
 @functools.cache
 def _library() -> Any:
     """Return mjxgrad in double precision, in which jumps and slopes are told apart."""
@@ -431,20 +366,3 @@ def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
     )
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
-
-
-def _checkout() -> Path:
-    return Path(__file__).parents[1]
-
-
-def _experiments() -> Callable[[list[str]], int]:
-    """Return the command line of the experiments, which lie beside the library in a checkout only."""
-    if not (_checkout() / "experiments" / "__main__.py").is_file():
-        raise CommandError(
-            "experiments come with a checkout, not with the installed library: git clone, then make demo"
-        )
-    sys.path.insert(0, str(_checkout()))
-    try:
-        return importlib.import_module("experiments.__main__").main
-    except ImportError as error:
-        raise CommandError(f"experiments need {error.name}: pip install -e '.[experiments]'") from error

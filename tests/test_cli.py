@@ -101,28 +101,12 @@ def test_new_writes_a_short_program(scene):
     assert "'scene.xml'" in text
 
 
-def test_a_gallery_of_no_results_says_where_it_looked(tmp_path, capsys):
-    assert cli.main(["gallery", "--output", str(tmp_path)]) == 2
-    assert f"there are no results in {tmp_path}" in capsys.readouterr().err
-
-
 def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
     assert cli.main(["new", scene]) == 0
     assert "video" not in capsys.readouterr().err
     monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
     assert cli.main(["new", scene, "--force"]) == 0
     assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
-
-
-def test_list_names_every_experiment(scene, capsys):
-    assert cli.main(["list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == sorted(path.stem for path in (ROOT / "experiments").glob("*.toml"))
-
-
-def test_without_a_checkout_experiments_are_one_sentence(scene, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(cli, "_checkout", lambda: tmp_path)
-    assert cli.main(["run", "ball_wall"]) == 2
-    assert "come with a checkout" in capsys.readouterr().err
 
 
 def test_importing_the_library_imports_no_command_line_and_no_pictures():
