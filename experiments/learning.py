@@ -1,6 +1,5 @@
 """Policies through contact: which gradient learns soonest, how good it is meanwhile, and what it is worth in C MuJoCo."""
 
-import dataclasses
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
+from experiments.bundle import bundled
 from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
@@ -316,7 +316,7 @@ def _stepped(environment: Environment, method: Method) -> Environment:
     if method in ("discrete", "slope"):
         return environment.with_gradient(method)
     if method == "bundled":
-        return dataclasses.replace(environment.with_onset(None), bundle=envs.Bundle())
+        return bundled(environment.with_onset(None))
     return environment
 
 

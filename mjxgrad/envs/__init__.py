@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 from mjxgrad.envs import diffrl, playground
-from mjxgrad.envs.bundle import Bundle
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
@@ -27,7 +26,6 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
 
 __all__ = [
     "ENVIRONMENTS",
-    "Bundle",
     "EnvState",
     "Environment",
     "TaskEnvironment",

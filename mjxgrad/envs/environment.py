@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from mjxgrad._arrays import whole
 from mjxgrad._rollout import State, Trajectory, initial_state, rollout
 from mjxgrad.dynamics import Gradient
-from mjxgrad.envs.bundle import Bundle
 from mjxgrad.scene import Scene
 from mjxgrad.task import InScene, optional_pytree
 
@@ -68,14 +67,12 @@ class Environment(InScene):
     Attributes:
         frame_skip: time steps per action.
         episode_length: actions after which time is up.
-        bundle: averages the derivative of every step over perturbed starts; None is the derivative as it is.
         randomisation: from a key and the scene to the scene of one copy; see `randomised`.
     """
 
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
-    bundle: Bundle | None = eqx.field(default=None, kw_only=True)
     randomisation: Randomisation | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
@@ -171,12 +168,9 @@ class Environment(InScene):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
         action = jnp.clip(action, -self.action_limit, self.action_limit)
-        key, memory_key, bundle_key = jax.random.split(state.key, 3)
-        ctrl, begun = self.control(action), self.disturbed(state.physics, state.memory)
-        course = self._move(begun, ctrl)
+        key, memory_key = jax.random.split(state.key)
+        course = self._move(self.disturbed(state.physics, state.memory), self.control(action))
         after = course.final
-        if self.bundle is not None:
-            after = self.bundle.average(lambda *at: self._move(*at).final, self.scene, begun, ctrl, bundle_key)
         terms = self.rewards(state.physics, action, after, state.memory)
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1
