@@ -1,9 +1,8 @@
-"""Plans through contact: trajectory optimisation and search trees, both on smoothed linear models."""
+"""Plans through contact: trajectory optimisation on smoothed linear models."""
 
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
-from mjxgrad.planning.tree import Path, Sampling, Search, path, search
 
 __all__ = [
     "Analytic",
@@ -13,16 +12,11 @@ __all__ = [
     "GoalCost",
     "Iterations",
     "LinearModel",
-    "Path",
     "Plan",
     "Sampled",
-    "Sampling",
     "SceneSystem",
-    "Search",
     "Smoother",
     "System",
     "optimise_trajectory",
-    "path",
-    "search",
     "shifted",
 ]

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._arrays import compiled, known
-from mjxgrad.planning.linear_model import LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, StateVector, System
+from mjxgrad.planning import LinearModel, Smoother, System
+from mjxgrad.planning.system import ControlVector, StateVector
 from mjxgrad.task import optional_pytree
 
 Index = Int[Array, ""]
