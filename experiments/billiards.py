@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from scipy.optimize import minimize
 
 import mjxgrad as mg
+from experiments.problems.billiards import Billiards, billiards
 from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
@@ -24,7 +25,6 @@ from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
-from mjxgrad.tasks.billiards import Billiards, billiards
 
 
 class MethodSettings(SettingsTable):

@@ -17,6 +17,7 @@ from matplotlib.colors import LogNorm
 from pydantic import Field, model_validator
 
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, at_time_step, motion
+from experiments.problems.textbook import bounce_scene
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
@@ -25,7 +26,6 @@ from experiments.workspace import Workspace
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.scene import Scene
-from mjxgrad.tasks.textbook import bounce_scene
 
 Share = Annotated[float, Field(ge=0, lt=1)]
 

@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from pydantic import Field, model_validator
 
 import mjxgrad as mg
+from experiments.problems.equivalent_noise import EquivalentNoise, contact_profile, probe
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import capitalised, joined, quantity
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics.equivalent_noise import EquivalentNoise, contact_profile, probe
 from mjxgrad.dynamics.kernels import KERNELS
 
 KernelName = Literal["gaussian", "logistic", "log_barrier"]

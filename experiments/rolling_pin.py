@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 import mjxgrad as mg
+from experiments.problems.rolling_pin import STIFFNESS, RollingPin, rolling_pin
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
@@ -21,7 +22,6 @@ from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
-from mjxgrad.tasks.rolling_pin import STIFFNESS, RollingPin, rolling_pin
 
 
 class RemedySettings(SettingsTable):

@@ -17,16 +17,17 @@ from scipy import stats
 
 from experiments import theme
 from experiments.config import ExperimentError, suggest
+from experiments.problems import textbook
+from experiments.problems.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
+from experiments.problems.textbook import Textbook
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
-from mjxgrad.diagnostics import Comparison, EmpiricalBias, Rollouts, compare, empirical_bias, first_order_samples
+from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import rules
-from mjxgrad.tasks import textbook
-from mjxgrad.tasks.textbook import Textbook
 
 Count = Annotated[int, Field(ge=2)]
 
@@ -58,7 +59,7 @@ class Settings(RunSettings):
     """Error, bias and variance of estimators against samples and stiffness, with closed forms drawn in."""
 
     problem: Literal["heaviside", "soft_heaviside", "quadratic_sine"]
-    """The cost, a function of `mjxgrad.tasks.textbook`."""
+    """The cost, a function of `experiments/problems/textbook.py`."""
     point: Finite
     """Where the gradient is estimated."""
     stddev: Positive

@@ -17,6 +17,7 @@ from experiments.config import ExperimentError
 from experiments.motion import own_task
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
+from experiments.problems import published_scenes
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
 from mjxgrad.diagnostics.comparison import affordable
@@ -200,11 +201,11 @@ class Outcome:
 
 
 _SCENES = {
-    "push_soft": lambda: mg.tasks.push(10.0),
-    "push_stiff": lambda: mg.tasks.push(1000.0),
-    "friction": mg.tasks.friction,
-    "motion_planning": mg.tasks.motion_planning,
-    "tennis": mg.tasks.tennis,
+    "push_soft": lambda: published_scenes.push(10.0),
+    "push_stiff": lambda: published_scenes.push(1000.0),
+    "friction": published_scenes.friction,
+    "motion_planning": published_scenes.motion_planning,
+    "tennis": published_scenes.tennis,
 }
 _OWN = {"num_samples": 16, "learning_rate": 1.0, "num_steps": 100, "gamma": 1.0, "bound": 1.0}
 _ELITE = 0.2  # share of the candidates that cross-entropy fits to

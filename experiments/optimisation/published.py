@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from experiments.problems import published
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
 from mjxgrad.policy import linear_policy
-from mjxgrad.tasks import published
 
 Schedule = Callable[[Int[Array, ""] | int], Float[Array, ""] | float]
 

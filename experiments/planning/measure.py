@@ -13,10 +13,10 @@ from jaxtyping import Float, Int
 import mjxgrad as mg
 from experiments.planning.settings import NAMES, Settings
 from experiments.planning.tree import Sampling, path, search
+from experiments.problems.planar_pusher import PlanarPusher, beside_rod, planar_pusher
 from experiments.workspace import Workspace
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import GoalCost, Plan, Smoother, optimise_trajectory
-from mjxgrad.tasks.planar_pusher import PlanarPusher, beside_rod, planar_pusher
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from matplotlib.patches import Circle
 
 from experiments.planning.measure import Attempt, Outcome
 from experiments.planning.settings import NAMES
+from experiments.problems.planar_pusher import planar_pusher
 from experiments.report import Table
 from experiments.settings import VideoSettings
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, plain, shades, subplots
 from experiments.video import film, shown_speed
 from experiments.words import capitalised, quantity
 from experiments.workspace import Workspace
-from mjxgrad.tasks.planar_pusher import planar_pusher
 
 
 def answer(outcome: Outcome) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.policy_gradient.settings import Settings
+from experiments.problems.published_scenes import push
 from experiments.workspace import Workspace
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.rules import Consistent
@@ -265,7 +266,7 @@ def problem(name: str, settings: Settings) -> Problem:
     """Build one of the tasks that the settings name."""
     if name.startswith("push"):
         stiffness = {"push_soft": 10.0, "push_stiff": 1000.0}[name]
-        task = mg.tasks.push(stiffness)
+        task = push(stiffness)
         start = Point("start", task.initial_params())
         return Problem(name, f"Push, {stiffness:g} N/m", task, task.stddev, [start], 16, has_jump_of_force=False)
     return _hopper(settings) if name == "hopper" else _throw(name, settings)

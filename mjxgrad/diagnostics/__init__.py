@@ -3,7 +3,6 @@
 from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
 from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare
 from mjxgrad.diagnostics.contacts import contacts_needed
-from mjxgrad.diagnostics.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from mjxgrad.diagnostics.horizon import Crossover, Growth, crossover, growth
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
@@ -15,7 +14,6 @@ __all__ = [
     "BiasVariance",
     "Comparison",
     "Crossover",
-    "EmpiricalBias",
     "Growth",
     "Jumps",
     "Landscape",
@@ -34,8 +32,6 @@ __all__ = [
     "contacts_needed",
     "crossover",
     "derivative_against_slope",
-    "empirical_bias",
-    "first_order_samples",
     "growth",
     "jumps_along",
     "mean_interval",

@@ -1,4 +1,4 @@
-"""Intervals for means, biases, variances, errors and probabilities; on the host, in NumPy."""
+"""Intervals for means, biases, variances and errors; on the host, in NumPy."""
 
 from typing import Literal
 
@@ -115,21 +115,6 @@ def root_mean_square_interval(
     ends = np.where(freedom < 1e12, ends, mean)
     taken_off = np.asarray(reference_variance, float)
     return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
-
-
-def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float[np.ndarray, " 2"]:
-    """Give the Clopper-Pearson interval of a probability, which covers at least as often as it says.
-
-    References:
-        Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
-        26, 1934.
-    """
-    return np.array(stats.binomtest(count, total).proportion_ci(checked(confidence)))
-
-
-def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
-    """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %."""
-    return float(stats.binomtest(count, total, alternative="less").proportion_ci(checked(confidence)).high)
 
 
 def bootstrap_variance_interval(

@@ -7,7 +7,6 @@ from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 from mjxgrad.envs.quadruped import quadruped
 from mjxgrad.envs.task_environment import TaskEnvironment, from_task
-from mjxgrad.envs.trot import trot
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "ant": ant,
@@ -21,7 +20,6 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "diffrl_hopper": diffrl.hopper,
     "diffrl_humanoid": diffrl.humanoid,
     "quadruped": quadruped,
-    "trot": trot,
 }
 
 __all__ = [
@@ -38,7 +36,6 @@ __all__ = [
     "load",
     "playground",
     "quadruped",
-    "trot",
     "walker2d",
 ]
 

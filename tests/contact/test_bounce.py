@@ -7,7 +7,6 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
-from mjxgrad.tasks.textbook import bounce_scene
 
 DURATION = 0.1
 TIMESTEP = 5e-4
@@ -16,7 +15,11 @@ TIMESTEP = 5e-4
 @pytest.fixture(scope="module")
 def found():
     """MuJoCo's default contact but for its impedance, which is constant, so that there is a closed form."""
-    scene = bounce_scene(TIMESTEP)
+    scene = mg.load_scene(
+        f"""<mujoco><option gravity="0 0 0" timestep="{TIMESTEP}"><flag refsafe="disable"/></option><worldbody>
+        <geom type="plane" size="1 1 .1"/><body pos="0 0 .05"><joint type="slide" axis="0 0 1"/><geom size=".05"/></body>
+        </worldbody></mujoco>"""
+    )
     model = scene.model.tree_replace({"geom_solimp": scene.model.geom_solimp.at[:, :2].set(0.9)})
     scene = mg.Scene(**{**vars(scene), "model": model})
 

@@ -8,17 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 from mjxgrad.diagnostics import Rollouts, Seconds, bias_interval, compare, root_mean_square_interval
 from mjxgrad.diagnostics.comparison import affordable
-from mjxgrad.diagnostics.statistics import binomial_bound, binomial_interval, variance_interval
+from mjxgrad.diagnostics.statistics import variance_interval
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
-from mjxgrad.tasks import textbook
+from tests.estimators.textbook import ramp, ramp_probability, step, step_gradient
 
 STDDEV, POINT, REPEATS = 0.1, 0.03, 4000
-RAMP = textbook.soft_heaviside(0.1)
-TRUTH = float(RAMP.gradient(POINT, STDDEV))
+WIDTH = 0.1
+RAMP = parameter_noise(ramp(WIDTH), STDDEV, dim=1)
+ON_SLOPE = ramp_probability(POINT, WIDTH)
+TRUTH = 2 / WIDTH * ON_SLOPE
 PAIRS = functools.partial(zeroth_order, antithetic=True)
 ZERO_NOISE = functools.partial(zeroth_order, baseline="zero_noise")
 
@@ -76,22 +80,6 @@ def test_the_error_of_the_reference_is_taken_off_and_widens_the_interval():
     assert share(low, high, np.sqrt(2)) < 0.5
 
 
-@pytest.mark.parametrize("probability", [0.002, 0.03, 0.4])
-def test_an_interval_of_a_probability_covers_at_least_as_often_as_it_says(probability):
-    counts = np.random.default_rng(4).binomial(200, probability, REPEATS)
-    intervals = np.array([binomial_interval(count, 200, 0.9) for count in range(201)])[counts]
-    bounds = np.array([binomial_bound(count, 200, 0.9) for count in range(201)])[counts]
-    assert share(*intervals.T, probability) >= 0.9 - 4 * np.sqrt(0.09 / REPEATS)
-    assert (bounds >= probability).mean() >= 0.9 - 4 * np.sqrt(0.09 / REPEATS)
-
-
-def test_the_bound_of_what_was_never_seen_is_the_rule_of_three():
-    """(1 − p)^n = 0.05 at p = 1 − 0.05^(1/n), which is ln 20 / n to first order."""
-    assert binomial_bound(0, 1000) == pytest.approx(1 - 0.05 ** (1 / 1000), rel=1e-9)
-    assert binomial_bound(0, 1000) == pytest.approx(3 / 1000, rel=4e-3)
-    assert binomial_bound(7, 7) == 1
-
-
 def test_variances_of_normal_samples_get_chi_square_and_cover_in_several_coordinates():
     """Coordinates of unequal size: total variance 1 + 9, where 3 (n − 1) degrees of freedom would be far too many."""
     rng, covers, methods = np.random.default_rng(5), [], []
@@ -126,7 +114,7 @@ def table():
     estimators = {"first": first_order, "zeroth": zeroth_order, "pairs": PAIRS, "zero noise": ZERO_NOISE}
     return compare(
         estimators,
-        RAMP.objective(STDDEV),
+        RAMP,
         jnp.array([POINT]),
         jax.random.key(0),
         budget=Rollouts(51),
@@ -148,19 +136,27 @@ def test_an_estimator_that_rolls_out_thrice_per_sample_gets_a_third_of_the_sampl
         estimate = zeroth_order(objective, params, key, num_samples=num_samples)
         return eqx.tree_at(lambda e: e.num_rollouts, estimate, jnp.asarray(3 * num_samples + 1))
 
-    bought = affordable(thrice, RAMP.objective(STDDEV), jnp.array([POINT]), jax.random.key(0), Rollouts(100))
+    bought = affordable(thrice, RAMP, jnp.array([POINT]), jax.random.key(0), Rollouts(100))
     assert bought.num_samples == 33
 
 
+def _expected(function) -> float:
+    """The mean of a function of the ramp's value and the score w/σ², by quadrature between the kinks."""
+
+    def density(w: float) -> float:
+        return function(np.clip(2 * (POINT + w) / WIDTH, -1, 1), w / STDDEV**2) * norm.pdf(w, scale=STDDEV)
+
+    return quad(density, -9 * STDDEV, 9 * STDDEV, points=[-WIDTH / 2 - POINT, WIDTH / 2 - POINT], limit=200)[0]
+
+
 def test_errors_are_those_of_the_closed_forms(table):
-    exact = np.array(
-        [
-            RAMP.first_order_variance(POINT, STDDEV) / 51,
-            RAMP.leave_one_out_variance(POINT, STDDEV, 51),
-            np.nan,
-            RAMP.zeroth_order_variance(POINT, STDDEV, 0.6) / 50,  # the ramp is at 2 · 0.03/0.1 there
-        ]
-    )
+    """With φ = f − E f, leaving one out of n has the variance V(φ s) / n + (V(f) V(s) + (E φ s)²) / (n (n − 1))."""
+    mean, start = _expected(lambda f, s: f), 2 * POINT / WIDTH
+    spread = _expected(lambda f, s: (f - mean) ** 2)
+    first = (2 / WIDTH) ** 2 * ON_SLOPE * (1 - ON_SLOPE)  # the slope, or zero
+    centred, from_start = (_expected(lambda f, s, c=c: ((f - c) * s) ** 2) - TRUTH**2 for c in (mean, start))
+    left_out = centred / 51 + (spread / STDDEV**2 + TRUTH**2) / (51 * 50)
+    exact = np.array([first / 51, left_out, np.nan, from_start / 50])
     known = ~np.isnan(exact)
     low, high = table.variance_interval
     # 3 intervals of 95 %: wider by half they hold all but once in 300.
@@ -173,9 +169,8 @@ def test_errors_are_those_of_the_closed_forms(table):
 
 def test_a_bias_shows_in_the_error_and_not_in_the_variance():
     """A step on a parabola: first order converges to 2θ and misses the density of the noise at the step."""
-    step = textbook.heaviside()
     objective = parameter_noise(lambda x: step(x) + x[0] ** 2, STDDEV, dim=1)
-    missed = float(step.gradient(POINT, STDDEV))
+    missed = step_gradient(POINT)
     table = compare(
         {"first": first_order},
         objective,
@@ -226,7 +221,7 @@ def test_a_budget_of_seconds_buys_the_samples_that_it_lasts_for():
         return eqx.tree_at(lambda e: e.value, estimate, value)
 
     budget = Seconds(0.1, num_runs=3)
-    bought = affordable(slow, RAMP.objective(STDDEV), jnp.array([POINT]), jax.random.key(0), budget)
+    bought = affordable(slow, RAMP, jnp.array([POINT]), jax.random.key(0), budget)
     assert 0 < bought.seconds <= 0.1
     assert 300 < bought.num_samples <= 1000
     assert bought.seconds > 1e-4 * bought.num_samples
@@ -252,7 +247,7 @@ def test_a_budget_of_seconds_buys_the_samples_that_it_lasts_for():
     ],
 )
 def test_what_cannot_be_compared_is_refused(arguments, sentence):
-    good = {"objective": RAMP.objective(STDDEV), "estimators": {"first": first_order}, "reference": TRUTH}
+    good = {"objective": RAMP, "estimators": {"first": first_order}, "reference": TRUTH}
     good |= {"budget": Rollouts(4), "params": jnp.array([POINT]), "key": jax.random.key(0)}
     with pytest.raises(ValueError, match=sentence):
         compare(**(good | arguments))

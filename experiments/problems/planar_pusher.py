@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad._rollout import initial_state
-from mjxgrad.planning.system import SceneSystem
+from mjxgrad.planning import SceneSystem
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks.action_task import scene_path
+from mjxgrad.tasks import scene_path
 
 # Of 0.01 s; a decision every 0.1 s, four time constants of the damped rod.
 _NUM_SUBSTEPS = 10

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from experiments.problems.trot import trot
 from mjxgrad import learning
 from mjxgrad._rollout import initial_state
-from mjxgrad.envs.trot import trot
 
 LEGS = ("LF", "RF", "LH", "RH")
 HIP, KNEE = np.pi / 6, np.pi / 4  # of the stance

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.diagnostics.equivalent_noise import contact_profile, probe
+from experiments.problems.equivalent_noise import contact_profile, probe
 from tests.dynamics.test_kernels import DISTRIBUTIONS
 
 SCENE = """<mujoco><worldbody><geom type="plane" size="5 5 .1" solimp="{0}" margin="{1}"/>

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from experiments.optimisation import published as settings
+from experiments.problems import published
+from experiments.problems.published import CENTRES, RADII
 from mjxgrad import estimators
-from mjxgrad.tasks import published
-from mjxgrad.tasks.published import CENTRES, RADII
+from mjxgrad.objective import open_loop
 
 NAMES = tuple(settings.TASKS)
 LEVEL_PAD = [0.0, 0.0, 0.0]
@@ -194,3 +195,17 @@ def test_the_stiff_push_differs_in_more_than_stiffness():
 def test_rates_decrease_where_the_paper_says():
     rate = setting("tennis").learning_rate
     np.testing.assert_allclose([rate(0), rate(99)], [1e-6, 1e-6 / 100**0.1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("stiffness", "most"), [(10.0, 0.1), (1000.0, 1.05)])
+def test_on_the_push_the_error_of_the_control_variate_is_far_below_zeroth_order_or_no_worse(stiffness, most):
+    """With 200 controls and 10 rollouts; facts: zeroth order 4.5 times the gradient, this one 0.34, and 4.31 and 4.15."""
+    task = published.push(stiffness, 0.99 if stiffness == 1000 else 0.998, horizon=200)
+    objective, params, keys = open_loop(task, 0.1), jnp.full(200, 0.1), jax.random.split(jax.random.key(3), 60)
+    results = [
+        jax.jit(jax.vmap(lambda key, e=estimator: e(objective, params, key, num_samples=10).value))(keys)
+        for estimator in (estimators.control_variate, estimators.zeroth_order)
+    ]
+    # Both are unbiased, so their spread is their error.
+    errors = [np.sqrt(((np.asarray(v) - np.asarray(v).mean(axis=0)) ** 2).sum(axis=1).mean()) for v in results]
+    assert errors[0] < most * errors[1]

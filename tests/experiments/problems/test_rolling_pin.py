@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from experiments.problems.rolling_pin import DENT, DEPTH, rolling_pin
 from experiments.rolling_pin import Descent, Outcome, Settings, tables, verdict
 from mjxgrad.dynamics import Smoothing
-from mjxgrad.tasks.rolling_pin import DENT, DEPTH, rolling_pin
 
 HORIZON = 40
 

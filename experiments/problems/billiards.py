@@ -19,7 +19,7 @@ from mjxgrad._rollout import Trajectory, initial_state, rollout
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.scene import load_scene
 from mjxgrad.task import InScene, finite_cost
-from mjxgrad.tasks.action_task import scene_path
+from mjxgrad.tasks import scene_path
 
 _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)
 

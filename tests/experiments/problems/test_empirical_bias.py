@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.diagnostics import empirical_bias, first_order_samples
+from experiments.problems import textbook
+from experiments.problems.empirical_bias import binomial_bound, binomial_interval, empirical_bias, first_order_samples
 from mjxgrad.objective import parameter_noise
-from mjxgrad.tasks import textbook
 
 STDDEV, POINT, WIDTH = 0.1, 0.03, 0.02
 RAMP = textbook.soft_heaviside(WIDTH)
@@ -163,3 +163,21 @@ def test_the_derivative_of_a_diverged_rollout_is_no_sample():
 def test_what_is_no_sample_is_refused(arguments, sentence):
     with pytest.raises(ValueError, match=sentence):
         empirical_bias(**({"gradients": np.zeros(3)} | arguments))
+
+
+@pytest.mark.parametrize("probability", [0.002, 0.03, 0.4])
+def test_an_interval_of_a_probability_covers_at_least_as_often_as_it_says(probability):
+    counts = np.random.default_rng(4).binomial(200, probability, 4000)
+    intervals = np.array([binomial_interval(count, 200, 0.9) for count in range(201)])[counts]
+    bounds = np.array([binomial_bound(count, 200, 0.9) for count in range(201)])[counts]
+    assert ((intervals[:, 0] <= probability) & (probability <= intervals[:, 1])).mean() >= 0.9 - 4 * np.sqrt(
+        0.09 / 4000
+    )
+    assert (bounds >= probability).mean() >= 0.9 - 4 * np.sqrt(0.09 / 4000)
+
+
+def test_the_bound_of_what_was_never_seen_is_the_rule_of_three():
+    """(1 − p)^n = 0.05 at p = 1 − 0.05^(1/n), which is ln 20 / n to first order."""
+    assert binomial_bound(0, 1000) == pytest.approx(1 - 0.05 ** (1 / 1000), rel=1e-9)
+    assert binomial_bound(0, 1000) == pytest.approx(3 / 1000, rel=4e-3)
+    assert binomial_bound(7, 7) == 1

@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from experiments.problems import textbook
 from mjxgrad.estimators import zeroth_order
-from mjxgrad.tasks import textbook
 
 STDDEV, POINT, BASELINE = 0.1, 0.03, 0.2
 # By themselves, without kinks and jumps taken from the code on trial: those of the throw are in facts that were known.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.billiards import MethodSettings, Outcome, Run, Settings, hard_cost, hard_optimum, verdict
-from mjxgrad.tasks.billiards import billiards
+from experiments.problems.billiards import billiards
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from mjxgrad._rollout import State, data_of, initial_state
 from mjxgrad.dynamics.kinematics import kinematics
 from mjxgrad.dynamics.spatial import rotation_matrix
-from mjxgrad.envs.environment import Environment
+from mjxgrad.envs import Environment
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks.action_task import scene_path
+from mjxgrad.tasks import scene_path
 
 Memory = dict[str, Array]
 _FEET = ("LF_foot", "RF_foot", "LH_foot", "RH_foot")

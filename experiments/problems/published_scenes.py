@@ -16,12 +16,12 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from experiments.problems import published
 from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.contact import Softness
 from mjxgrad.policy import linear_policy
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.tasks import published
-from mjxgrad.tasks.action_task import ActionTask, scene_path
+from mjxgrad.tasks import ActionTask, scene_path
 
 PUSH_CONTACT = (("pusher", "pushed"),)
 # Two bodies of 0.1 kg move against each other like one of half that mass.

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._rollout import Trajectory, initial_state
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks.action_task import ActionTask, scene_path
+from mjxgrad.tasks import ActionTask, scene_path
 
 NUM_PILLARS = 8
 DENT = (2, 3, 4, 5)

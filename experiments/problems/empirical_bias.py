@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from scipy import stats
 
-from mjxgrad.diagnostics.statistics import binomial_bound, binomial_interval, checked
+from mjxgrad.diagnostics.statistics import checked
 from mjxgrad.objective import Objective, as_vector
 
 # Cutting a normal sample at its mean explains 2/π of its variance, an exponential one at the best place 0.65, a uniform
@@ -165,6 +165,21 @@ def first_order_samples(
         return jnp.where(jnp.isfinite(cost), gradient, jnp.nan)
 
     return jax.vmap(one)(jax.random.split(key, num_samples))
+
+
+def binomial_interval(count: int, total: int, confidence: float = 0.95) -> Float[np.ndarray, " 2"]:
+    """Give the Clopper-Pearson interval of a probability, which covers at least as often as it says.
+
+    References:
+        Clopper, Pearson. The use of confidence or fiducial limits illustrated in the case of the binomial. Biometrika
+        26, 1934.
+    """
+    return np.array(stats.binomtest(count, total).proportion_ci(checked(confidence)))
+
+
+def binomial_bound(count: int, total: int, confidence: float = 0.95) -> float:
+    """Give the one-sided upper Clopper-Pearson bound of a probability; for a count of zero about 3/total at 95 %."""
+    return float(stats.binomtest(count, total, alternative="less").proportion_ci(checked(confidence)).high)
 
 
 def _finite(gradients: ArrayLike) -> tuple[Float[np.ndarray, "samples dim"], int]:
