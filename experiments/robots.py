@@ -166,13 +166,14 @@ def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray, *, measur
     weights = random.normal(size=model.nv) / math.sqrt(model.nv)
     line = (random.normal(size=model.nv), 0.4 * ranges * random.normal(size=model.nu))
     given = jax.tree.map(lambda x: jnp.asarray(x, dtype), (weights, line, places))
-    (outcomes, flags), derivatives = _outcomes(scene, start_of(model, dtype), *given, measure_growth)
+    (outcomes, flags), derivatives = _outcomes(scene, start_of(model, dtype), *given, measure_growth)  # pyright: ignore[reportCallIssue]
     return np.asarray(outcomes), np.asarray(flags), np.asarray(derivatives)
 
 
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
-    names, shown = "slope mean standard_error resolution num_teeth irregularity spread num_finite", {"steps": "off"}
+    names = "slope mean standard_error resolution num_teeth irregularity spread num_finite"
+    shown: dict[str, Any] = {"steps": "off"}
     for count in _PHASES:
         if shown["steps"] in ("off", "consistent"):
             outcomes, _, gradients = _along(model, scene, places := phases(_INTERVAL, count))
@@ -180,13 +181,13 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
             shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
             shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
     if shown["steps"] == "off" or shown["lost"]:
-        _, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
-        shown["lost"] = int(np.sum(np.isfinite(outcomes[0]) & ~np.isfinite(gradients) & ~flags))
+        outcomes, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
+        shown["lost"] = int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients) & ~flags))
         shown["steps"] = "flagged" if flags.any() else shown["steps"]
     return shown
 
 
-def judged(shown: dict[str, float]) -> str:
+def judged(shown: dict[str, Any]) -> str:
     """Say whether a mean derivative is the slope within two standard errors or 5 %, if these are small enough to tell."""
     bar, size = 2 * shown["standard_error"], max(abs(shown["slope"]), abs(shown["mean"]))
     if shown["num_finite"] < shown["starts"] / 2:

@@ -255,8 +255,10 @@ class _Linearisation:
             return nothing
         mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
         events = self.surfaces.events(self.far, row[self.places["qvel"]], after)
-        spanned = None if events is None else self._spanned(model, row, events)
-        if events is None or not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
+        if events is None:
+            return nothing
+        spanned = self._spanned(model, row, events)
+        if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return nothing
         near, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
         off = events.gaps - surfaces
