@@ -50,6 +50,7 @@ _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 _SOLVE, _WIDTH = 1e-15, 1e-6
 _HORIZON, _INTERVAL = 50, (-0.25, 0.25)
 _PHASES = (33, 129, 513)  # starts, and how many where fewer do not tell
+_LONGEST = 12.0  # s, after which no more starts are taken
 _FEWEST_TEETH = 4  # steps' phases that starts must cover
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
 # condition of contact, stiff rows on light bodies, up to 1e5; C's engine computes in double precision in any case.
@@ -174,8 +175,9 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
     names = "slope mean standard_error resolution num_teeth irregularity spread num_finite"
     shown: dict[str, Any] = {"steps": "off"}
-    for count in _PHASES:
-        if shown["steps"] in ("off", "consistent"):
+    begin = time.perf_counter()
+    for count in _PHASES:  # each takes four times as long as the one before
+        if shown["steps"] in ("off", "consistent") and time.perf_counter() - begin < _LONGEST:
             outcomes, _, gradients = _along(model, scene, places := phases(_INTERVAL, count))
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
             shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
