@@ -1,4 +1,8 @@
-"""Any environment as one of brax, for its learners."""
+"""Any environment as one of brax, for its learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
+
+Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier
+jax, or a function of that name.
+"""
 
 import jax
 import jax.numpy as jnp
