@@ -12,6 +12,7 @@ from mjxgrad import (
     render,
     tasks,
 )
+from mjxgrad._programs import keep_compiled
 from mjxgrad._rollout import (
     DivergedError,
     State,
@@ -20,8 +21,8 @@ from mjxgrad._rollout import (
     initial_state,
     rollout,
 )
+from mjxgrad.batched import over_devices
 from mjxgrad.contact import Softness
-from mjxgrad.devices import keep_compiled, over_devices
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.identification import identify

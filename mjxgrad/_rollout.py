@@ -12,11 +12,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import compiled, form, is_known, known, whole
+from mjxgrad._arrays import form, is_known, known, whole
 from mjxgrad._mjx import mjx
+from mjxgrad._programs import compiled
+from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
-from mjxgrad.dynamics.cholesky import SOLUTION
 from mjxgrad.dynamics.collision import first_missed, slot_geoms
 from mjxgrad.dynamics.onset import reach
 from mjxgrad.native import INPUTS, roll_out

@@ -337,9 +337,11 @@ def _library() -> Any:
     """Return mjxgrad in double precision, in which jumps and slopes are told apart."""
     import jax
 
+    from mjxgrad.batched.device import all_devices
+
     jax.config.update("jax_enable_x64", True)
     try:
-        jax.devices()
+        all_devices()
     except (AssertionError, RuntimeError) as error:  # an assertion, where JAX_PLATFORMS names what is not there
         raise CommandError(
             f"JAX finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: unset it {error}".rstrip()

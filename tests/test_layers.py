@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # Each line may import those above it; parts of one line do not know each other.
 ORDER = (
-    ("_arrays", "_mjx"),
+    ("_arrays", "_mjx", "_programs", "_text"),
+    ("batched",),
     ("contact",),
     ("dynamics",),
     ("scene",),
@@ -21,7 +23,7 @@ ORDER = (
     ("estimators",),
     ("optimiser",),
     ("baselines",),
-    ("devices", "diagnostics", "identification", "integration", "planning", "render"),
+    ("diagnostics", "identification", "integration", "planning", "render"),
     ("tasks",),
     ("envs", "verdict"),
     ("learning",),
@@ -52,6 +54,12 @@ def test_each_part_imports_only_what_stands_before_it():
     lines = [(m, t) for m in parts for t in _imported(m) if t in MODULES and t.split(".")[1:2] != m.split(".")[1:2]]
     backwards = [(m, t) for m, t in lines if t == "mjxgrad" or LINE[t.split(".")[1]] >= LINE[m.split(".")[1]]]
     assert not backwards
+
+
+def test_one_file_asks_which_device():
+    question = re.compile(r"default_backend|platform_dependent|register_lowering|\bjax\.(local_)?device(s|_count)\(")
+    asking = {path.relative_to(ROOT).as_posix() for path in MODULES.values() if question.search(path.read_text())}
+    assert asking == {"batched/device.py"}
 
 
 def test_any_part_can_be_imported_first():

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import compiled, known
+from mjxgrad._arrays import known
+from mjxgrad._programs import compiled
 from mjxgrad.planning import LinearModel, Smoother, System
 from mjxgrad.planning.system import ControlVector, StateVector
 from mjxgrad.task import optional_pytree

@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import geom_pairs, mjx
+from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.contact.law import rest_depth, stiffness_damping
 
 _DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value

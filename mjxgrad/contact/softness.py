@@ -16,8 +16,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import as_float, is_known, safe_sqrt
+from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
+from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.contact.law import compensated_stiffness
 from mjxgrad.contact.parameters import (
     ContactPair,

@@ -1,6 +1,6 @@
 """What contacts do otherwise than their numbers say: altered by MuJoCo, too stiff for the time step, hovering, without effect."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import jax
 import mujoco
@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
+from mjxgrad._text import format_number, name_pairs
 from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
 
@@ -71,22 +72,6 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
         ({geom.mjGEOM_CAPSULE}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
     )
     return [message for kind, message in known if kind in kinds]
-
-
-def name_pairs(pairs: Sequence[object]) -> str:
-    """Return two pairs, or whatever else has a name, by name; or the first of them and how many more there are."""
-    if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
-        return ", ".join(str(pair) for pair in pairs)
-    return f"{pairs[0]} + {len(pairs) - 1} more"
-
-
-def format_number(x: float) -> str:
-    """Write three digits; whole numbers up to 99999 in full."""
-    if np.isinf(x):
-        return "∞" if x > 0 else "−∞"
-    if 1e3 <= abs(x) < 99999.5:
-        return f"{x:.0f}"
-    return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
 
 
 def steepest(

@@ -24,9 +24,10 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
-from mjxgrad._arrays import compile_once, whole
+from mjxgrad._arrays import whole
+from mjxgrad._programs import compile_once
+from mjxgrad._text import format_number
 from mjxgrad.contact import Softness
-from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary

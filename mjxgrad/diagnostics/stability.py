@@ -21,17 +21,11 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import COLLISION_FUNCTIONS
+from mjxgrad._text import format_number, name_pairs
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.parameters import ContactPair
-from mjxgrad.contact.warnings import (
-    altered_by_refsafe,
-    beyond_stability,
-    format_number,
-    largest_stable_step,
-    name_pairs,
-    steepest,
-)
+from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
 from mjxgrad.scene import Scene
 
 LEAST_FRICTION = 0.01

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics.maps import Bilinear, dot, pick, scale
+from mjxgrad.batched.maps import Bilinear, dot, pick, scale
 from mjxgrad.dynamics.spatial import cross
 
 _PerPair = Float[Array, " pairs"]

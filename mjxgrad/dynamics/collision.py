@@ -24,10 +24,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import contact_groups, custom_number, geom_groups, make_frame, mjx
-from mjxgrad.dynamics import capsules, maps
-from mjxgrad.dynamics.maps import contract, dot, pick
+from mjxgrad.batched import maps
+from mjxgrad.batched.maps import contract, dot, pick, safe_norm
+from mjxgrad.dynamics import capsules
 from mjxgrad.dynamics.mended import COLLISION_FUNCTIONS
 
 _PerPair = Float[Array, " pairs"]

@@ -33,8 +33,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad.batched.linear import add, sum_of_few
 from mjxgrad.dynamics.kernels import Kernel
-from mjxgrad.dynamics.linear import add, sum_of_few
 
 _PerRow = Float[Array, "rows *batch"]
 _PerContact = Float[Array, "contacts *batch"]

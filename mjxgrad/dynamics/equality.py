@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
+from mjxgrad.batched import maps
+from mjxgrad.batched.maps import safe_norm
 from mjxgrad.contact.law import impedance
-from mjxgrad.dynamics import kinematics, maps, spatial, tree
+from mjxgrad.dynamics import kinematics, spatial, tree
 from mjxgrad.dynamics.jacobian import DenseRows
 from mjxgrad.dynamics.rows import Block, contact_jacobian, per_row
 

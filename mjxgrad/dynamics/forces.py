@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import compensate_gravity, fluid_force, mjx
-from mjxgrad.dynamics import cholesky, kinematics, maps, mended, spatial, tree
-from mjxgrad.dynamics.maps import contract, pick
+from mjxgrad.batched import cholesky, maps
+from mjxgrad.batched.maps import contract, pick
+from mjxgrad.dynamics import kinematics, mended, spatial, tree
 
 _Disable = mujoco.mjtDisableBit
 _Joint = mujoco.mjtJoint

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import cholesky, linear, on_gpu
+from mjxgrad.batched import cholesky, device, linear, on_gpu
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.sparse import SparseRows
 
@@ -65,10 +65,9 @@ def solve_mended(mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: B
 def _on_device(at_once: Callable, step_by_step: Callable, mass, jacobian, layout: RowLayout, bend, vector):
     """Solve by one kernel where there are some, else by operations."""
     if vector.ndim == 2 and on_gpu.solves(layout.num_rows, len(vector)):
-        # The program may yet be compiled for the CPU beside the GPU.
-        return jax.lax.platform_dependent(
+        return device.by_platform(
             *(mass, jacobian, bend, vector),
-            cuda=lambda mass, jacobian, bend, vector: at_once(mass, jacobian, layout, bend, vector),
+            gpu=lambda mass, jacobian, bend, vector: at_once(mass, jacobian, layout, bend, vector),
             default=step_by_step,
         )
     return step_by_step(mass, jacobian, bend, vector)

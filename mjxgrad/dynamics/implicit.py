@@ -25,8 +25,9 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import constraint, hessian, linear, newton
-from mjxgrad.dynamics.cholesky import SOLUTION
+from mjxgrad.batched import device, linear
+from mjxgrad.batched.cholesky import SOLUTION
+from mjxgrad.dynamics import constraint, hessian, newton
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.newton import System, Variant
 
@@ -110,7 +111,7 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
 
 def _takes_few() -> bool:
     """Whether it pays to solve again for those few of a batch that need it: a GPU is done sooner with all of them at once."""
-    return jax.default_backend() == "cpu"
+    return device.is_cpu()
 
 
 def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_needed: _Truth | None = None) -> _Vector:

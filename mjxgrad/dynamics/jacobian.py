@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import linear, maps, spatial
-from mjxgrad.dynamics.maps import combine, contract
+from mjxgrad.batched import linear, maps
+from mjxgrad.batched.maps import combine, contract
+from mjxgrad.dynamics import spatial
 
 _PerRow = Float[Array, " rows"]
 _Vector = Float[Array, " nv"]

@@ -24,8 +24,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import maps, mended, spatial, tree
-from mjxgrad.dynamics.maps import combine, contract, pick
+from mjxgrad.batched import maps
+from mjxgrad.batched.maps import combine, contract, pick
+from mjxgrad.dynamics import mended, spatial, tree
 from mjxgrad.dynamics.orientation import orientation
 
 _Position = Float[Array, " nq"]

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import safe_sqrt
 from mjxgrad._mjx import COLLISION_FUNCTIONS as _COLLISION_FUNCTIONS
+from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.dynamics import spatial, wrapping
 
 _Scalar = Float[Array, "..."]

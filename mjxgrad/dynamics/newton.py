@@ -32,7 +32,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad.dynamics import constraint, hessian, linear, on_gpu
+from mjxgrad.batched import device, linear, on_gpu
+from mjxgrad.dynamics import constraint, hessian
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import JoinedRows, RowMap
 from mjxgrad.dynamics.kinematics import Inertia
@@ -371,9 +372,8 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
     if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(num_together(system.map), len(start)):
-        # The program may yet be compiled for the CPU beside the GPU.
         ways = (functools.partial(way, layout, max_iterations) for way in (in_one_kernel, _in_turns))
-        return jax.lax.platform_dependent(system, start, tolerance, cuda=next(ways), default=next(ways))
+        return device.by_platform(system, start, tolerance, gpu=next(ways), default=next(ways))
     return _in_turns(layout, max_iterations, system, start, tolerance)
 
 
@@ -422,7 +422,7 @@ def _in_turns(layout: RowLayout, max_iterations: int, system: System, start: _Ve
     solver = _Solver(problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
     # On a CPU, where it was measured.
-    splits = jax.default_backend() == "cpu" and bool(batch) and batch[0] >= _LEAST_BATCH
+    splits = device.is_cpu() and bool(batch) and batch[0] >= _LEAST_BATCH
     num_last = batch[0] // _SHARE if splits else 0
     state = solver.run(first, num_last)
     result = solver.result(state)
@@ -562,7 +562,7 @@ def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Sea
     """
     is_done, num_looks = search.is_flat, 0
     least = _LINE_STEPS if is_done.ndim else 0  # one state's own loop ends with its search
-    if jax.default_backend() != "cpu" and is_done.ndim:
+    if not device.is_cpu() and is_done.ndim:
         # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA
         # writes each step out again wherever the next one uses its length.
         num_looks = _LINE_STEPS

@@ -71,8 +71,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import as_float, is_known, safe_norm, safe_sqrt
+from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
+from mjxgrad.batched.maps import safe_norm, safe_sqrt
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.dynamics.collision import WITHOUT_CENTRE, are, is_blind, other_sides, slot_geoms
 from mjxgrad.dynamics.jacobian import RowMap

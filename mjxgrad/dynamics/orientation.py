@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from mjxgrad._arrays import known
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import linear, maps, spatial, tree
-from mjxgrad.dynamics.maps import contract, pick
+from mjxgrad.batched import linear, maps
+from mjxgrad.batched.maps import contract, pick
+from mjxgrad.dynamics import spatial, tree
 
 _Vectors = Float[Array, "n 3"]
 _Matrices = Float[Array, "n 3 3"]

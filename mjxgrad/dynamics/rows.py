@@ -15,10 +15,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import safe_norm
 from mjxgrad._mjx import mjx
+from mjxgrad.batched import linear, maps
+from mjxgrad.batched.maps import safe_norm
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.dynamics import linear, maps, spatial, tree
+from mjxgrad.dynamics import spatial, tree
 from mjxgrad.dynamics.collision import slot_geoms
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, SlotRows, fold
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad.dynamics import linear
+from mjxgrad.batched import linear
 from mjxgrad.dynamics.constraint import Bend, RowLayout
 from mjxgrad.dynamics.jacobian import DenseRows, Group, RowMap, dense, edges, flat, fold
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics.maps import Bilinear, contract, dot, scale
+from mjxgrad.batched.maps import Bilinear, contract, dot, scale
 
 _Quaternions = Float[Array, "*batch 4"]
 _Matrices = Float[Array, "n 3 3"]

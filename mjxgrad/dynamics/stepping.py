@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 
 from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, cholesky, forces, implicit, kinematics, mended
+from mjxgrad.batched import cholesky
+from mjxgrad.dynamics import assembly, forces, implicit, kinematics, mended
 from mjxgrad.dynamics import onset as onsets
 from mjxgrad.dynamics.collision import collide
 from mjxgrad.dynamics.constraint import RowLayout, Rows

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import safe_norm
+from mjxgrad.batched.maps import safe_norm
 from mjxgrad.dynamics.spatial import normalise
 
 _Point = Float[Array, "3"]

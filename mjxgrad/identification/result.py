@@ -19,7 +19,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad.contact.warnings import format_number
+from mjxgrad._text import format_number
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 

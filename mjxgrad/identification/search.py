@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import compile_once
+from mjxgrad._programs import compile_once
 from mjxgrad._rollout import DivergedError
 from mjxgrad.dynamics import Gradient, Onset
 from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all

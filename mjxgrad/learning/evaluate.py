@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import compile_once
+from mjxgrad._programs import compile_once
 from mjxgrad._rollout import Engine
 from mjxgrad.envs import Environment, EnvState
 

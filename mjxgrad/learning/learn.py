@@ -33,7 +33,8 @@ import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Float, Key, UInt32
 
-from mjxgrad._arrays import compile_once
+from mjxgrad._programs import compile_once
+from mjxgrad.batched.device import all_devices
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import Learner, Policy, Settings, begin
 from mjxgrad.learning.update import update
@@ -218,7 +219,7 @@ def _apart(environments: Sequence[Environment]) -> tuple[Environment, Environmen
 
 def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Any]]:
     """Return how to place arrays, and how to compile what gives arrays, that all devices of all processes are to have."""
-    devices = jax.devices()
+    devices = all_devices()
     if len(devices) == 1:
         return lambda tree: tree, jax.jit
     if jax.process_count() > 1:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.devices import over_devices
+from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.learner import Learner, Policy, Settings, optimisers, starts
 from mjxgrad.learning.networks import Network

@@ -15,7 +15,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import compile_once, whole
+from mjxgrad._arrays import whole
+from mjxgrad._programs import compile_once
 from mjxgrad.estimators.estimate import Estimator, Reason
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.parameters import Restored

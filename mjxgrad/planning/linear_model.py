@@ -32,8 +32,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._arrays import is_known
+from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import ContactPair
-from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
 

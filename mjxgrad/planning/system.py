@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import compiled
 from mjxgrad._mjx import mjx
+from mjxgrad._programs import compiled
 from mjxgrad._rollout import State
 from mjxgrad.dynamics import Smoothing, step
 from mjxgrad.dynamics.kinematics import integrate_position, position_change

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad._arrays import compiled, known
+from mjxgrad._arrays import known
+from mjxgrad._programs import compiled
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import mjx
+from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
-from mjxgrad.contact.warnings import name_pairs
 from mjxgrad.scene.refusals import element_name, has_constraints, has_medium, searched_pairs
 
 _DISABLE = mujoco.mjtDisableBit

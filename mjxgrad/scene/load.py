@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import MJX_VERSION, counts, make_efc_address, make_efc_type, mjx
+from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import (
@@ -270,7 +271,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
     try:
         # Of several processes each has its own; MJX would take the first of all.
         with np.errstate(over="raise"):
-            mjx_model = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
+            mjx_model = mjx.put_model(model, impl="jax", device=own_device())
         return mjx_model, _make_data(model, mjx_model, max_contacts)
     except FloatingPointError:
         largest = f"{np.finfo(np.float32).max:.1g}"
@@ -284,7 +285,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
     """Data of MJX with room for so many contacts, also for frictionless ones beside elliptic ones, which MJX refuses."""
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    data = mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
+    data = mjx.make_data(model, impl="jax", device=own_device())
     model.opt.cone = cone
     dims = np.asarray(data._impl.contact.dim)
     of_dim = [np.flatnonzero(dims == dim)[:max_contacts] for dim in np.unique(dims)]

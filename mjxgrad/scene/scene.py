@@ -16,9 +16,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
+from mjxgrad._text import format_number, name_pairs
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
-from mjxgrad.contact.warnings import contact_differences, contact_warnings, format_number, name_pairs
+from mjxgrad.contact.warnings import contact_differences, contact_warnings
 from mjxgrad.dynamics import constants
 from mjxgrad.dynamics.collision import candidates
 from mjxgrad.dynamics.rows import index_of

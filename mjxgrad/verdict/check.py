@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import Engine, Trajectory
-from mjxgrad.contact.warnings import format_number
+from mjxgrad._text import format_number
 from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.scene import Scene, SceneError, load_scene

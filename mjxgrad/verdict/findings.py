@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from mjxgrad._rollout import LARGEST_GROWTH
-from mjxgrad.contact.warnings import format_number, name_pairs
+from mjxgrad._text import format_number, name_pairs
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.measure import STDDEVS, Measured

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._rollout import State
+from mjxgrad._text import format_number
 from mjxgrad.contact import Softness
-from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases

@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State, Trajectory, rollout
+from mjxgrad.batched import device
 from mjxgrad.native.derivative import to_coordinates, to_tangent
 from mjxgrad.native.engine import engine_of
 from mjxgrad.scene import Scene
@@ -269,5 +270,5 @@ def with_contact(scene: Scene, contact: dict[str, Array]) -> Scene:
 
 def compiler_options() -> dict | None:
     """Return what makes XLA compile in half the time, where it is known to."""
-    is_known = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
+    is_known = device.is_cpu() and jax.__version_info__ < (0, 11)
     return _OPTIONS if is_known else None

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
 from mjxgrad._rollout import Engine, Trajectory, initial_state
+from mjxgrad._text import format_number
 from mjxgrad.contact import Softness
-from mjxgrad.contact.warnings import format_number
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
 from mjxgrad.dynamics import Gradient

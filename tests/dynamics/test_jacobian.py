@@ -11,7 +11,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import assembly, constraint, kinematics, linear
+from mjxgrad.batched import linear
+from mjxgrad.dynamics import assembly, constraint, kinematics
 from mjxgrad.dynamics.collision import collide, slot_geoms
 from mjxgrad.dynamics.constraint import Bend
 from mjxgrad.dynamics.jacobian import AxisRows, ContactRows

@@ -16,8 +16,8 @@ import jax.scipy.linalg as jsl
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics import on_gpu
-from mjxgrad.dynamics.linear import add, batch_last, dot, matvec, rmatvec
+from mjxgrad.batched import device, on_gpu
+from mjxgrad.batched.linear import add, batch_last, dot, matvec, rmatvec
 
 _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
@@ -36,17 +36,14 @@ def cholesky_solve(matrix: _Matrix, vector: _Vector) -> _Vector:
     if matrix.ndim == 2:
         return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), vector)
     if on_gpu.solves(0, len(vector)):
-        # The program may yet be compiled for the CPU beside the GPU.
-        return jax.lax.platform_dependent(
-            matrix, vector, cuda=lambda *system: on_gpu.solve(*system)[0], default=_step_by_step
-        )
+        return device.by_platform(matrix, vector, gpu=lambda *system: on_gpu.solve(*system)[0], default=_step_by_step)
     return _step_by_step(matrix, vector)
 
 
 def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n batch"]) -> Float[Array, "n batch"]:
     if len(vector) <= _LARGEST:
         return written_out(matrix, vector)
-    if jax.default_backend() == "cpu":
+    if device.is_cpu():
         return in_blocks(matrix, vector)
     leading = jnp.moveaxis(matrix, (0, 1), (-2, -1)), jnp.moveaxis(vector, 0, -1)[..., None]
     factor = jnp.linalg.cholesky(leading[0])

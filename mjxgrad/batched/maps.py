@@ -1,11 +1,14 @@
-"""Linear and bilinear maps and Einstein sums of many short vectors, whose derivatives are of the same kind; see `primitives`."""
+"""Linear and bilinear maps and Einstein sums of many short vectors, whose derivatives are of the same kind; see `primitives`.
+
+Beside them their norms, whose derivative at zero is zero where the usual one has none.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mjxgrad.dynamics import primitives
+from mjxgrad.batched import primitives
 
 
 class Bilinear:
@@ -80,3 +83,14 @@ def contract(subscripts: str, a: Array, b: Array) -> Array:
     """Return an Einstein sum at full precision; each index of one factor is in the other or in the result."""
     dtype = jnp.result_type(a, b)
     return primitives.contract(jnp.asarray(a, dtype), jnp.asarray(b, dtype), subscripts)
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root, whose derivative at zero is zero instead of infinite."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Return the Euclidean norm over the last axis, with derivative zero at the zero vector."""
+    return safe_sqrt(jnp.sum(x * x, axis=-1))

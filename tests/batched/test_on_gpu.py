@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import cholesky, newton, on_gpu
+from mjxgrad.batched import cholesky, on_gpu
+from mjxgrad.dynamics import newton
 from mjxgrad.dynamics.constraint import RowLayout, Rows
 from mjxgrad.dynamics.jacobian import AxisRows, DenseRows, JoinedRows
 from mjxgrad.dynamics.kinematics import Inertia

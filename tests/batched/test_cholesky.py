@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.dynamics import cholesky
+from mjxgrad.batched import cholesky
 
 _WAYS = {
     "written out": cholesky.written_out,

@@ -24,10 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics.linear import LONGEST_SUM, add
+from mjxgrad.batched import device
+from mjxgrad.batched.linear import LONGEST_SUM, add
 
 # (entry of the result, entry of the first factor, entry of the second, coefficient)
 Term = tuple[int, int, int, float]
@@ -70,10 +71,6 @@ def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) ->
         factors = [_batch_last(x, batch) for x in factors]
         return _batch_last(evaluate(*factors, batch=batch, **parameters), batch)
 
-    def on_cpu(context: mlir.LoweringRuleContext, *factors, **parameters):
-        way = evaluate if _is_shared_out(context) else batch_last
-        return mlir.lower_fun(way, multiple_results=False)(context, *factors, **parameters)
-
     def batched(factors, axes, *, batch, **parameters):
         size = next(x.shape[axis] for x, axis in zip(factors, axes, strict=True) if axis is not None)
         spread = [
@@ -85,19 +82,9 @@ def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) ->
     names = [one.name for one in inspect.signature(evaluate).parameters.values() if one.kind is one.KEYWORD_ONLY]
     primitive.def_impl(jax.jit(evaluate, static_argnames=names))
     primitive.def_abstract_eval(infer)
-    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=False))
-    mlir.register_lowering(primitive, on_cpu, platform="cpu")
-    mlir.register_lowering(primitive, mlir.lower_fun(on_gpu, multiple_results=False), platform="cuda")
+    device.set_lowerings(primitive, default=evaluate, cpu=batch_last, gpu=on_gpu)
     batching.primitive_batchers[primitive] = batched
     return primitive
-
-
-def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
-    """Return whether XLA shares out the program over devices: it would gather all that asks for a layout."""
-    axes = context.module_context.axis_context
-    if hasattr(axes, "mesh"):  # in `jax.shard_map`, which shares out by some axes itself
-        return any(size > 1 for name, size in axes.mesh.shape.items() if name not in axes.manual_axes)
-    return getattr(axes, "num_devices", 1) > 1
 
 
 def _batch_last(x: Array, batch: int) -> Array:

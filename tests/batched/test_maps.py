@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import maps, primitives, spatial
+from mjxgrad.batched import maps, primitives
+from mjxgrad.dynamics import spatial
 
 BILINEAR = {
     "cross": spatial.cross,
@@ -199,7 +200,7 @@ def test_a_program_that_is_shared_out_gathers_nothing():
     program = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import NamedSharding, Mesh, PartitionSpec as P
-from tests.dynamics.test_maps import _chain
+from tests.batched.test_maps import _chain
 assert len(jax.devices()) == 4
 sharding = NamedSharding(Mesh(np.array(jax.devices()), ("batch",)), P("batch"))
 x = jax.device_put(jax.random.normal(jax.random.key(0), (32, 4, 3)), sharding)

@@ -1,4 +1,7 @@
-"""A batch split over devices, each of which works on its part alone; and compiled programs kept from one process to the next.
+"""Which device a program is for, and a batch shared out over several: the one place of the library that asks.
+
+A processor runs operations along the batch and likes loops; a GPU spends a microsecond on starting an operation, however short.
+So several parts have two ways, and ask here which of them to take.
 
 XLA runs one small operation after another, and a processor's second core idles most of that time. As two devices
 (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
@@ -7,18 +10,59 @@ them all.
 """
 
 import functools
-import hashlib
-import importlib.metadata
-import os
-import platform
-import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
+
+
+def is_cpu() -> bool:
+    """Return whether programs run on a CPU unless they are placed elsewhere."""
+    return jax.default_backend() == "cpu"
+
+
+def is_gpu() -> bool:
+    """Return whether programs run on a GPU unless they are placed elsewhere."""
+    return jax.default_backend() == "gpu"
+
+
+def all_devices() -> list[jax.Device]:
+    """Return the devices of all processes."""
+    return jax.devices()
+
+
+def own_device() -> jax.Device:
+    """Return the first device of this process: of several processes each has its own."""
+    return jax.local_devices()[0]
+
+
+def by_platform(*args: Any, gpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
+    """Call one function on NVIDIA's GPUs and another elsewhere: a program may yet be compiled for the CPU beside the GPU."""
+    return jax.lax.platform_dependent(*args, cuda=gpu, default=default)
+
+
+def set_lowerings(primitive: Primitive, *, default: Callable, cpu: Callable, gpu: Callable) -> None:
+    """Set what a primitive is compiled to: on a CPU that shares the program with no other device, on a GPU, and elsewhere."""
+
+    def on_cpu(context: mlir.LoweringRuleContext, *factors, **parameters):
+        way = default if _is_shared_out(context) else cpu
+        return mlir.lower_fun(way, multiple_results=False)(context, *factors, **parameters)
+
+    mlir.register_lowering(primitive, mlir.lower_fun(default, multiple_results=False))
+    mlir.register_lowering(primitive, on_cpu, platform="cpu")
+    mlir.register_lowering(primitive, mlir.lower_fun(gpu, multiple_results=False), platform="cuda")
+
+
+def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
+    """Return whether XLA shares out the program over devices: it would gather all that asks for a layout."""
+    axes = context.module_context.axis_context
+    if hasattr(axes, "mesh"):  # in `jax.shard_map`, which shares out by some axes itself
+        return any(size > 1 for name, size in axes.mesh.shape.items() if name not in axes.manual_axes)
+    return getattr(axes, "num_devices", 1) > 1
 
 
 def over_devices(
@@ -40,7 +84,7 @@ def over_devices(
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
         batched = jax.vmap(function, in_axes=tuple(None if i < num_shared else 0 for i in range(len(args))))
-        own = jax.devices() if devices is None else list(devices)
+        own = all_devices() if devices is None else list(devices)
         if len(own) == 1:
             return batched(*args)
         sizes = {np.shape(x)[:1] for x in jax.tree.leaves(args[num_shared:])}
@@ -71,48 +115,3 @@ def over_devices(
         return jax.shard_map(of_part, mesh=mesh, in_specs=(specs,), out_specs=part, check_vma=False)(given)
 
     return wrapped
-
-
-def keep_compiled() -> Path | None:
-    """Keep compiled programs in the user's folder of caches, for the next process. Call it before anything is computed.
-
-    It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
-    so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
-
-    Returns:
-        The folder in use; None if it cannot be written, and nothing is kept.
-    """
-    if present := jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        return Path(present)
-    try:
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute()
-        place = caches / "mjxgrad" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
-        place.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # read-only, or there is no home
-        return None
-    if not os.access(place, os.W_OK):
-        return None
-    found = {"compilation_cache_dir": str(place), "persistent_cache_min_compile_time_secs": 0.0}
-    for name, value in (found | {"persistent_cache_min_entry_size_bytes": -1}).items():
-        jax.config.update(f"jax_{name}", value)
-    warnings.showwarning = functools.partial(_show, warnings.showwarning, place, [])
-    return place
-
-
-def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any, *args: Any, **kwargs: Any) -> None:
-    """Show a warning; of JAX's for each program that cannot be read or written, dozens with one cause, one in their place."""
-    if "persistent compilation cache" in str(message):
-        told.append(message)
-        message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
-    if len(told) < 2 or not str(message).startswith("programs in"):
-        show(message, *args, **kwargs)
-
-
-def _processor() -> str:
-    """Return a short name of what programs are compiled for: the processor with all that it can do."""
-    about = Path("/proc/cpuinfo")
-    lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
-    kinds = sorted(
-        {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))} or lines[:1]
-    )
-    return f"{platform.machine()}-{hashlib.sha256(''.join(kinds).encode()).hexdigest()[:8]}"

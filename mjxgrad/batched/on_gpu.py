@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad.dynamics import linear
+from mjxgrad.batched import device, linear
 
 _Part = Float[Array, " 16"]
 _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
@@ -32,7 +32,7 @@ _MOST_ROWS = 1024
 @functools.cache
 def has_kernels() -> bool:
     """Return whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
-    if jax.default_backend() != "gpu":
+    if not device.is_gpu():
         return False
     try:
         importlib.import_module("jax.experimental.pallas.triton")

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from mjxgrad.batched import device
+
 _Items = Float[Array, "n *rest"]
 _Matrix = Float[Array, "n n *batch"]
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
@@ -220,7 +222,7 @@ def _add_block(x: Array, where: tuple[slice, ...], part: Array) -> Array:
     """
     if part.shape == x.shape:
         return x + part
-    if jax.default_backend() == "cpu":
+    if device.is_cpu():
         return x.at[where].add(part)
     margins = [(axis.start, size - axis.stop, 0) for axis, size in zip(where, x.shape, strict=False)]
     return x + jax.lax.pad(part, jnp.zeros((), x.dtype), [*margins, *[(0, 0, 0)] * (x.ndim - len(where))])

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import linear
+from mjxgrad.batched import linear
 
 
 @pytest.mark.parametrize("length", [1, linear.LONGEST_SUM, linear.LONGEST_SUM + 1, 4 * linear.LONGEST_SUM + 3])

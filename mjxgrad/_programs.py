@@ -1,0 +1,103 @@
+"""Programs that are compiled once: in a process, and from one process to the next."""
+
+import collections
+import functools
+import hashlib
+import importlib.metadata
+import os
+import platform
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+
+_Function = TypeVar("_Function", bound=Callable)
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile a function of arrays, or of trees with arrays, once for each shape and structure of them.
+
+    Called with traced values it is part of a larger program and left to that, in which more of the values may be known. It must
+    depend on its arguments alone: what it reads besides is read once.
+    """
+    program = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return function(*args, **kwargs)
+        # Whether a type is weak is part of a program: results that go in again would be compiled for a second time.
+        strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
+        return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+_KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()
+_MOST_KEPT = 64
+
+
+def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> jax.stages.Compiled:
+    """Compile a program, or return what was compiled of the same text: a function that was traced anew need not be.
+
+    The text has every number in it that is no argument, but not what a callback calls.
+    """
+    text = lowered.as_text()
+    if "callback" in text:
+        return lowered.compile(compiler_options=options)
+    shapes = str(jax.tree.leaves(lowered.args_info))
+    key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
+    if key not in _KEPT:
+        _KEPT[key] = lowered.compile(compiler_options=options)
+    _KEPT.move_to_end(key)
+    if len(_KEPT) > _MOST_KEPT:
+        _KEPT.popitem(last=False)
+    return _KEPT[key]
+
+
+def keep_compiled() -> Path | None:
+    """Keep compiled programs in the user's folder of caches, for the next process. Call it before anything is computed.
+
+    It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
+    so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
+
+    Returns:
+        The folder in use; None if it cannot be written, and nothing is kept.
+    """
+    if present := jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        return Path(present)
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute()
+        place = caches / "mjxgrad" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
+        place.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # read-only, or there is no home
+        return None
+    if not os.access(place, os.W_OK):
+        return None
+    found = {"compilation_cache_dir": str(place), "persistent_cache_min_compile_time_secs": 0.0}
+    for name, value in (found | {"persistent_cache_min_entry_size_bytes": -1}).items():
+        jax.config.update(f"jax_{name}", value)
+    warnings.showwarning = functools.partial(_show, warnings.showwarning, place, [])
+    return place
+
+
+def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any, *args: Any, **kwargs: Any) -> None:
+    """Show a warning; of JAX's for each program that cannot be read or written, dozens with one cause, one in their place."""
+    if "persistent compilation cache" in str(message):
+        told.append(message)
+        message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
+    if len(told) < 2 or not str(message).startswith("programs in"):
+        show(message, *args, **kwargs)
+
+
+def _processor() -> str:
+    """Return a short name of what programs are compiled for: the processor with all that it can do."""
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
+    kinds = sorted(
+        {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))} or lines[:1]
+    )
+    return f"{platform.machine()}-{hashlib.sha256(''.join(kinds).encode()).hexdigest()[:8]}"
