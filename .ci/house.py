@@ -24,7 +24,7 @@ def frames() -> int:
     import optax
 
     import mjxgrad as mg
-    from mjxgrad.dynamics import newton
+    from mjxgrad.solver import newton
 
     def reached(*_, **__):
         raise ReachedError

@@ -22,8 +22,8 @@ from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film, shown_speed
 from experiments.words import capitalised, joined
 from experiments.workspace import Workspace
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.scene import load_scene
+from mjxgrad.stepping import Smoothing
 from mjxgrad.tasks import scene_path
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 import mjxgrad as mg
-from mjxgrad.dynamics.kinematics import integrate_position
+from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.envs import Environment, EnvState
 
 

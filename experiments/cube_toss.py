@@ -23,8 +23,8 @@ from experiments.words import capitalised, joined, percent, quantity
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import data_of
-from mjxgrad.dynamics import Gradient, assembly
 from mjxgrad.integration import adaptive_rollout
+from mjxgrad.stepping import Gradient, assembly
 from mjxgrad.tasks import scene_path
 
 

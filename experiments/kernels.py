@@ -20,7 +20,7 @@ from experiments.settings import Positive, RunSettings
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import capitalised, joined, quantity
 from experiments.workspace import Workspace
-from mjxgrad.dynamics.kernels import KERNELS
+from mjxgrad.solver.kernels import KERNELS
 
 KernelName = Literal["gaussian", "logistic", "log_barrier"]
 

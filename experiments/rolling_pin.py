@@ -21,7 +21,7 @@ from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
 from experiments.workspace import Workspace
-from mjxgrad.dynamics import Smoothing
+from mjxgrad.stepping import Smoothing
 
 
 class RemedySettings(SettingsTable):

@@ -27,9 +27,9 @@ from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
-from mjxgrad.dynamics import Gradient
 from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import Engine
+from mjxgrad.stepping import Gradient
 from mjxgrad.tasks import scene_path
 from mjxgrad.verdict.sweep import Knob
 

@@ -22,15 +22,16 @@ from mjxgrad._rollout import (
     rollout,
 )
 from mjxgrad.batched import over_devices
+from mjxgrad.bodies import set_const
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
-from mjxgrad.dynamics import Onset, Smoothing, contact_force, forward, set_const, solve, step
 from mjxgrad.identification import identify
 from mjxgrad.linearisation import Linearisation, linearise
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
+from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
 from mjxgrad.task import SceneTask
 from mjxgrad.verdict import Verdict, check, sweep
 

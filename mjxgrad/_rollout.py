@@ -16,13 +16,13 @@ from mjxgrad._arrays import form, is_known, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.batched.cholesky import SOLUTION
+from mjxgrad.contact.collision import first_missed, slot_geoms
 from mjxgrad.contact.parameters import geom_name
-from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
-from mjxgrad.dynamics.collision import first_missed, slot_geoms
-from mjxgrad.dynamics.onset import reach
 from mjxgrad.native import INPUTS, roll_out
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
+from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient, forward, smoothing_warnings, step
+from mjxgrad.stepping.onset import reach
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 """From its parameters and what it sees to controls."""

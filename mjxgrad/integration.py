@@ -27,9 +27,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from mjxgrad._arrays import known
 from mjxgrad._rollout import State, data_of
-from mjxgrad.dynamics import forward
-from mjxgrad.dynamics.kinematics import integrate_position
+from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import forward
 
 Rates = tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " na"]]
 

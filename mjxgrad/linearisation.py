@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._rollout import Engine, State, data_of
-from mjxgrad.dynamics import Gradient, Onset, step
-from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import INPUTS
 from mjxgrad.native import linearise as by_mujoco
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import Gradient, Onset, step
 
 
 class Linearisation(eqx.Module):

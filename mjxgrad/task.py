@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad._arrays import form
 from mjxgrad._rollout import Engine, Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
-from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient
 
 
 class Outcome(eqx.Module):

@@ -13,8 +13,9 @@ ROOT = Path(mjxgrad.__file__).parent
 ORDER = (
     ("_arrays", "_mjx", "_programs", "_text"),
     ("batched",),
-    ("contact",),
-    ("dynamics",),
+    ("bodies",),
+    ("contact", "solver"),
+    ("stepping",),
     ("scene",),
     ("native",),
     ("_rollout",),

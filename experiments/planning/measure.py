@@ -15,8 +15,8 @@ from experiments.planning.settings import NAMES, Settings
 from experiments.planning.tree import Sampling, path, search
 from experiments.problems.planar_pusher import PlanarPusher, beside_rod, planar_pusher
 from experiments.workspace import Workspace
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import GoalCost, Plan, Smoother, optimise_trajectory
+from mjxgrad.stepping import Smoothing
 
 
 @dataclass(frozen=True)

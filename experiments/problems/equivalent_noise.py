@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad.contact.parameters import contact_parameters
-from mjxgrad.dynamics import constraint
-from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.jacobian import DenseRows
-from mjxgrad.dynamics.rows import law, one_sided
-from mjxgrad.dynamics.smoothing import Smoothing, noisy
 from mjxgrad.scene import Scene
+from mjxgrad.solver import constraint
+from mjxgrad.solver.constraint import RowLayout, Rows
+from mjxgrad.solver.jacobian import DenseRows
+from mjxgrad.stepping.rows import law, one_sided
+from mjxgrad.stepping.smoothing import Smoothing, noisy
 
 Profile = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 _ForceAt = Callable[[np.ndarray], np.ndarray]

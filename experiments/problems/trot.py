@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._rollout import State, data_of, initial_state
-from mjxgrad.dynamics.kinematics import kinematics
-from mjxgrad.dynamics.spatial import rotation_matrix
+from mjxgrad.bodies.kinematics import kinematics
+from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs import Environment
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path

@@ -19,7 +19,7 @@ from experiments.parallel import num_cores
 from experiments.stability.scenes import FIELDS, Points, StabilityScene, catalogue, configure
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import Observe, Trajectory
-from mjxgrad.dynamics import Gradient
+from mjxgrad.stepping import Gradient
 
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""

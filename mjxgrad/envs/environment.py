@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
 from mjxgrad._rollout import State, Trajectory, initial_state, rollout
-from mjxgrad.dynamics import Gradient
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import Gradient
 from mjxgrad.task import InScene, optional_pytree
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]

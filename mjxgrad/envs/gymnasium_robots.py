@@ -16,7 +16,7 @@ import mujoco
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._rollout import State, data_of, initial_state
-from mjxgrad.dynamics.kinematics import kinematics
+from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.envs.environment import Environment
 from mjxgrad.scene import Scene, load_scene
 

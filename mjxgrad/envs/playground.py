@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import mujoco.mjx
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import Gradient, Onset, Smoothing, check_gradient, step
+from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient, step
 
 Foreign = TypeVar("Foreign")
 _LOCK = threading.RLock()

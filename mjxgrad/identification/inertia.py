@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics.rows import index_of
 from mjxgrad.identification.parameters import Parameter
 from mjxgrad.scene import Scene
+from mjxgrad.stepping.rows import index_of
 
 # As `mujoco.sysid` bounds them: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre of mass by 0.5 m.
 _REACH = np.array([np.log(10) / 2, *[np.log(2) / 2] * 3, *[0.5] * 3, *[0.5] * 3])

@@ -13,8 +13,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import contact_parameters, deciding_geoms
-from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene import Scene
+from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
 """From a model and the parameter's value to the fields of the model that change."""

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import mjx
 from mjxgrad._rollout import State, initial_state, rollout
-from mjxgrad.dynamics import Gradient, Onset
-from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.scene import Scene, sensor
+from mjxgrad.stepping import Gradient, Onset
 
 _STATES = ("qpos", "qvel", "act")
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native.engine import Engine, Gradient, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of

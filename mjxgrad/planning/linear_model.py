@@ -34,8 +34,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import ContactPair
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
+from mjxgrad.stepping import Smoothing
 
 _Samples = Float[Array, "N both"]
 _Errors = Float[Array, "n columns"]

@@ -17,9 +17,9 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad._rollout import State
-from mjxgrad.dynamics import Smoothing, step
-from mjxgrad.dynamics.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import Smoothing, step
 from mjxgrad.task import as_pytree
 
 StateVector = Float[Array, " state"]

@@ -107,7 +107,7 @@ def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def searched_pairs(model: mujoco.MjModel) -> Iterator[str]:
-    """Name the pairs whose contact MJX finds by a search on distance fields, where `dynamics.collision` has nothing better."""
+    """Name the pairs whose contact MJX finds by a search on distance fields, where `contact.collision` has nothing better."""
     smooth = {kind.value for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, *_SEARCHED)}
     searched = {kind.value for kind in _SEARCHED}
     known = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CYLINDER.value}

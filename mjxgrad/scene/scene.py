@@ -17,14 +17,14 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
 from mjxgrad._text import format_number, name_pairs
+from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
+from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
-from mjxgrad.dynamics import constants
-from mjxgrad.dynamics.collision import candidates
-from mjxgrad.dynamics.rows import index_of
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission, has_medium
+from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters; what a laptop's terminal shows
 _OPTIONS = ("timestep", "gravity", "wind")

@@ -23,14 +23,14 @@ from jaxtyping import Array, Float, PyTree
 from mjxgrad._arrays import is_known
 from mjxgrad._rollout import Engine, Trajectory, initial_state
 from mjxgrad._text import format_number
+from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
-from mjxgrad.dynamics import Gradient
-from mjxgrad.dynamics.kinematics import kinematics
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.scene import Scene, SceneWarning, load_scene
+from mjxgrad.stepping import Gradient
 from mjxgrad.task import SceneTask
 from mjxgrad.verdict.check import Cost, Source, _outcomes
 from mjxgrad.verdict.motions import half_range

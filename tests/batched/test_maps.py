@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mjxgrad.batched import maps, primitives
-from mjxgrad.dynamics import spatial
+from mjxgrad.bodies import spatial
 
 BILINEAR = {
     "cross": spatial.cross,

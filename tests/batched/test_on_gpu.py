@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mjxgrad.batched import cholesky, on_gpu
-from mjxgrad.dynamics import newton
-from mjxgrad.dynamics.constraint import RowLayout, Rows
-from mjxgrad.dynamics.jacobian import AxisRows, DenseRows, JoinedRows
-from mjxgrad.dynamics.kinematics import Inertia
-from mjxgrad.dynamics.newton import System
+from mjxgrad.bodies.kinematics import Inertia
+from mjxgrad.solver import newton
+from mjxgrad.solver.constraint import RowLayout, Rows
+from mjxgrad.solver.jacobian import AxisRows, DenseRows, JoinedRows
+from mjxgrad.solver.newton import System
 
 _INTERPRET = jax.default_backend() != "gpu"
 _BATCH = 5

@@ -11,8 +11,8 @@ import mujoco.mjx
 import numpy as np
 import pytest
 
-from mjxgrad.dynamics import Onset
 from mjxgrad.envs import playground
+from mjxgrad.stepping import Onset
 
 # How many actions, and what is to be known: noise on observations and pushes have keys of their own.
 NAMES = {

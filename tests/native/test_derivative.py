@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.dynamics.kinematics import integrate_position
+from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.native.engine import engine_of
 from mjxgrad.tasks import scene_path
 

@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import norm
 
 import mjxgrad as mg
-from mjxgrad.dynamics import Smoothing
-from mjxgrad.dynamics.kinematics import position_change
+from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.planning.linear_model import Analytic, Exact, Sampled
 from mjxgrad.planning.system import FunctionSystem, SceneSystem
+from mjxgrad.stepping import Smoothing
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
 POINT, CONTROL, STDDEV = 0.03, jnp.zeros(1), 0.05

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import mjxgrad as mg
-from mjxgrad.dynamics import Smoothing
 from mjxgrad.planning import (
     Analytic,
     Cost,
@@ -22,6 +21,7 @@ from mjxgrad.planning import (
 )
 from mjxgrad.planning.system import terminal_model
 from mjxgrad.planning.trajectory import minimise_in_box
+from mjxgrad.stepping import Smoothing
 
 A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.02, 0.0], [0.1, 0.05]])
 HORIZON, START, GOAL = 6, jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mjxgrad._mjx import mjx
-from mjxgrad.dynamics import forward
-from mjxgrad.dynamics.collision import collide
+from mjxgrad.contact.collision import collide
 from mjxgrad.scene import SceneWarning, load_scene
+from mjxgrad.stepping import forward
 
 PENDULUM = """
 <mujoco>

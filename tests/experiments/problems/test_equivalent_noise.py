@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from experiments.problems.equivalent_noise import contact_profile, probe
-from tests.dynamics.test_kernels import DISTRIBUTIONS
+from tests.solver.test_kernels import DISTRIBUTIONS
 
 SCENE = """<mujoco><worldbody><geom type="plane" size="5 5 .1" solimp="{0}" margin="{1}"/>
   <body pos="0 0 1"><freejoint/><geom size=".1" solimp="{0}"/></body></worldbody></mujoco>"""

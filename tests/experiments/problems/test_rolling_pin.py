@@ -11,7 +11,7 @@ import pytest
 import mjxgrad as mg
 from experiments.problems.rolling_pin import DENT, DEPTH, rolling_pin
 from experiments.rolling_pin import Descent, Outcome, Settings, tables, verdict
-from mjxgrad.dynamics import Smoothing
+from mjxgrad.stepping import Smoothing
 
 HORIZON = 40
 

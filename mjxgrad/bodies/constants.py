@@ -1,0 +1,98 @@
+"""What MuJoCo computes from masses, inertias, lengths and sizes when it compiles a model, computed again from the present ones.
+
+The regularisation of constraint rows is scaled by inverse weights at the reference pose: without them a derivative by a mass is
+that of half the model. MuJoCo's own is `mj_setConst`, and for the bounding radii its compiler.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.bodies import forces, kinematics, tree
+
+# What they follow from, `geom_size` excepted, which only the bounding radii do.
+CAUSES = {
+    *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat", "dof_armature"),
+    *("jnt_pos", "jnt_axis", "qpos0", "site_pos", "tendon_armature", "actuator_gear"),
+}
+_Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
+# MuJoCo's mark of a body that hangs on the world by slides along the axes and carries no other: it counts by its mass alone.
+_SLIDING = 2
+
+
+def set_const(model: mjx.Model) -> mjx.Model:
+    """Return the model with the constants that follow from its masses, inertias, lengths and sizes.
+
+    Those are `body_subtreemass`, `body_invweight0`, `dof_invweight0`, `dof_M0`, `tendon_invweight0`, `tendon_length0`,
+    `actuator_acc0` and, of primitive geoms, `geom_rbound`. Differentiable with respect to all that they follow from, traceable,
+    and for batches under `jax.vmap`. The masses and inertias that MuJoCo's compiler derives from a geom's size or density
+    are inputs here: a changed size changes no mass.
+
+    Args:
+        model: of MJX's JAX implementation.
+    """
+    return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
+
+
+def constants_of(model: mjx.Model) -> dict[str, Array]:
+    """Return these constants by name."""
+    with jax.default_matmul_precision("highest"):
+        data = kinematics.up_to_inertia(model, mjx.make_data(model).replace(qpos=model.qpos0))
+        mass = mjx.full_m(model, data)
+        inverse = jnp.linalg.inv(mass)
+        found = {
+            "body_subtreemass": jnp.asarray(tree.descendants(model), mass.dtype) @ model.body_mass,
+            "body_invweight0": _of_bodies(model, data, inverse),
+            "dof_invweight0": _of_dofs(model, inverse),
+            "dof_M0": jnp.diag(mass),
+            "geom_rbound": bounding_radii(model),
+        }
+        if model.ntendon:
+            along = data._impl.ten_J
+            found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", along, inverse, along)
+            found["tendon_length0"] = data.ten_length
+        if model.nu:
+            moment = forces.transmission(model, data)._impl.actuator_moment
+            found["actuator_acc0"] = jnp.sqrt(jnp.sum((moment @ inverse) ** 2, axis=1))
+    return found
+
+
+def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"]) -> Float[Array, "nbody 2"]:
+    """Return what a unit force and a unit torque on each body's centre of mass accelerate it by, in the mean over directions."""
+    moves = jnp.asarray(tree.moving_dofs(model), inverse.dtype)[:, :, None]
+    turning, moving = data.cdof[None, :, :3] * moves, data.cdof[None, :, 3:] * moves
+    lever = data.xipos - data.subtree_com[np.asarray(model.body_rootid)]
+    moving = moving + jnp.cross(turning, lever[:, None])
+    weights = jnp.stack([jnp.einsum("bix,ij,bjx->b", j, inverse, j) / 3 for j in (moving, turning)], axis=1)
+    slides = model.body_simple == _SLIDING
+    alone = 1 / jnp.where(slides, model.body_mass, 1.0)
+    return jnp.where(slides[:, None], jnp.stack([alone, jnp.zeros_like(alone)], axis=1), weights)
+
+
+def _of_dofs(model: mjx.Model, inverse: Float[Array, "nv nv"]) -> Float[Array, " nv"]:
+    """Return the diagonal, of ball joints and of both halves of free joints in the mean."""
+    mean = np.zeros((model.nv, model.nv))
+    for kind, first in zip(model.jnt_type, model.jnt_dofadr, strict=True):
+        widths = {_Joint.mjJNT_FREE: (3, 3), _Joint.mjJNT_BALL: (3,)}.get(_Joint(kind), (1,))
+        for start, width in zip(np.cumsum((first, *widths)), widths, strict=False):
+            mean[start : start + width, start : start + width] = 1 / width
+    return jnp.asarray(mean, inverse.dtype) @ jnp.diag(inverse)
+
+
+def bounding_radii(model: mjx.Model) -> Float[Array, " ngeom"]:
+    """Return the radius of a sphere about each primitive geom (m), of others as it is; planes have none."""
+    radius, half, depth = model.geom_size.T
+    of_kind = {
+        _Geom.mjGEOM_SPHERE: radius,
+        _Geom.mjGEOM_CAPSULE: radius + half,
+        _Geom.mjGEOM_CYLINDER: jnp.sqrt(radius**2 + half**2),
+        _Geom.mjGEOM_ELLIPSOID: jnp.maximum(jnp.maximum(radius, half), depth),
+        _Geom.mjGEOM_BOX: jnp.sqrt(radius**2 + half**2 + depth**2),
+    }
+    bound = model.geom_rbound
+    for kind, own in of_kind.items():
+        bound = jnp.where(model.geom_type == kind, own, bound)
+    return bound

@@ -1,0 +1,318 @@
+r"""Kinematics, inertia and bias forces: the smooth stages of a step, without recursion.
+
+MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
+Then nothing has to be transformed between bodies, and what is usually a recursion over the tree is a sum over
+ancestors or descendants: a product with a constant 0/1 matrix. Only orientations multiply; their products from the
+root are formed by doubling, in a number of rounds that is logarithmic in the depth of the tree.
+
+MJX walks the tree level by level and gathers and scatters between levels, which reverse mode multiplies. The stages
+here fill the same fields of `mjx.Data` with the same values. One difference is meant: bodies fixed to a mocap body
+follow it, as in C MuJoCo.
+
+References:
+    Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.
+    MuJoCo documentation, "Computation", "General framework".
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mjxgrad._mjx import mjx
+from mjxgrad.batched import maps
+from mjxgrad.batched.maps import combine, contract, pick
+from mjxgrad.bodies import mended, spatial, tree
+from mjxgrad.bodies.orientation import orientation
+
+_Position = Float[Array, " nq"]
+_Vector = Float[Array, " nv"]
+_Joint = mujoco.mjtJoint
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def up_to_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Run the stages from the position to the mass matrix; those of tendons are MJX's."""
+    data = com_pos(model, kinematics(model, data))
+    if not model.ntendon:
+        return crb(model, data)
+    return mended.tendon_armature(model, crb(model, mended.tendon(model, data)))
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Place bodies, joints, geoms and sites, and normalise the quaternions of `qpos`; a drop-in for `mjx.kinematics`."""
+    frames = tree.frames(model)
+    qpos, turn, way, origin = _joint_motion(model, data.qpos)
+    turned = orientation(model, data, frames, turn)
+    fixed = spatial.rotation_matrix(pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY))
+    is_free = (model.jnt_type == _Joint.mjJNT_FREE)[:, None]
+    axis = jnp.where(is_free, jnp.asarray(_UP, qpos.dtype), spatial.rotate(fixed, model.jnt_axis))
+    before = np.concatenate([frames.before_body, frames.before_joint, frames.before_joint])
+    local = jnp.concatenate([model.body_pos, spatial.rotate(fixed, model.jnt_pos), axis])
+    from_parent, to_anchor, axis = jnp.split(turned.rotate(before, local), [model.nbody, model.nbody + model.njnt])
+    if model.nmocap:
+        is_mocap = (model.body_mocapid >= 0)[:, None]
+        from_parent = jnp.where(is_mocap, pick(model.body_mocapid, data.mocap_pos), from_parent)
+    moved = origin + maps.scale(way, axis)
+    moved -= turned.rotate(frames.after_joint, model.jnt_pos * (frames.after_joint >= 0)[:, None])
+    of_bodies, of_anchors = tree.displacements(model)
+    steps = jnp.concatenate([from_parent, to_anchor, moved])
+    positions = combine(np.concatenate([of_bodies, of_anchors]), steps)
+    xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
+
+    def place(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
+        """Return world position and orientation of what is fixed to bodies."""
+        last = frames.of_body[body]
+        return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
+
+    xmat = turned.compose(frames.of_body, jnp.broadcast_to(jnp.eye(3, dtype=xpos.dtype), (model.nbody, 3, 3)))
+    xquat = turned.quaternions(frames.of_body)
+    xipos, ximat = place(np.arange(model.nbody), model.body_ipos, model.body_iquat)
+    data = data.replace(qpos=qpos, xanchor=xanchor, xaxis=axis, xpos=xpos, xquat=xquat, xmat=xmat)
+    data = data.replace(xipos=xipos, ximat=ximat)
+    if model.ngeom:
+        placed = place(model.geom_bodyid, model.geom_pos, model.geom_quat)
+        data = data.replace(geom_xpos=placed[0], geom_xmat=placed[1])
+    if model.nsite:
+        placed = place(model.site_bodyid, model.site_pos, model.site_quat)
+        data = data.replace(site_xpos=placed[0], site_xmat=placed[1])
+    return data
+
+
+def _joint_motion(
+    model: mjx.Model, qpos: _Position
+) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
+    """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
+    dtype = qpos.dtype
+    kept, turns, ways, origins = [], [], [], []
+    for run in tree.joint_runs(model):
+        q, count = qpos[run.qpos], run.joints.stop - run.joints.start
+        turn = jnp.asarray(np.tile(_IDENTITY, (count, 1)), dtype)
+        way, origin = jnp.zeros(count, dtype), jnp.zeros((count, 3), dtype)
+        if run.kind == _Joint.mjJNT_SLIDE:
+            way = q - model.qpos0[run.qpos]
+        elif run.kind == _Joint.mjJNT_HINGE:
+            half = 0.5 * (q - model.qpos0[run.qpos])
+            axes = model.jnt_axis[run.joints]
+            turn = jnp.concatenate([jnp.cos(half)[:, None], maps.scale(jnp.sin(half), axes)], axis=1)
+        else:
+            q = q.reshape(count, run.width)
+            turn = spatial.normalise(q[:, -4:])
+            if run.kind == _Joint.mjJNT_FREE:
+                origin = q[:, :3]
+                q = jnp.concatenate([origin, turn], axis=1).reshape(-1)
+            else:
+                q = turn.reshape(-1)
+        for values, value in zip((kept, turns, ways, origins), (q, turn, way, origin), strict=True):
+            values.append(value)
+    if not kept:
+        return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))  # pyright: ignore[reportReturnType]
+    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
+
+
+def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find `subtree_com`, `cinert` and `cdof` of posed bodies, with mass or without; a drop-in for `mjx.com_pos`."""
+    mass = model.body_mass
+    moments = jnp.concatenate([maps.scale(mass, data.xipos), mass[:, None]], axis=1)
+    sums = combine(tree.descendants(model), moments)
+    is_massless = sums[:, 3:] < mujoco.mjMINVAL
+    centre = sums[:, :3] / jnp.where(is_massless, 1.0, sums[:, 3:])
+    centre = jnp.where(is_massless, data.xipos, centre)
+    offset = data.xipos - pick(model.body_rootid, centre)
+    central = spatial.compose(data.ximat * model.body_inertia[:, None], data.ximat.transpose(0, 2, 1))
+    inertia = spatial.inertia_about(offset, mass, central)
+    return data.tree_replace({"subtree_com": centre, "_impl.cinert": inertia, "cdof": _joint_axes(model, data, centre)})  # pyright: ignore[reportReturnType]
+
+
+def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]) -> Float[Array, "nv 6"]:
+    """Return the motion of unit joint velocities about the centre of mass of their tree."""
+    angular, linear = [], []
+    for run in tree.joint_runs(model):
+        axis = data.xaxis[run.joints]
+        if run.kind in (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL):
+            columns = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
+            axis = columns.reshape(-1, 3)
+        still = jnp.zeros_like(axis)
+        if run.kind == _Joint.mjJNT_FREE:
+            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)  # pyright: ignore[reportPossiblyUnboundVariable]
+            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
+            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
+        elif run.kind == _Joint.mjJNT_SLIDE:
+            angular.append(still)
+            linear.append(axis)
+        else:
+            angular.append(axis)
+            linear.append(still)
+    if not angular:
+        return jnp.zeros((0, 6), data.qpos.dtype)
+    turning = jnp.concatenate(angular)
+    root = pick(model.body_rootid[model.dof_bodyid], centre)
+    lever = root - pick(model.dof_jntid, data.xanchor)
+    return jnp.concatenate([turning, jnp.concatenate(linear) + spatial.cross(turning, lever)], axis=1)
+
+
+def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find velocities of bodies `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
+    motion = maps.scale(data.qvel, data.cdof)
+    sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
+    velocity, before = sums[: model.nbody], sums[model.nbody :]
+    return data.replace(cvel=velocity, cdof_dot=spatial.cross_motion(before, data.cdof))
+
+
+def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find the mass matrix from composite inertias; a drop-in for `mjx.crb`.
+
+    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself. `M` is in
+    whichever of MJX's two formats the data has.
+    """
+    if data._impl.M.ndim == 1:
+        return mjx.crb(model, data)
+    below = tree.descendants(model)
+    below[0] = 0
+    carried = combine(below[model.dof_bodyid], data._impl.cinert)
+    momentum = spatial.momentum(carried, data.cdof)
+    products = contract("ik,jk->ij", momentum, data.cdof)
+    is_pair = np.zeros((model.nv, model.nv))
+    is_pair[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = 1
+    lower = products * jnp.asarray(is_pair, products.dtype)
+    mirrored = products.T * jnp.asarray(np.triu(is_pair.T, 1), products.dtype)
+    diagonal = model.dof_armature[:, None] * jnp.eye(model.nv, dtype=products.dtype)
+    return data.tree_replace({"_impl.crb": combine(below, data._impl.cinert), "_impl.M": lower + mirrored + diagonal})  # pyright: ignore[reportReturnType]
+
+
+def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Find gravity, Coriolis and centrifugal forces, `qfrc_bias`, which keep the acceleration at zero; as `mjx.rne`."""
+    acceleration = combine(tree.moving_dofs(model), maps.scale(data.qvel, data.cdof_dot))
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
+        acceleration += jnp.concatenate([jnp.zeros_like(upwards), upwards])
+    inertia = data._impl.cinert
+    rate = spatial.cross_force(data.cvel, spatial.momentum(inertia, data.cvel))
+    force = spatial.momentum(inertia, acceleration) + rate
+    return data.replace(qfrc_bias=generalised_force(model, data, force))
+
+
+def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> _Vector:
+    """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
+    carried = combine(tree.moving_dofs(model).T, force)
+    return maps.dot(data.cdof, carried)
+
+
+class Bodies(eqx.Module):
+    """Bodies in motion, by which the mass matrix is applied without being formed.
+
+    M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
+    ancestors, a product with each body's inertia, sums over descendants, as in `rne`. Its derivative is of the same kind,
+    where that of the matrix is a matrix. `moves` has the joint velocities that move each body.
+    """
+
+    inertia: Float[Array, "nbody 10 *batch"]
+    axes: Float[Array, "nv 6 *batch"]
+    armature: Float[Array, "nv *batch"]
+    moves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def apply(self, acceleration: _Vector) -> _Vector:
+        """Return M a."""
+        moves = np.zeros((len(self.moves), len(self.axes)))
+        for row, dofs in zip(moves, self.moves, strict=True):
+            row[list(dofs)] = 1
+        motion = combine(moves, maps.scale(acceleration, self.axes))
+        force = spatial.momentum(self.inertia, motion)
+        return maps.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
+
+
+class Inertia(eqx.Module):
+    """M: its entries, and the bodies it is made of, if nothing else adds to it. Derivatives go through these."""
+
+    matrix: Float[Array, "nv nv *batch"]
+    bodies: Bodies | None = None
+
+    def apply(self, acceleration: _Vector) -> _Vector:
+        """Return M a."""
+        if self.bodies is None:
+            return contract("ij,j->i", self.matrix, acceleration)
+        return self.bodies.apply(acceleration)
+
+    def plus(self, diagonal: _Vector) -> "Inertia":
+        """Return M plus a diagonal matrix."""
+        bodies = None
+        if self.bodies is not None:
+            bodies = dataclasses.replace(self.bodies, armature=self.bodies.armature + diagonal)
+        return Inertia(self.matrix + jnp.diag(diagonal), bodies)
+
+
+def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
+    """Return M of data with its mass matrix filled in."""
+    matrix = mjx.full_m(model, data)
+    if model.ntendon or data._impl.M.ndim == 1:
+        # Tendons have armature of their own; the sparse format is MJX's.
+        return Inertia(matrix)
+    moves = tuple(tuple(int(dof) for dof in np.nonzero(row)[0]) for row in tree.moving_dofs(model))
+    armature = jnp.asarray(model.dof_armature, matrix.dtype)
+    return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
+
+
+def integrate_position(
+    model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
+) -> _Position:
+    """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
+    places = _places(model)
+    if not places.quaternions.size:
+        return qpos + duration * qvel
+    moved = qpos + duration * pick(places.dof, qvel)
+    turn = spatial.exponential(duration * pick(places.turns, qvel).reshape(-1, 3))
+    turned = spatial.normalise(spatial.multiply(pick(places.quaternions, qpos).reshape(-1, 4), turn))
+    return jnp.where(places.entry < 0, moved, pick(places.entry, turned.reshape(-1)))
+
+
+def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
+    """Return the velocity that moves one position to another in unit time, by the shorter turns of quaternions.
+
+    The inverse of `integrate_position`.
+    """
+    places = _places(model)
+    if not places.quaternions.size:
+        return end - start
+    before, after = (pick(places.quaternions, x).reshape(-1, 4) for x in (start, end))
+    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(before), after)).reshape(-1)
+    return pick(_inverse(places.dof, model.nv), end - start) + pick(_inverse(places.turns, model.nv), turned)
+
+
+class _Places(NamedTuple):
+    """Of each coordinate the joint velocity that adds to it and its entry among those of quaternions, -1 for none.
+
+    And of the entries of quaternions and of turning joints the places among coordinates and among joint velocities.
+    """
+
+    dof: Int[np.ndarray, " nq"]
+    entry: Int[np.ndarray, " nq"]
+    quaternions: Int[np.ndarray, " entries"]
+    turns: Int[np.ndarray, " dofs"]
+
+
+def _places(model: mjx.Model) -> _Places:
+    dof, quaternions, turns = np.full(model.nq, -1), [], []
+    for kind, address, first in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        is_free = kind == _Joint.mjJNT_FREE
+        if is_free:
+            dof[address : address + 3] = np.arange(first, first + 3)
+            address, first = address + 3, first + 3
+        if is_free or kind == _Joint.mjJNT_BALL:
+            quaternions += range(address, address + 4)
+            turns += range(first, first + 3)
+        else:
+            dof[address] = first
+    quaternions, turns = np.array(quaternions, int), np.array(turns, int)
+    return _Places(dof, _inverse(quaternions, model.nq), quaternions, turns)
+
+
+def _inverse(index: Int[np.ndarray, " n"], size: int) -> Int[np.ndarray, " size"]:
+    """Return where in an index each place is, -1 where it is not."""
+    inverse = np.full(size, -1)
+    inverse[index[index >= 0]] = np.flatnonzero(index >= 0)
+    return inverse

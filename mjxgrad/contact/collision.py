@@ -1,0 +1,297 @@
+"""Contacts between geoms: MJX's pairs and slots, and in part its functions.
+
+Those of planes, balls and capsules are in `capsules`. Of four more kinds of pair MJX finds the points in another way.
+
+A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
+and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
+there is nothing to search, and a contact belongs to one diagonal for good.
+
+A ball on a box. MJX knows its distance only where they overlap; the nearest point of a box is known anywhere.
+
+A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder is known, too.
+
+A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and gives the other two the height that
+follows from the first. Standing upright there is no lowest point; it then picks a fixed one, and the heights of the other two
+no longer feel a tilt about it. The positions of the contacts do: each lies half its distance from the rim towards the plane,
+n·(p - o) + d/2 is the height of the rim above the plane, and its derivative is the right one in every pose.
+"""
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mjxgrad._mjx import COLLISION_FUNCTIONS as _PLAIN
+from mjxgrad._mjx import contact_groups, custom_number, geom_groups, make_frame, mjx
+from mjxgrad.batched import maps
+from mjxgrad.batched.maps import contract, dot, pick, safe_norm
+from mjxgrad.bodies.mended import copy_of
+from mjxgrad.contact import capsules
+
+_PerPair = Float[Array, " pairs"]
+_Frames = Float[Array, "pairs 3 3"]
+_Points = Float[Array, "pairs 3"]
+_Point, _Polygon = Float[Array, "3"], Float[Array, "_ 3"]
+_Pairs = Int[Array | np.ndarray, "pairs 2"]
+# Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
+_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
+)
+CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
+_WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
+"""What has no bounding sphere."""
+_DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
+# How much sooner a ball outside an edge is too far from it to be pushed by both faces.
+_ROUND_EDGES = 4.0
+# In m² of an edge's length times a distance from a plane: less is rounding, in either precision.
+_PARALLEL = 1e-12
+
+
+def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs.
+
+    Where data has fewer slots for contacts of one dimension than could touch, the nearest get them.
+    """
+    if not data._impl.ncon:
+        return data
+    most_pairs = custom_number(model, "max_geom_pairs")
+    contacts, members = contact_groups(model, data), geom_groups(model)
+    pairs: dict[Any, Array | np.ndarray] = {}
+    for key, contact in contacts.items():
+        pairs[key] = geoms = np.array(members[key])[:, :2]
+        if len(geoms) > most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types):
+            first, second = data.geom_xpos[geoms.T]
+            gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
+            contacts[key] = nearest = _greatest(contact, -gaps, most_pairs)
+            pairs[key] = nearest.geom
+    # Of pairs that only the running program knows MJX finds the contacts.
+    known = {key: geoms for key, geoms in pairs.items() if isinstance(geoms, np.ndarray) and capsules.has_formula(key)}
+    found = capsules.find(model, data, known)
+    by_dim: dict[int, list] = {}
+    for key, geoms in pairs.items():
+        find = _FUNCTIONS.get(key.types) or _MJX_FUNCTIONS[key.types]  # pyright: ignore[reportArgumentType]
+        dist, pos, frame = found[key] if key in found else find(model, data, key, geoms)
+        count = len(dist) // len(geoms)
+        contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), contacts[key])
+        by_dim.setdefault(int(key.condim), []).append(contact.replace(dist=dist, pos=pos, frame=frame))
+    ordered = []
+    for dim in sorted(by_dim):
+        contact = _joined(by_dim[dim])
+        count = int(np.sum(data._impl.contact.dim == dim))
+        if len(contact.dist) > count:
+            contact = _greatest(contact, contact.includemargin - contact.dist, count)
+        ordered.append(contact)
+    return data.tree_replace({"_impl.contact": _joined(ordered)})  # pyright: ignore[reportReturnType]
+
+
+def slot_geoms(model: mjx.Model, data: mjx.Data) -> Int[np.ndarray, "contacts 2"] | None:
+    """Return the two geoms of each contact slot; None where it is decided at run time who gets a slot."""
+    every = candidates(model)
+    found = np.concatenate([np.zeros((0, 2), int), *(every[dim] for dim in sorted(every))])
+    return found if len(found) == len(data._impl.contact.dim) else None
+
+
+def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
+    """Return the two geoms of each contact that there could be, by dimension."""
+    by_dim: dict[int, list[np.ndarray]] = {}
+    for key, members in geom_groups(model).items():
+        count = _MJX_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
+        by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
+    return {dim: np.concatenate(geoms) for dim, geoms in by_dim.items()}
+
+
+def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
+    """Return the distance, less the margin, from which a contact may have found no slot (m); infinite if all have one."""
+    contact, gap = data._impl.contact, data._impl.contact.dist - data._impl.contact.includemargin
+    slots = {dim: np.flatnonzero(np.asarray(contact.dim) == dim) for dim in np.unique(contact.dim)}
+    crowded = [gap[of_dim].max() for dim, of_dim in slots.items() if len(of_dim) < len(candidates(model)[dim])]
+    return jnp.min(jnp.stack(crowded)) if crowded else jnp.asarray(jnp.inf, data.qpos.dtype)
+
+
+def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
+    """Return of which pairs the distance is known only where they overlap."""
+    is_plane, is_sphere, is_box, is_convex = (
+        are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
+    )
+    is_ball_on_box = is_sphere.any(axis=1) & is_box.any(axis=1)
+    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~is_ball_on_box  # pyright: ignore[reportReturnType]
+
+
+def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
+    """Return which geoms are of some kinds; known while tracing where the geoms are."""
+    table = np.isin(np.asarray(model.geom_type), kinds)
+    return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
+
+
+def other_sides(
+    model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
+) -> tuple[Any, Float[Array, " contacts"]]:
+    """Return the contact that would take the place of each as bodies move on, and by how much the present one is nearer (m).
+
+    Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
+    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
+    boxes change sides only where the geoms are constants.
+    """
+    towards = pick(geoms[:, 1], data.geom_xpos) - pick(geoms[:, 0], data.geom_xpos)
+    pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
+    if isinstance(geoms, np.ndarray):
+        kinds = np.asarray(model.geom_type)[geoms]
+        in_box = np.flatnonzero((kinds == (_SPHERE, _BOX)).all(axis=1))
+        if in_box.size:
+            faces = _next_face(model, data, geoms[in_box])
+            pos, frame, nearer = (x.at[in_box].set(new) for x, new in zip((pos, frame, nearer), faces, strict=True))
+    return contact.replace(pos=pos, frame=frame), nearer
+
+
+def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points, _Frames, _PerPair]:
+    """Return position and frame of a ball's contact with the second nearest face of a box, and how much farther that is."""
+    distance, outward, beyond, sign = _from_box(model, data, geoms)
+    nearest = _largest(beyond)
+    opposite = -beyond - 2 * pick(geoms[:, 1], model.geom_size)
+    rest = jnp.where(nearest, opposite, beyond)
+    second = _largest(rest)
+    along_nearest, along_second = (jnp.sum(jnp.abs(outward) * axis, axis=1)[:, None] for axis in (nearest, second))
+    traded = outward + sign * (along_second - along_nearest) * (1.0 * nearest - 1.0 * second)
+    is_opposite = jnp.any(nearest & second, axis=1)
+    pos, frame = _towards(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
+    next_one = jnp.max(rest, axis=1)
+    # Round an edge the normal turns as the ball does: nothing to share.
+    return pos, frame, jnp.max(beyond, axis=1) - next_one + _ROUND_EDGES * jnp.where(next_one > 0, next_one, 0.0)
+
+
+def _joined(contacts: list):
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
+
+
+def _greatest(contact, score: Float[Array, " contacts"], count: int):
+    index = jax.lax.top_k(score, k=count)[1]
+    chosen = jax.tree.map(lambda x: x[index], contact)
+    if contact.dist is None:  # before they are found
+        return chosen
+    places = jnp.concatenate([contact.dist[:, None], contact.pos, contact.frame.reshape(-1, 9)], axis=1)
+    dist, pos, frame = jnp.split(maps.choose(index, places), (1, 4), axis=1)
+    return chosen.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
+
+
+def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
+    """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
+    plane, box = geoms.T
+    normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
+    height = dot(normal, centre - pick(plane, data.geom_xpos))
+    halves = jnp.asarray(_DIAGONALS, centre.dtype) * pick(box, model.geom_size)[:, None]
+    diagonal = contract("pij,pdj->pdi", pick(box, data.geom_xmat), halves)
+    rise = contract("pi,pdi->pd", normal, diagonal)
+    to_lower = jnp.where(rise > 0, -1, 1)
+    dist = height[:, None] + to_lower * rise
+    corner = centre[:, None] + to_lower[..., None] * diagonal
+    pos = corner - 0.5 * dist[..., None] * normal[:, None]
+    frame = jnp.repeat(jax.vmap(make_frame)(normal), len(_DIAGONALS), axis=0)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame
+
+
+def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> capsules.Found:
+    """Return MJX's contacts with the derivative of the distance that it drops."""
+    dist, pos, frame = _MJX_FUNCTIONS[key.types](model, data, key, geoms)
+    on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
+    height = dot(frame[:, 0], pos - on_plane) + 0.5 * dist
+    # The value stays MJX's own; only the derivative is replaced.
+    return jax.lax.stop_gradient(dist - height) + height, pos, frame
+
+
+def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
+    """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
+    distance, outward, *_ = _from_box(model, data, geoms)
+    pos, frame = _towards(model, data, geoms, distance, outward)
+    return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
+
+
+def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
+    """Return the point of the cylinder that is nearest to the ball's centre; from within, that of the nearer of side and end."""
+    sphere, cylinder = geoms.T
+    away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
+    centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
+    radius = safe_norm(centre[:, :2])
+    on_axis = (radius < 1e-12)[:, None]  # m; nearer to it a turn about it is none, and its derivative overflows
+    radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
+    # In the half-plane of axis and centre: across, along.
+    beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]
+    sign = jnp.stack([jnp.ones_like(radius), jnp.where(centre[:, 2] < 0, -1.0, 1.0)], axis=1)
+    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
+    length = safe_norm(gap)
+    is_inside = jnp.all(beyond <= 0, axis=1)
+    nearer = sign * (jnp.arange(2) == jnp.argmax(beyond, axis=1)[:, None])
+    outward = jnp.where(is_inside[:, None], nearer, gap / jnp.where(length > 0, length, 1.0)[:, None])
+    distance = jnp.where(is_inside, jnp.max(beyond, axis=1), length)
+    outward = jnp.concatenate([outward[:, :1] * radial, outward[:, 1:]], axis=1)
+    pos, frame = _towards(model, data, geoms, distance, outward)
+    return distance - pick(sphere, model.geom_size)[:, 0], pos, frame
+
+
+def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
+    """Return how far a ball's centre lies outside a box, in which direction, and its distances and sides along the axes."""
+    sphere, box = geoms.T
+    away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
+    centre = contract("pji,pj->pi", pick(box, data.geom_xmat), away)
+    beyond = jnp.abs(centre) - pick(box, model.geom_size)
+    is_inside = jnp.all(beyond <= 0, axis=1)
+    sign = jnp.where(centre < 0, -1.0, 1.0)
+    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
+    length = safe_norm(gap)
+    face = sign * _largest(beyond)
+    outward = jnp.where(is_inside[:, None], face, gap / jnp.where(length > 0, length, 1.0)[:, None])
+    return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward, beyond, sign
+
+
+def _towards(
+    model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
+) -> tuple[_Points, _Frames]:
+    """Return position and frame of contacts, half-way between both surfaces."""
+    sphere, other = geoms.T
+    normal = contract("pij,pj->pi", pick(other, data.geom_xmat), -outward)
+    reach = 0.5 * (distance + pick(sphere, model.geom_size)[:, 0])
+    return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
+
+
+def _largest(x: _Points) -> Array:
+    """Return which is the largest of three."""
+    return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
+
+
+_FUNCTIONS = {
+    (_PLANE, _BOX): _plane_box,
+    (_PLANE, _CYLINDER): _plane_cylinder,
+    (_SPHERE, _BOX): _sphere_box,
+    (_SPHERE, _CYLINDER): _sphere_cylinder,
+}
+
+
+def _divisor(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return what to divide by, where MJX does so by anything but zero."""
+    return jnp.where(jnp.abs(x) >= _PARALLEL, x, 1e-6)
+
+
+def _closest_segment_point_plane(a: _Point, b: _Point, p0: _Point, plane_normal: _Point) -> _Point:
+    """Return where a segment meets a plane, or its nearer end; of a parallel one some point."""
+    along = jnp.sum(plane_normal * (b - a))
+    share = (jnp.sum(p0 * plane_normal) - jnp.sum(plane_normal * a)) / _divisor(along)
+    return a + jnp.clip(share, 0, 1) * (b - a)
+
+
+def _project_poly_onto_poly_plane(poly1: _Polygon, norm1: _Point, poly2: _Polygon, norm2: _Point) -> _Polygon:
+    """Return the first polygon moved along its normal onto the plane of the second."""
+    way = (poly2[0].dot(norm2) - poly1.dot(norm2)) / _divisor(norm1.dot(norm2))
+    return poly1 + way.reshape(-1, 1) * norm1
+
+
+_convex = copy_of(
+    "collision_convex",
+    _closest_segment_point_plane=_closest_segment_point_plane,
+    _project_poly_onto_poly_plane=_project_poly_onto_poly_plane,
+)
+_own = {f: getattr(_convex, name) for name, f in vars(sys.modules[_convex.__name__]).items() if hasattr(f, "ncon")}
+# MJX's for each pair of types, of boxes, capsules, meshes and height fields with quotients that have a derivative.
+_MJX_FUNCTIONS = {kinds: _own.get(f, f) for kinds, f in _PLAIN.items()}

@@ -1,0 +1,1 @@
+"""Constraint forces, as the minimum of a convex cost: laws and Jacobians of rows, Newton's method, its derivative."""

@@ -1,0 +1,313 @@
+r"""Laws of the constraint rows: cost, force and curvature as functions of x = J a - a_ref.
+
+Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope bounded by the loss), then limits and
+contacts (½D min(x, 0)²), where an elliptic contact couples its rows in three zones. With u = (μx₀, f₁x₁, ...), N = u₀,
+T = |u₁..|:
+
+- top, N ≥ μT: no cost;
+- bottom, μN + T ≤ 0: ½ Σ D x²;
+- middle: ½ D₀ (N - μT)² / (μ²(1 + μ²)), whose curvature in u is the sum of two positive parts,
+  (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
+  (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
+
+Rows under noise (see `smoothing`) have the mean of these costs: of x + c w over noise w on the distance, where it makes
+contact. That of ½ min(x, 0)² is convex in x with the derivative -`_mean_push`. For the cone it is as simple, since its
+three zones are the sum of two such terms,
+
+    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
+
+at the top both vanish, in the middle the second does, at the bottom they add up to ½ Σ D x². Noise shifts N by μcw, so
+each term is the simple one with its own spread: exact, whatever the kernel, and convex. At T = 0 the pulls of both
+along the tangent cancel.
+
+Arrays may carry the batch as trailing axes, see `linear`.
+
+References:
+    Todorov. Convex and analytically-invertible dynamics with contacts and constraints: Theory and implementation in
+    MuJoCo. ICRA 2014. MuJoCo documentation, "Computation", "Constraint model".
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mjxgrad.batched.linear import add, sum_of_few
+from mjxgrad.solver.kernels import Kernel
+
+_PerRow = Float[Array, "rows *batch"]
+_PerContact = Float[Array, "contacts *batch"]
+_Directions = Float[Array, "contacts dim *batch"]
+_Columns = Float[Array, "contacts dim columns *batch"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ConeGroup:
+    """Elliptic contacts of one dimension, in consecutive rows."""
+
+    start: int
+    count: int
+    dim: int
+
+    @property
+    def stop(self) -> int:
+        return self.start + self.count * self.dim
+
+
+@dataclasses.dataclass(frozen=True)
+class RowLayout:
+    """Which law holds on which rows. Static: it shapes the compiled program."""
+
+    num_equality: int
+    num_friction: int
+    num_rows: int
+    cones: tuple[ConeGroup, ...] = ()
+    kernel: Kernel | None = None
+    first_noisy: int = 0
+
+    @property
+    def friction(self) -> slice:
+        return slice(self.num_equality, self.num_equality + self.num_friction)
+
+    @property
+    def simple_stop(self) -> int:
+        """End of the rows that stand for themselves."""
+        return self.cones[0].start if self.cones else self.num_rows
+
+    @property
+    def is_piecewise_quadratic(self) -> bool:
+        """Whether the cost along a line is."""
+        return not self.cones and self.kernel is None
+
+    @property
+    def hard_stop(self) -> int:
+        """End of the rows among them that have no noise; those from here on have it, cones included."""
+        return self.simple_stop if self.kernel is None else self.first_noisy
+
+
+class Noise(eqx.Module):
+    """What noise on the distance r does to x of a contact's or limit's rows; of cones the first row counts.
+
+    Attributes:
+        spread: by how much x moves if r does by one length of the kernel (m/s² or rad/s²); positive.
+        gate: x at which contact ends by distance alone and not by acceleration; -inf if it never does (m/s² or rad/s²).
+    """
+
+    spread: _PerRow
+    gate: _PerRow
+
+
+class Rows(eqx.Module):
+    """Parameters of the constraint rows of one state.
+
+    Attributes:
+        reference: a_ref, the acceleration that a row asks for (m/s² or rad/s²).
+        weight: D, the inverse of the regularisation R (kg or kg m²).
+        bound: largest force of a friction loss row (N or N m); elsewhere unused.
+        scales: per elliptic group (μ, f₁, ..., f_dim-1) of each contact; μ = f₁/√impratio.
+        noise: of the rows, where the layout has a kernel.
+    """
+
+    reference: _PerRow
+    weight: _PerRow
+    bound: _PerRow
+    scales: tuple[Float[Array, "_ _ *batch"], ...]
+    noise: Noise | None = None
+
+
+def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
+    """Return the constraint forces, minus the derivative of the cost with respect to x (N or N m)."""
+    hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
+    linear = -rows.weight * x
+    bound = rows.bound[friction]
+    limit = jnp.sign(x[friction]) * bound
+    # `where`, not `clip` and `maximum`: at a tie their derivative is one half, which belongs to neither side.
+    parts = [
+        linear[: friction.start],
+        jnp.where(jnp.abs(linear[friction]) < bound, linear[friction], -limit),
+        jnp.where(x[hard] < 0, linear[hard], 0.0),
+    ]
+    if layout.kernel is not None:
+        noisy = slice(layout.hard_stop, layout.simple_stop)
+        parts.append(rows.weight[noisy] * _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
+    for k in range(len(layout.cones)):
+        parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
+    return jnp.concatenate([part for part in parts if part.shape[0]])
+
+
+def bounds(layout: RowLayout, rows: Rows) -> tuple[_PerRow, _PerRow]:
+    """Return least and largest force of rows that stand for themselves without noise: where it lies between, it is -D x."""
+    bound, one_sided = rows.bound[layout.friction], jnp.zeros_like(rows.bound[layout.friction.stop :])
+    equality = jnp.full_like(rows.bound[: layout.num_equality], jnp.inf)
+    low = jnp.concatenate([-equality, -bound, one_sided])
+    return low, jnp.concatenate([equality, bound, jnp.full_like(one_sided, jnp.inf)])
+
+
+class Bend(eqx.Module):
+    """The second derivative of the cost by x: of rows that stand for themselves, and a matrix for each elliptic contact."""
+
+    simple: Float[Array, "_ *batch"]
+    cones: tuple[Float[Array, "_ _ _ *batch"], ...]
+
+
+def bend(layout: RowLayout, rows: Rows, x: _PerRow) -> Bend:
+    """Return the second derivative of the cost with respect to x."""
+    cones = []
+    for k, group in enumerate(layout.cones):
+        unit = jnp.eye(group.dim, dtype=x.dtype).reshape(1, group.dim, group.dim, *(1,) * (x.ndim - 1))
+        unit = jnp.broadcast_to(unit, (group.count, group.dim, group.dim, *x.shape[1:]))
+        cones.append(_cone(layout, k, rows, x).curvature_product(unit))
+    return Bend(_simple_curvature(layout, rows, x), tuple(cones))
+
+
+def bend_product(layout: RowLayout, bend: Bend, x: _PerRow) -> _PerRow:
+    """Return a second derivative of the cost times a vector."""
+    parts = [bend.simple * x[: layout.simple_stop]]
+    for group, matrix in zip(layout.cones, bend.cones, strict=True):
+        own = _blocks(group, x)
+        both = add(matrix[:, :, k] * own[:, None, k] for k in range(group.dim))
+        parts.append(both.reshape(-1, *x.shape[1:]))
+    return jnp.concatenate(parts)
+
+
+def curvature_product(
+    layout: RowLayout, rows: Rows, x: _PerRow, matrix: Float[Array, "rows columns *batch"]
+) -> Float[Array, "rows columns *batch"]:
+    """Return the second derivative of the cost with respect to x, times a matrix."""
+    parts = [_simple_curvature(layout, rows, x)[:, None] * matrix[: layout.simple_stop]]
+    for k, group in enumerate(layout.cones):
+        both = _cone(layout, k, rows, x).curvature_product(_blocks(group, matrix))
+        parts.append(both.reshape(-1, *matrix.shape[1:]))
+    return jnp.concatenate(parts, axis=0)
+
+
+def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array, "_ *batch"]:
+    hard, friction = slice(layout.friction.stop, layout.hard_stop), layout.friction
+    stuck = jnp.abs(rows.weight[friction] * x[friction]) < rows.bound[friction]
+    equality = jnp.ones_like(x[: friction.start], bool)
+    is_curved = jnp.concatenate([equality, stuck, x[hard] < 0])
+    curvature = jnp.where(is_curved, rows.weight[: layout.hard_stop], 0.0)
+    if layout.kernel is None:
+        return curvature
+    noisy = slice(layout.hard_stop, layout.simple_stop)
+    share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
+    return jnp.concatenate([curvature, rows.weight[noisy] * share])
+
+
+class _Cone(eqx.Module):
+    """An elliptic group seen in the coordinates u, with its zones."""
+
+    group: ConeGroup = eqx.field(static=True)
+    weight: _PerRow
+    scale: _Directions
+    tangent: Float[Array, "contacts tangents *batch"]
+    slip: _PerContact
+    gap: _PerContact
+    stiffness: _PerContact
+    is_middle: Bool[Array, "contacts *batch"]
+    is_bottom: Bool[Array, "contacts *batch"]
+
+    def force(self, linear: _PerRow) -> _Directions:
+        press = jnp.where(self.is_middle, -self.stiffness * self.gap, 0.0)
+        slide = -(press * self.scale[:, 0])[:, None] * self.tangent
+        middle = self.scale * jnp.concatenate([press[:, None], slide], axis=1)
+        return jnp.where(self.is_bottom[:, None], _blocks(self.group, linear), middle)
+
+    def curvature_product(self, block: _Columns) -> _Columns:
+        scaled = self.scale[:, :, None] * block
+        mu = self.scale[:, 0]
+        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * self.tangent], axis=1)
+        ratio = jnp.where(self.is_middle, -self.gap / jnp.where(self.slip > 0, self.slip, 1.0), 0.0)
+        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
+        slide = sum_of_few(self.tangent[:, :, None] * scaled[:, 1:])
+        across = scaled[:, 1:] - self.tangent[:, :, None] * slide
+        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
+        middle = (self.stiffness[:, None] * self.scale)[:, :, None] * (first + second)
+        bottom = _blocks(self.group, self.weight)[:, :, None] * block
+        zone = jnp.where(self.is_middle[:, None, None], middle, 0.0)
+        return jnp.where(self.is_bottom[:, None, None], bottom, zone)
+
+
+class _NoisyCone(eqx.Module):
+    """An elliptic group under noise: both terms of its cost in the coordinates u."""
+
+    scale: _Directions
+    stiffness: _PerContact
+    tangential: Float[Array, "contacts tangents *batch"]
+    slip: _PerContact
+    pushes: tuple[_PerContact, _PerContact]
+    shares: tuple[_PerContact, _PerContact]
+    hold: _PerContact
+
+    def force(self, _: _PerRow) -> _Directions:
+        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
+        both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
+        return self.stiffness[:, None] * self.scale * both
+
+    def curvature_product(self, block: _Columns) -> _Columns:
+        scaled = self.scale[:, :, None] * block
+        mu = self.scale[:, :1, None]
+        tangent = (self.tangential / jnp.where(self.slip > 0, self.slip, 1.0)[:, None])[:, :, None]
+        slide = sum_of_few(tangent * scaled[:, 1:])
+        first = self.shares[0][:, None, None] * (scaled[:, :1] - mu * slide)
+        second = self.shares[1][:, None, None] * (mu * scaled[:, :1] + slide)
+        across = self.hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
+        along = tangent * (second - mu * first)
+        both = jnp.concatenate([first + mu * second, along + across], axis=1)
+        return (self.stiffness[:, None] * self.scale)[:, :, None] * both
+
+
+def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _NoisyCone:
+    """Return one group of elliptic contacts at x."""
+    group, scale = layout.cones[which], rows.scales[which]
+    u = _blocks(group, x) * scale
+    square = sum_of_few(u[:, 1:] ** 2)[:, 0]
+    slides = square > 1e-24  # m²/s⁴; less is rest, without a direction whose derivative could overflow
+    slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
+    mu, normal = scale[:, 0], u[:, 0]
+    stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))
+    if layout.kernel is None:
+        is_top = normal >= mu * slip
+        is_bottom = ~is_top & (mu * normal + slip <= 0)
+        tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
+        gap, is_middle = normal - mu * slip, ~is_top & ~is_bottom
+        return _Cone(group, rows.weight, scale, tangent, slip, gap, stiffness, is_middle, is_bottom)
+    noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
+    first = Noise(mu * noise.spread, mu * noise.gate)
+    second = Noise(mu * first.spread, mu * first.gate)
+    push1, share1 = _mean_push(layout.kernel, normal - mu * slip, first)
+    push2, share2 = _mean_push(layout.kernel, mu * normal + slip, second)
+    # The pull along the tangent, per slip. Where slip is small both pushes nearly cancel; there it is the mean over
+    # the slip of its derivative, by the trapezoidal rule, whose error (of second order) meets that of rounding at the
+    # cube root of eps.
+    still = _mean_push(layout.kernel, normal, first)[1]
+    smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
+    is_small = slip < smallest
+    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
+    resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
+    hold = jnp.where(is_small, resting, moving)
+    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)
+
+
+def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
+    return x[group.start : group.stop].reshape(group.count, group.dim, *x.shape[1:])
+
+
+def _noise_at(rows: Rows, which: slice) -> Noise:
+    assert rows.noise is not None
+    return Noise(rows.noise.spread[which], rows.noise.gate[which])
+
+
+def _mean_push(
+    kernel: Kernel, x: Float[Array, "n *batch"], noise: Noise
+) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+    """Return the mean of max(-x - c w, 0) where noise makes contact, and the probability of a push, its slope but for the sign.
+
+    Above the gate the acceleration ends the push before the distance does, and the mean is the softened ramp. Below it
+    the distance alone decides, so the probability stays as it is at the gate, and the mean goes on along its tangent.
+    """
+    held = jnp.where(x > noise.gate, x, noise.gate)
+    near = held / noise.spread
+    share = kernel.share(near)
+    return noise.spread * kernel.ramp(near) + share * (held - x), share

@@ -1,0 +1,377 @@
+r"""The constraint Jacobian as a linear map, applied without being formed.
+
+A derivative of the solve needs J only times a vector, and the reverse mode of a product that was never spelled out is as
+cheap as the product: a contact's rows are the relative velocity of two bodies at a point, six numbers per body, whatever the
+number of joints. The solve needs the entries, see `sparse`; a map gives them group by group, a pyramid's edges n ± μ t
+as its directions n, t.
+
+The entries are formed with or without the batch as trailing axes, see `linear`; a map is applied to one state.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjxgrad.batched import linear, maps
+from mjxgrad.batched.maps import combine, contract
+from mjxgrad.bodies import spatial
+
+_PerRow = Float[Array, " rows"]
+_Vector = Float[Array, " nv"]
+# By how much the entries of a Hessian may grow where contacts are kept together.
+_WASTE = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Items, contacts or single rows, that act on the same joint velocities.
+
+    Attributes:
+        dofs: which, ascending.
+        num: number of items.
+        dim: directions of each.
+        is_pyramid: whether their rows are the edges n ± μ t of a pyramid, two for each direction but the first.
+        is_diagonal: whether each item acts on one of the joint velocities alone, in their order.
+    """
+
+    dofs: tuple[int, ...]
+    num: int
+    dim: int = 1
+    is_pyramid: bool = False
+    is_diagonal: bool = False
+
+    @property
+    def rows_each(self) -> int:
+        return 2 * (self.dim - 1) if self.is_pyramid else self.dim
+
+    @property
+    def num_rows(self) -> int:
+        return self.num * self.rows_each
+
+
+class RowMap(eqx.Module):
+    """Some constraint rows as a linear map from joint velocities."""
+
+    @property
+    @abc.abstractmethod
+    def groups(self) -> tuple[Group, ...]:
+        """The rows in order, by the joint velocities that they see."""
+
+    @abc.abstractmethod
+    def rates(self, velocity: _Vector) -> _PerRow:
+        """Return J v."""
+
+    @abc.abstractmethod
+    def pull(self, force: _PerRow) -> _Vector:
+        """Return Jᵀ f."""
+
+    @abc.abstractmethod
+    def directions(self) -> Sequence[Float[Array, "num dim dofs *batch"]]:
+        """Return the entries, one array per group; pyramids by their directions."""
+
+    def tilts(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
+        """Return μ of each tangent of a pyramid, one array per group; None where there is none."""
+        return [None] * len(self.groups)
+
+    def matrix(self, num_dofs: int) -> Float[Array, "rows nv *batch"]:
+        """Return J."""
+        return dense(self.groups, self.directions(), self.tilts(), num_dofs)
+
+
+class DenseRows(RowMap):
+    """Rows that are few, or that may move every joint: J, and number and dimension of its elliptic contacts, which are last."""
+
+    entries: Float[Array, "rows nv *batch"]
+    cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        dofs, coupled = tuple(range(self.entries.shape[1])), sum(num * dim for num, dim in self.cones)
+        single = len(self.entries) - coupled
+        return (*([Group(dofs, single)] if single else []), *(Group(dofs, *cone) for cone in self.cones))
+
+    def rates(self, velocity):
+        return contract("rv,v->r", self.entries, velocity)
+
+    def pull(self, force):
+        return contract("rv,r->v", self.entries, force)
+
+    def directions(self):
+        pieces, start = [], 0
+        for group in self.groups:
+            rows = self.entries[start : start + group.num_rows]
+            pieces.append(rows.reshape(group.num, group.dim, *rows.shape[1:]))
+            start += group.num_rows
+        return pieces
+
+
+class SlotRows(RowMap):
+    """Rows of contacts of one dimension between bodies that are known at run time: entries and, of pyramids, μ of tangents."""
+
+    entries: Float[Array, "contacts dim nv *batch"]
+    friction: Float[Array, "contacts tangents *batch"] | None
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        count, dim, num_dofs = self.entries.shape[:3]
+        return (Group(tuple(range(num_dofs)), count, dim, is_pyramid=self.friction is not None),)
+
+    def rates(self, velocity):
+        return edges(contract("cdv,v->cd", self.entries, velocity), self.friction).reshape(-1)
+
+    def pull(self, force):
+        return contract("cdv,cd->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
+
+    def directions(self):
+        return [self.entries]
+
+    def tilts(self):
+        return [self.friction]
+
+
+class AxisRows(RowMap):
+    """Rows of one joint velocity each, `dofs` of all `num_dofs`, with entries `sign`."""
+
+    sign: Float[Array, "rows *batch"]
+    dofs: tuple[int, ...] = eqx.field(static=True)
+    num_dofs: int = eqx.field(static=True)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        return (Group(self.dofs, len(self.dofs), is_diagonal=True),)
+
+    def rates(self, velocity):
+        return self.sign * maps.pick(np.array(self.dofs), velocity)
+
+    def pull(self, force):
+        return combine(_selection(self.dofs, self.num_dofs).T, self.sign * force)
+
+    def directions(self):
+        return [self.sign[:, None, None]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """One of the two bodies of a contact: its sign, 1 for the second body, and the joint velocities that move it alone.
+
+    What moves both bodies does nothing to a contact.
+    """
+
+    sign: float
+    dofs: tuple[int, ...]
+
+
+class ContactRows(RowMap):
+    """Rows of contacts of one dimension.
+
+    A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
+    on a joint velocity at the rate (axis · wrench). All contacts have as many sides, those that do not move without joint
+    velocities.
+
+    Attributes:
+        lever: from that centre of each side to the point of contact (m).
+        frame: normal and tangents.
+        axes: motion of unit joint velocities.
+        friction: μ of each tangent of a pyramid, n ± μ t its edges; None for frictionless and elliptic contacts.
+    """
+
+    lever: Float[Array, "contacts sides 3 *batch"]
+    frame: Float[Array, "contacts 3 3 *batch"]
+    axes: Float[Array, "nv 6 *batch"]
+    friction: Float[Array, "contacts tangents *batch"] | None
+    sides: tuple[tuple[Side, ...], ...] = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        has_edges = self.friction is not None
+        return tuple(Group(dofs, stop - start, self.dim, has_edges) for start, stop, dofs in self._runs())
+
+    def _runs(self) -> list[tuple[int, int, tuple[int, ...]]]:
+        """Return neighbouring contacts that are kept together: first, one after the last, dofs.
+
+        Every run is some operations more, and every column that one contact of a run does not need is computed for
+        nothing: they are joined while that no more than doubles the entries of the Hessian.
+        """
+        runs: list[tuple[int, int, tuple[int, ...], int]] = []
+        for contact, sides in enumerate(self.sides):
+            # A contact that nothing moves keeps a column of zeros.
+            dofs = {dof for side in sides for dof in side.dofs} or {0}
+            least = len(dofs) ** 2
+            if runs:
+                start, _, others, least_others = runs[-1]
+                both = dofs | set(others)
+                if (contact + 1 - start) * len(both) ** 2 <= _WASTE * (least + least_others):
+                    runs[-1] = (start, contact + 1, tuple(sorted(both)), least + least_others)
+                    continue
+            runs.append((contact, contact + 1, tuple(sorted(dofs)), least))
+        return [run[:3] for run in runs]
+
+    def _moves(self, contacts: slice, dofs: tuple[int, ...]) -> np.ndarray:
+        """Return with which sign joint velocities move the sides of contacts."""
+        chosen = self.sides[contacts]
+        moves = np.zeros((len(chosen), len(chosen[0]), self.axes.shape[0]))
+        for contact, sides in enumerate(chosen):
+            for place, side in enumerate(sides):
+                moves[contact, place, list(side.dofs)] = side.sign
+        return moves[..., list(dofs)]
+
+    def _all_moves(self) -> np.ndarray:
+        return self._moves(slice(None), tuple(range(self.axes.shape[0]))).reshape(-1, self.axes.shape[0])
+
+    def rates(self, velocity):
+        motion = combine(self._all_moves(), maps.scale(velocity, self.axes))
+        turning, moving = motion[:, :3], motion[:, 3:]
+        relative = self._sum(moving + spatial.cross(turning, self.lever.reshape(-1, 3)))
+        along = contract("ckx,cx->ck", self.frame[:, : min(self.dim, 3)], relative)
+        if self.dim > 3:
+            spin = self._sum(turning)
+            along = jnp.concatenate([along, contract("ckx,cx->ck", self.frame[:, : self.dim - 3], spin)], axis=1)
+        return edges(along, self.friction).reshape(-1)
+
+    def _sum(self, of_sides: Float[Array, "sides 3"]) -> Float[Array, "contacts 3"]:
+        by_contact = of_sides.reshape(self.lever.shape)
+        return linear.add(by_contact[:, side] for side in range(by_contact.shape[1]))
+
+    def pull(self, force):
+        force = fold(force.reshape(len(self.frame), -1), self.friction)
+        num_axes, num_sides = min(self.dim, 3), self.lever.shape[1]
+        push = jnp.repeat(contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0)
+        torque = spatial.cross(self.lever.reshape(-1, 3), push)
+        if self.dim > 3:
+            twist = contract("ckx,ck->cx", self.frame[:, : self.dim - 3], force[:, 3:])
+            torque += jnp.repeat(twist, num_sides, axis=0)
+        wrench = jnp.concatenate([torque, push], axis=1)
+        return maps.dot(self.axes, combine(self._all_moves().T, wrench))
+
+    def directions(self):
+        return [self._entries(slice(start, stop), dofs) for start, stop, dofs in self._runs()]
+
+    def _entries(self, contacts: slice, dofs: tuple[int, ...]) -> Float[Array, "num dim dofs *batch"]:
+        frame, axes = self.frame[contacts], linear.take(self.axes, dofs)
+        force, num_batch = frame[:, : min(self.dim, 3)], frame.ndim - 3
+        moves = jnp.asarray(self._moves(contacts, dofs), frame.dtype)
+        moves = moves.reshape(*moves.shape, *(1,) * num_batch)
+        pushes, parts = [force[:, :, i] for i in range(3)], []
+        for side in range(moves.shape[1]):
+            lever = [self.lever[contacts, side, i, None] for i in range(3)]
+            torques = [lever[i] * pushes[j] - lever[j] * pushes[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+            rows = _along(torques + pushes, axes)
+            if self.dim > 3:
+                twists = [frame[:, : self.dim - 3, i] for i in range(3)]
+                rows = jnp.concatenate([rows, _along(twists, axes[:, :3])], axis=1)
+            parts.append(moves[:, side, None] * rows)
+        return linear.add(parts)
+
+    def tilts(self):
+        return [None if self.friction is None else self.friction[start:stop] for start, stop, _ in self._runs()]
+
+
+class JoinedRows(RowMap):
+    """Rows of several maps, one after the other."""
+
+    parts: tuple[RowMap, ...]
+
+    def with_parts(self, others: tuple[RowMap | None, ...] | None) -> "JoinedRows":
+        """Return the same with other parts where there are some."""
+        if others is None:
+            return self
+        pairs = zip(self.parts, others, strict=True)
+        return JoinedRows(tuple(own if other is None else other for own, other in pairs))
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        return tuple(group for part in self.parts for group in part.groups)
+
+    def rates(self, velocity):
+        return jnp.concatenate([part.rates(velocity) for part in self.parts])
+
+    def pull(self, force):
+        total, start = jnp.zeros((), force.dtype), 0
+        for part in self.parts:
+            stop = start + sum(group.num_rows for group in part.groups)
+            total, start = total + part.pull(force[start:stop]), stop
+        return total
+
+    def directions(self):
+        return [piece for part in self.parts for piece in part.directions()]
+
+    def tilts(self):
+        return [tilt for part in self.parts for tilt in part.tilts()]
+
+
+def dense(
+    groups: Sequence[Group],
+    pieces: Sequence[Float[Array, "_ _ _ *batch"]],
+    tilts: Sequence[Float[Array, "_ _ *batch"] | None],
+    num_dofs: int,
+) -> Float[Array, "rows nv *batch"]:
+    """Return J from its entries, group by group."""
+    rows = []
+    for group, entries, tilt in zip(groups, pieces, tilts, strict=True):
+        if group.is_diagonal:
+            selection = _selection(group.dofs, num_dofs)
+            own = entries[:, 0] * selection.reshape(*selection.shape, *(1,) * (entries.ndim - 3))
+        else:
+            own = edges(_spread(entries, group.dofs, num_dofs), None if tilt is None else tilt[:, :, None])
+        rows.append(own.reshape(group.num_rows, num_dofs, *entries.shape[3:]))
+    return jnp.concatenate(rows)
+
+
+def edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
+    """Return the edges n ± μ t of pyramids; without μ the directions themselves."""
+    if tilt is None:
+        return along
+    normal, tangent = along[:, :1], tilt * along[:, 1:]
+    both = jnp.stack([normal + tangent, normal - tangent], axis=2)
+    return both.reshape(len(along), -1, *along.shape[2:])
+
+
+def fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
+    """Return the forces along directions that forces along edges add up to; the transpose of `edges`."""
+    if tilt is None:
+        return force
+    pairs = force.reshape(len(force), -1, 2, *force.shape[2:])
+    plus, minus = pairs[:, :, 0], pairs[:, :, 1]
+    return jnp.concatenate([linear.sum_of_few(plus + minus), tilt * (plus - minus)], axis=1)
+
+
+def flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
+    """Return items and directions as rows."""
+    return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
+
+
+def _along(
+    parts: list[Float[Array, "n k *batch"]], axes: Float[Array, "dofs entries *batch"]
+) -> Float[Array, "n k dofs *batch"]:
+    """Return products of vectors, given entry by entry, with axes.
+
+    Written out, and no vector put together of its entries: XLA's CPU backend runs along the batch only where nothing
+    is concatenated on the way. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
+    """
+    return linear.add(part[:, :, None] * axes[:, i] for i, part in enumerate(parts))
+
+
+def _spread(
+    entries: Float[Array, "num dim dofs *batch"], dofs: tuple[int, ...], num_dofs: int
+) -> Float[Array, "num dim nv *batch"]:
+    """Return entries with zeros for all other joint velocities."""
+    if len(dofs) == num_dofs:
+        return entries
+    columns, at = [], 0
+    for target, source in linear.runs(dofs):
+        columns.append(jnp.zeros((*entries.shape[:2], target.start - at, *entries.shape[3:]), entries.dtype))
+        columns.append(entries[:, :, source])
+        at = target.stop
+    columns.append(jnp.zeros((*entries.shape[:2], num_dofs - at, *entries.shape[3:]), entries.dtype))
+    return jnp.concatenate(columns, axis=2)
+
+
+def _selection(dofs: tuple[int, ...], num_dofs: int) -> np.ndarray:
+    """Return the matrix that picks some joint velocities."""
+    return (np.array(dofs, int)[:, None] == np.arange(num_dofs)).astype(float)

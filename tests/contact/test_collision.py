@@ -1,0 +1,166 @@
+"""Contacts against C MuJoCo's and against MJX's."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad._mjx import mjx
+from mjxgrad.bodies import kinematics
+from mjxgrad.contact.collision import collide, slot_geoms
+from tests.scenes import central_difference
+
+# Two boxes that do not meet, over two tilted planes; margins beyond all distances, so that C MuJoCo reports every corner.
+BOXES = """
+<mujoco>
+  <default><geom margin="5"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 1" euler="10 20 0"/>
+    <geom type="plane" size="1 1 1" pos="0 0 -.05" euler="-15 0 0"/>
+    <body><freejoint/><geom type="box" size=".1 .2 .05" contype="2"/></body>
+    <body><freejoint/><geom type="box" size=".1 .02 .05" contype="2"/></body>
+  </worldbody>
+</mujoco>
+"""
+BALLS = """
+<mujoco>
+  <custom>{numbers}</custom>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 .09"><freejoint/><geom size=".1" condim="1"/></body>
+    <body pos=".17 0 .08"><freejoint/><geom size=".1" condim="1"/></body>
+    <body pos=".05 .2 .11"><freejoint/><geom size=".12"/></body>
+    <body pos=".3 .1 .095"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def _finder(model):
+    return jax.jit(
+        lambda data: collide(model, kinematics.com_pos(model, kinematics.kinematics(model, data)))._impl.contact
+    )
+
+
+def _poses(seed, num_boxes=2):
+    random = np.random.default_rng(seed)
+    quaternions = random.normal(size=(num_boxes, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.concatenate([random.normal(scale=0.1, size=(num_boxes, 3)), quaternions], axis=1).ravel()
+
+
+def test_a_box_on_a_plane_touches_where_it_does_in_c():
+    mj_model = mujoco.MjModel.from_xml_string(BOXES)
+    mj_data = mujoco.MjData(mj_model)
+    model = mjx.put_model(mj_model)
+    start, find, geoms = mjx.make_data(mj_model), _finder(model), slot_geoms(model, mjx.make_data(mj_model))
+    for seed in range(20):
+        mj_data.qpos[:] = _poses(seed)
+        mujoco.mj_forward(mj_model, mj_data)
+        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
+        ours = np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]])
+        theirs = np.column_stack(
+            [mj_data.contact.geom, mj_data.contact.dist, mj_data.contact.pos, mj_data.contact.frame[:, :3]]
+        )
+        # Two planes, two boxes, four corners each: in C's order after sorting by pair and depth.
+        assert len(theirs) == 16
+        order = [np.lexsort((found[:, 2], found[:, 1], found[:, 0])) for found in (ours, theirs)]
+        np.testing.assert_allclose(ours[order[0]], theirs[order[1]], atol=1e-14)
+
+
+def test_the_contacts_of_a_box_have_the_derivative_of_its_corners():
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOXES))
+    start, find = mjx.make_data(model), _finder(model)
+
+    def outcome(qpos):
+        contact = find(start.replace(qpos=qpos))
+        return jnp.concatenate([contact.dist, contact.pos.ravel()])
+
+    qpos = jnp.asarray(_poses(7))
+    # Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5.
+    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-9)
+
+
+CAN = """
+<mujoco><worldbody><body><freejoint/><geom size=".07" margin="5"/></body>
+<body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>
+"""
+
+
+def _can():
+    mj_model = mujoco.MjModel.from_xml_string(CAN)
+    model = mjx.put_model(mj_model)
+    return mj_model, mjx.make_data(mj_model), _finder(model)
+
+
+def test_a_ball_on_a_cylinder_touches_where_it_does_in_c():
+    """On the side, an end and the edge between, from outside and from within."""
+    mj_model, start, find = _can()
+    mj_data, places = mujoco.MjData(mj_model), set()
+    for seed in range(60):
+        mj_data.qpos[:] = _poses(seed)
+        mujoco.mj_forward(mj_model, mj_data)
+        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
+        ours = np.concatenate([contact.dist, contact.pos[0], contact.frame[0, 0]])
+        theirs = np.concatenate([mj_data.contact.dist, mj_data.contact.pos[0], mj_data.contact.frame[0, :3]])
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
+        centre = mj_data.geom_xmat[1].reshape(3, 3).T @ (mj_data.geom_xpos[0] - mj_data.geom_xpos[1])
+        places.add((np.hypot(*centre[:2]) > 0.1, abs(centre[2]) > 0.15))
+    assert len(places) == 4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_contact_of_a_ball_on_a_cylinder_has_the_derivative_of_its_point(seed):
+    _, start, find = _can()
+
+    def outcome(qpos):
+        contact = find(start.replace(qpos=qpos))
+        return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame[0, 0]])
+
+    qpos = jnp.asarray(_poses(seed))
+    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-7)
+
+
+def test_on_its_axis_a_ball_on_a_cylinder_has_a_derivative():
+    """Upright, centres one above the other: the distance is the height less what is between, whichever way it moves."""
+    _, start, find = _can()
+    upright = jnp.array([0, 0, 0.21, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0], float)
+    slope = jax.jacrev(lambda qpos: find(start.replace(qpos=qpos)).dist[0])(upright)
+    np.testing.assert_allclose(slope[:3], [0, 0, 1], atol=1e-14)
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize(
+    "limits", [{}, {"max_geom_pairs": 2}, {"max_contact_points": 2}, {"max_geom_pairs": 2, "max_contact_points": 1}]
+)
+def test_slots_are_given_as_in_mjx(limits):
+    numbers = "".join(f'<numeric name="{name}" data="{limit}"/>' for name, limit in limits.items())
+    mj_model = mujoco.MjModel.from_xml_string(BALLS.format(numbers=numbers))
+    model = mjx.put_model(mj_model)
+    data = jax.jit(mjx.kinematics)(model, mjx.make_data(mj_model))
+    ours, theirs = (jax.jit(find)(model, data)._impl.contact for find in (collide, mjx.collision))
+    assert len(theirs.dist) == len(theirs.dim)
+    # Other formulas, so other rounding; whole numbers are the same.
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-14), ours, theirs)
+    assert (slot_geoms(model, data) is None) == bool(limits)
+    if not limits:
+        np.testing.assert_array_equal(slot_geoms(model, data), theirs.geom)
+
+
+@pytest.mark.parametrize("kind", ['type="box" size=".1 .1 .1"', 'type="cylinder" size=".1 .1"'])
+def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
+    """Where it is decided at run time which pairs are looked at: those of all pairs whose distance is least."""
+    balls = "".join(f'<body pos="{x} .05 .17"><freejoint/><geom size=".1"/></body>' for x in (0, 0.05, 0.5, 0.9))
+    xml = "<mujoco><custom>{}</custom><worldbody><body><freejoint/><geom {}/></body>{}</worldbody></mujoco>"
+    found = []
+    for numbers in ('<numeric name="max_geom_pairs" data="2"/>', ""):
+        model = mjx.put_model(mujoco.MjModel.from_xml_string(xml.format(numbers, kind, balls)))
+        contact = _finder(model)(mjx.make_data(model))
+        is_with_it = np.asarray(contact.geom == 0).any(axis=1)
+        found.append(np.column_stack([contact.dist, contact.pos, contact.frame[:, 0]])[is_with_it])
+    few, every = found
+    assert len(few) == 2
+    np.testing.assert_allclose(
+        np.sort(few, axis=0), np.sort(every[np.argsort(every[:, 0])[:2]], axis=0), rtol=0, atol=1e-14
+    )

@@ -1,0 +1,211 @@
+"""What is wrong with MJX's derivatives, and gone here.
+
+Each test runs on our step and, marked as an expected failure, on MJX's: should MJX be mended, the mark fails and says so. The
+truth is a central difference of the same converged step.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad._mjx import mjx
+from tests.scenes import central_difference, put
+
+_MJX_IS_WRONG = pytest.mark.xfail(strict=True, reason="plain MJX gets this wrong")
+# That MJX still is takes as long to compile as that we are not, and may wait for the slow tests.
+both = pytest.mark.parametrize(
+    "step", [mg.step, pytest.param(mjx.step, marks=[_MJX_IS_WRONG, pytest.mark.slow])], ids=["mg", "mjx"]
+)
+
+# Widths of 1e-6 leave truncation near 1e-12 and rounding near 1e-10 of values around one; derivatives of contact are
+# of order ten.
+_WIDTH, _CLOSE = 1e-6, {"rtol": 1e-5, "atol": 1e-6}
+
+BALL = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50" {option}/><worldbody>
+  <geom type="plane" size="1 1 1"/>
+  <body pos="0 0 .1"><joint type="slide" axis="0 0 1" damping=".1"/><geom size=".1" mass="1" {geom}/></body>
+</worldbody></mujoco>"""
+
+
+def _outcome(step, model, data, nq):
+    """Return the map from (qpos, qvel) to the next (qpos, qvel)."""
+
+    def outcome(x):
+        moved = step(model, data.replace(qpos=x[:nq], qvel=x[nq:]))
+        return jnp.concatenate([moved.qpos, moved.qvel])
+
+    return outcome
+
+
+def _settled(text, steps=1500):
+    """Return MJX's model, and data at rest with the warm start of the last step."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+    return mjx.put_model(model), mjx.put_data(model, data)
+
+
+@both
+def test_reverse_mode_passes_through_a_solve_of_many_iterations(step):
+    model, data = put(BALL.format(option="", geom=""))
+    slope = jax.jit(jax.grad(lambda v: step(model, data.replace(qvel=v)).qvel[0]))(jnp.zeros(1))
+    assert jnp.isfinite(slope).all()
+
+
+@both
+def test_jacobian_at_rest_does_not_depend_on_the_warm_start(step):
+    model, data = _settled(BALL.format(option="", geom=""))
+    outcome = _outcome(step, model, data, 1)
+    x = jnp.concatenate([data.qpos, data.qvel])
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(outcome))(x), jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x), **_CLOSE
+    )
+
+
+@both
+@pytest.mark.slow
+def test_elliptic_contact_without_sliding_has_a_jacobian(step):
+    text = BALL.format(option='cone="elliptic"', geom='condim="4"')
+    model, data = _settled(text.replace('<joint type="slide" axis="0 0 1" damping=".1"/>', "<freejoint/>"))
+    outcome = _outcome(step, model, data, 7)
+    x = jnp.concatenate([data.qpos, data.qvel])
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(outcome))(x), jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x), **_CLOSE
+    )
+
+
+@both
+def test_elliptic_cone_without_any_contact_pair_runs(step):
+    model, data = put("""<mujoco><option cone="elliptic"/><worldbody><body>
+        <joint type="slide" range="-1 1" limited="true"/><geom size=".1"/></body></worldbody></mujoco>""")
+    assert jnp.isfinite(jax.jit(step)(model, data).qpos).all()
+
+
+CARTPOLE = """<mujoco><option timestep=".01" iterations="1" ls_iterations="50"/><worldbody>
+  <body><joint type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom type="box" size=".1 .1 .1" mass="1"/>
+    <body><joint type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/></body></body>
+</worldbody></mujoco>"""
+
+
+@both
+def test_inactive_limits_give_no_nan_in_single_precision(step):
+    """20000 random cart-poles short of the limit of their slide; one iteration, so that MJX has a reverse mode at all."""
+    with jax.enable_x64(False):
+        model, data = put(CARTPOLE)
+        key_q, key_v = jax.random.split(jax.random.key(0))
+        qpos = jax.random.uniform(key_q, (20000, 2), minval=-0.9, maxval=0.9)
+        qvel = jax.random.normal(key_v, (20000, 2))
+        assert qpos.dtype == jnp.float32
+
+        def slope(q, v):
+            return jax.grad(lambda x: _outcome(step, model, data, 2)(x).sum())(jnp.concatenate([q, v]))
+
+        assert jnp.isfinite(jax.jit(jax.vmap(slope))(qpos, qvel)).all()
+
+
+@both
+def test_a_body_at_rest_feels_its_angular_velocity(step):
+    """A quaternion moves by h/2 times the angular velocity, at zero velocity too."""
+    model, data = put("""<mujoco><option gravity="0 0 0" timestep=".004"/><worldbody>
+        <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
+    turned = jax.jacfwd(lambda w: step(model, data.replace(qvel=jnp.zeros(6).at[3:].set(w))).qpos[4:])
+    slope = jax.jit(turned)(jnp.zeros(3))
+    np.testing.assert_allclose(slope, 0.5 * 0.004 * jnp.eye(3), rtol=1e-12, atol=1e-15)
+
+
+@both
+def test_a_contact_deeper_than_its_width_can_be_differentiated(step):
+    """The power of solimp, and the position with a power that is no integer."""
+    model, data = put(BALL.format(option="", geom='solimp=".5 .9 .001 .5 2.5"'))
+    data = data.replace(qpos=jnp.array([-0.01]))
+
+    def outcome(x):
+        solimp = model.geom_solimp.at[:, 4].set(x[1])
+        return step(model.replace(geom_solimp=solimp), data.replace(qpos=x[:1])).qvel
+
+    x = jnp.array([-0.01, 2.5])
+    slope = jax.jit(jax.jacrev(outcome))(x)
+    np.testing.assert_allclose(slope, jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x), **_CLOSE)
+
+
+@both
+def test_a_direct_solref_without_damping_can_be_differentiated(step):
+    model, data = put(BALL.format(option="", geom=""))
+    data = data.replace(qpos=jnp.array([-0.001]))
+
+    @jax.jit
+    def outcome(stiffness):
+        solref = jnp.stack([-stiffness, jnp.zeros_like(stiffness)])
+        moved = step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data)
+        return moved.qvel[0]
+
+    slope = jax.jit(jax.grad(outcome))(jnp.array(1e4))
+    width = 1.0
+    truth = (outcome(1e4 + width) - outcome(1e4 - width)) / (2 * width)
+    np.testing.assert_allclose(slope, truth, rtol=1e-6)
+
+
+@both
+def test_at_the_clamp_of_refsafe_the_time_constant_counts(step):
+    """At exactly two time steps every larger value acts: the one-sided derivative, not half of it."""
+    model, data = put(BALL.format(option='timestep=".002"', geom=""))
+    data = data.replace(qpos=jnp.array([-0.001]))
+
+    @jax.jit
+    def outcome(time_constant):
+        solref = jnp.stack([time_constant, jnp.ones_like(time_constant)])
+        return step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data).qvel[0]
+
+    slope = jax.jit(jax.grad(outcome))(2 * model.opt.timestep)
+    width = 1e-8
+    truth = (outcome(0.004 + width) - outcome(jnp.array(0.004))) / width
+    np.testing.assert_allclose(slope, truth, rtol=1e-4)
+
+
+CYLINDER = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50"/><worldbody>
+  <geom type="plane" size="1 1 1"/>
+  <body pos="0 0 .2"><freejoint/><geom type="cylinder" size=".1 .2" mass="1"/></body></worldbody></mujoco>"""
+WELD = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50" gravity="0 0 0"/><worldbody>
+  <body name="a" pos="0 0 .2"><freejoint/><geom type="box" size=".1 .2 .1" mass="1"/></body>
+  <body name="b" pos="0 0 1.2"><freejoint/><geom type="box" size=".1 .2 .1" mass="1"/></body></worldbody>
+  <equality><weld body1="a" body2="b"/></equality></mujoco>"""
+
+
+@both
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(CYLINDER, id="standing cylinder", marks=pytest.mark.slow),
+        pytest.param(WELD, id="weld at zero error", marks=pytest.mark.slow),
+    ],
+)
+def test_a_degenerate_pose_keeps_its_derivative(step, text):
+    """The cylinder's tilt about its first contact point; a weld with nothing to correct."""
+    model, data = _settled(text)
+    outcome = _outcome(step, model, data, model.nq)
+    x = jnp.concatenate([data.qpos, data.qvel])
+    slope = jax.jit(jax.jacfwd(outcome))(x)
+    truth = jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x)
+    # The cylinder's rim is chosen anew on either side of upright: an error of first order in the width, times stiffness.
+    np.testing.assert_allclose(slope, truth, rtol=1e-4, atol=3e-4)
+
+
+@pytest.mark.slow
+def test_forward_over_reverse_mode_is_forward_over_forward():
+    """`jax.hessian` of two steps of a ball that is pressed on the floor and pushed along it."""
+    scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .0995">
+        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass=".5"/></body>
+        </worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator></mujoco>""")
+
+    def outcome(force):
+        end = mg.rollout(scene, mg.initial_state(scene), jnp.tile(force, (2, 1)))
+        return jnp.sum(end.qvel[-1] ** 2) + 1e3 * jnp.sum(end.qpos[-1])
+
+    force = jnp.array([3.0, -2.0])
+    found, expected = (jax.jit(f)(force) for f in (jax.hessian(outcome), jax.jacfwd(jax.jacfwd(outcome))))
+    # Both are exact; entries of order 1e-5 to 1e-2 of sums of terms near one.
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-10)

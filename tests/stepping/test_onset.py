@@ -1,0 +1,571 @@
+"""Contact that begins within the step: no jumps, the plain derivative right, and MuJoCo's step where nothing begins."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from experiments.sawtooth import case
+from mjxgrad._mjx import mjx
+from mjxgrad.contact.collision import collide
+from mjxgrad.stepping.onset import _split
+from mjxgrad.stepping.rows import Block
+from mjxgrad.tasks import wall_softness
+from tests.scenes import ASSETS
+
+_STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
+_ONSETS = {"continuous": mg.Onset(), "mujoco": None}
+# Sub-intervals of one look, how many of them are looked at again, and how often each: 64⁷ is 4·10¹².
+_PARTS, _FOLLOWED, _LOOKS = 64, 3, 7
+
+
+def _scene(source):
+    model = source if isinstance(source, mujoco.MjModel) else mujoco.MjModel.from_xml_string(source)
+    model.opt.iterations, model.opt.tolerance = 100, 1e-13  # a solve that ends early has jumps of its own
+    return mg.load_scene(model)
+
+
+def _end(scene, start, num_steps, kind):
+    """Return position and velocity after some steps."""
+
+    def step(_, state):
+        moved = mg.step(scene.model, start.replace(**dict(zip(_STATE, state, strict=True))), onset=_ONSETS[kind])
+        return tuple(getattr(moved, field) for field in _STATE)
+
+    state = jax.lax.fori_loop(0, num_steps, step, tuple(getattr(start, field) for field in _STATE))
+    return jnp.concatenate(state[:2])
+
+
+@functools.cache
+def _outcome(name):
+    """From places on a line in state and parameters to position and velocity after the impacts; and how many steps that takes."""
+    one = case(name) if not name.endswith(".xml") else None
+    scene = _scene(one.model if one else mujoco.MjModel.from_xml_path(str(ASSETS / name)))
+    random = np.random.default_rng(1)
+    qpos, qvel = np.array(scene.data.qpos), np.array(scene.data.qvel)
+    if one:
+        for index, value in one.qpos.items():
+            qpos[index] = value
+        for index, value in one.qvel.items():
+            qvel[index] = value
+    along_qvel = random.normal(size=len(qvel))
+    along_friction = random.normal(size=np.shape(scene.model.geom_friction))
+
+    @functools.partial(jax.jit, static_argnums=(2,))
+    def outcome(places, num_steps, kind):
+        def at(place):
+            friction = scene.model.geom_friction * (1 + 0.1 * place * along_friction)
+            changed = eqx.tree_at(lambda s: s.model, scene, scene.model.replace(geom_friction=friction))
+            shift = (one.interval[0] if one else 0.0) + 0.02 * place
+            start = scene.data.replace(
+                qpos=jnp.asarray(qpos).at[one.moved if one else 1].add(shift), qvel=qvel + 0.3 * place * along_qvel
+            )
+            return _end(changed, start, num_steps, kind)
+
+        return jax.vmap(at)(places)
+
+    duration = one.duration if one else 0.3
+    return outcome, round(0.6 * duration / float(scene.model.opt.timestep))
+
+
+def _roughness(outcome, low, high):
+    """Give the ends of sub-intervals, and by how much the difference over each is unlike those beside it."""
+    places = np.linspace(low, high, _PARTS + 1)
+    values = np.asarray(outcome(places))
+    assert np.isfinite(values).all()
+    change = np.diff(values, axis=0)
+    padded = np.concatenate([change[1:2], change, change[-2:-1]])
+    return places, np.abs(change - 0.5 * (padded[:-2] + padded[2:])).max(axis=1)
+
+
+def _largest_jump(outcome, low=0.0, high=1.0):
+    """Close in on where the outcome is roughest: a jump stays, all else falls in proportion."""
+    places, size = _roughness(outcome, low, high)
+    found = []
+    for worst in np.argsort(size)[-_FOLLOWED:]:
+        ends, left = places[worst : worst + 2], None
+        for _ in range(_LOOKS - 1):
+            inner, left = _roughness(outcome, *ends)
+            ends = inner[np.argmax(left) :][:2]
+        found.append(left.max())
+    return max(found)
+
+
+def _jumps(name, kind):
+    outcome, num_steps = _outcome(name)
+    return _largest_jump(lambda places: outcome(places, jnp.int32(num_steps), kind))
+
+
+# After the last look places are 10⁻¹² apart; rounding of some hundred steps, and derivatives of up to 10⁴, make 10⁻⁸ of it.
+_ROUNDING = 1e-7
+
+
+@pytest.mark.parametrize(
+    "name", ["ball", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball_elliptic", "hopper"))]
+)
+def test_outcomes_of_neighbouring_starts_and_parameters_are_neighbours(name):
+    assert _jumps(name, "continuous") < _ROUNDING
+    assert _jumps(name, "mujoco") > 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "walker2d", "ant", "ball_frictionless", "ball_torsion", "ball_rolling", "ball_inclined", "ball_inclined_rolling",
+        "two_balls", "two_balls_elliptic", "arm",
+    ],
+)  # fmt: skip
+def test_no_motion_with_impacts_has_jumps(name):
+    assert _jumps(name, "continuous") < _ROUNDING
+    assert _jumps(name, "mujoco") > 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    ["half_cheetah.xml", "humanoid.xml", "inverted_double_pendulum.xml", "reacher.xml", "swimmer.xml"],
+)
+def test_no_scene_of_gymnasium_has_jumps(name):
+    assert _jumps(name, "continuous") < _ROUNDING
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("domain", ["hopper", "walker"])
+def test_no_scene_of_dm_control_has_jumps(domain):
+    suite = pytest.importorskip("dm_control.suite.common")
+    module = pytest.importorskip(f"dm_control.suite.{domain}")
+    text, assets = module.get_model_and_assets()
+    assert suite
+    scene = _scene(mujoco.MjModel.from_xml_string(text.decode() if isinstance(text, bytes) else text, assets))
+
+    @functools.partial(jax.jit, static_argnums=(1,))
+    def outcome(places, kind):
+        def at(place):
+            start = scene.data.replace(qpos=scene.data.qpos.at[0].add(0.02 * place), qvel=scene.data.qvel + place)
+            return _end(scene, start, 80, kind)
+
+        return jax.vmap(at)(places)
+
+    assert _largest_jump(lambda places: outcome(places, "continuous")) < _ROUNDING
+    assert _largest_jump(lambda places: outcome(places, "mujoco")) > 1e-5
+
+
+def test_the_mean_of_the_derivative_is_the_difference_of_the_outcome():
+    """The fundamental theorem, over a tooth and a half; without the onset the jump is missing."""
+    outcome, num_steps = _outcome("ball")
+    places = np.linspace(0.0, 0.3, 1025)
+
+    def both(kind):
+        def value(place):
+            return outcome(place[None], jnp.int32(num_steps), kind)[0]
+
+        return jax.jit(jax.vmap(lambda place: jax.jvp(value, (place,), (jnp.ones(()),))))(jnp.asarray(places))
+
+    def missing(kind):
+        values, slopes = map(np.asarray, both(kind))
+        change = values[-1] - values[0]
+        mean = (0.5 * (slopes[:-1] + slopes[1:]) * np.diff(places)[:, None]).sum(axis=0)
+        return np.abs(mean - change).max() / np.abs(change).max()
+
+    # Kinks between samples: a part of 1 / 1024 of the interval each, with derivatives of some times the mean.
+    assert missing("continuous") < 0.01
+    assert missing("mujoco") > 0.1
+
+
+@pytest.mark.slow
+def test_forward_and_reverse_mode_agree():
+    one = case("ball")
+    scene = _scene(one.model)
+    qpos, qvel = np.array(scene.data.qpos), np.array(scene.data.qvel)
+    for index, value in one.qvel.items():
+        qvel[index] = value
+
+    def cost(height):
+        start = mg.initial_state(scene, jnp.asarray(qpos).at[2].set(height), qvel)
+        final = mg.rollout(scene, start, horizon=45, onset=mg.Onset()).final
+        return jnp.arange(1.0, 8.0) @ final.qpos + jnp.arange(1.0, 7.0) @ final.qvel
+
+    heights = jnp.linspace(0.1, 0.11, 16)
+    backward = jax.jit(jax.vmap(jax.grad(cost)))(heights)
+    forward = jax.jit(jax.vmap(lambda x: jax.jvp(cost, (x,), (jnp.ones(()),))[1]))(heights)
+    np.testing.assert_allclose(backward, forward, rtol=1e-8)
+
+
+_BALL = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0" cone="{cone}" tolerance="1e-14" iterations="100"/>
+  <worldbody>
+    <geom type="plane" size="5 5 .1" condim="{condim}" solref="-1e-9 -100" solimp=".9 .9 .001"/>
+    <body><freejoint/><geom size="5" condim="{condim}" solref="-1e-9 -100" solimp=".9 .9 .001"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+_CONTACTS = [
+    ("pyramidal", 3),
+    ("elliptic", 6),
+    *(pytest.param(*contact, marks=pytest.mark.slow) for contact in (("elliptic", 3), ("pyramidal", 1))),
+]
+
+
+@pytest.mark.parametrize(("cone", "condim"), _CONTACTS)
+def test_the_impulse_of_a_contact_grows_in_proportion_to_the_time_that_is_left(cone, condim):
+    """With next to no stiffness what a damper does in full contact does not depend on the depth: the rest is φ."""
+    scene = _scene(_BALL.format(cone=cone, condim=condim))
+    qvel = jnp.array([0.4, 0.0, -1.0, 0.005, 0.02, 0.0])
+    h, speed = 0.002, 1.0
+
+    def after(distance):
+        start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5 + distance), qvel=qvel)
+        return mg.step(scene.model, start, onset=mg.Onset(0.0)).qvel - qvel
+
+    shares = np.linspace(0.05, 0.95, 7)
+    change = jax.jit(jax.vmap(after))(jnp.asarray((0.5 - shares) * h * speed))
+    # The point of contact lies half the distance, a millimetre, from the ball of five metres.
+    np.testing.assert_allclose(change, shares[:, None] / shares[0] * change[0], rtol=1e-3, atol=1e-9)
+    assert np.abs(change[0]).max() > 1e-4
+
+
+def test_free_flight_and_deep_contact_are_mujocos():
+    scene = _scene(_BALL.replace('gravity="0 0 0"', "").format(cone="pyramidal", condim=3))
+    qvel = jnp.array([0.3, 0.0, -0.2, 0.0, 1.0, 0.0])
+    starts = 5 + jnp.array([0.3, 0.01, -0.005, -0.01])
+
+    def after(height, onset):
+        start = scene.data.replace(qpos=scene.data.qpos.at[2].set(height), qvel=qvel)
+        return mg.step(scene.model, start, onset=onset).qvel
+
+    for onset in (mg.Onset(), mg.Onset(0.0)):
+        both = [jax.jit(jax.vmap(lambda z, o=o: after(z, o)))(starts) for o in (onset, None)]
+        np.testing.assert_allclose(*both, rtol=0, atol=1e-15)  # two programs, whose sums XLA may order otherwise
+
+
+@pytest.mark.slow
+def test_several_contacts_share_the_step_and_none_jumps():
+    """A beam that lands on both ends and two balls beside it, each at another time of the same step."""
+    beam = """
+    <mujoco>
+      <option timestep="0.002"/>
+      <worldbody>
+        <geom type="plane" size="5 5 .1"/>
+        <body><freejoint/><geom type="capsule" size=".05 .2" euler="0 90 0"/>
+          <body pos="0 .3 0"><joint type="slide" axis="0 0 1" range="-.001 1" limited="true"/><geom size=".05"/></body></body>
+      </worldbody>
+    </mujoco>
+    """
+    scene = _scene(beam)
+
+    def outcome(places, kind):
+        def at(place):
+            tilt = jnp.array([jnp.cos(0.002 * place), 0, jnp.sin(0.002 * place), 0])
+            qpos = scene.data.qpos.at[2].set(0.0505 + 0.002 * place).at[3:7].set(tilt).at[7].set(0.002 - 0.004 * place)
+            qvel = jnp.array([0.5, 0, -1.0, 0, 0.3, 0, -1.0])
+
+            return _end(scene, scene.data.replace(qpos=qpos, qvel=qvel), 6, kind)
+
+        return jax.vmap(at)(places)
+
+    compiled = jax.jit(outcome, static_argnums=1)
+    assert _largest_jump(lambda places: compiled(places, "continuous")) < _ROUNDING
+    assert _largest_jump(lambda places: compiled(places, "mujoco")) > 1e-5
+
+
+_WALL = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0" cone="{cone}"/>
+  <worldbody>
+    <geom type="box" size="{half} .2 {half_height}" condim="{condim}"/>
+    <body pos="{start}"><freejoint/><geom type="sphere" size=".01" mass=".01" condim="{condim}"
+      solref="-300 -35" solimp="0 .3 .02"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+_THIN = {"half": 0.01, "half_height": 0.2, "start": "-.03 0 0"}
+# Enters by the left side, is pushed out by the top, then by the right side.
+_CORNER = {"half": 0.03, "half_height": 0.02, "start": "-.05 0 .005"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cone", "condim", "wall", "num_pushed"),
+    [
+        ("pyramidal", 1, _THIN, 1),
+        ("pyramidal", 3, _THIN, 3),
+        ("elliptic", 3, _THIN, 3),
+        ("pyramidal", 1, _CORNER, 2),
+        ("elliptic", 3, _CORNER, 3),
+    ],
+)
+def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim, wall, num_pushed):
+    """The normal flips half way through, or turns at two edges. Neither a jump is left, nor the mean over the phases moved."""
+    scene = _scene(_WALL.format(cone=cone, condim=condim, **wall))
+    qvel = jnp.array([1.9, 0.3, 0.0, 0.0, 4.0, 9.0])
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def outcome(places, kind):
+        def at(place):
+            # What the ball flies in one step.
+            qpos = scene.data.qpos.at[0].add(place * 0.002 * 1.9)
+            return _end(scene, scene.data.replace(qpos=qpos, qvel=qvel), 40, kind)[len(qpos) :][:3]
+
+        return jax.vmap(at)(places)
+
+    assert _largest_jump(lambda places: outcome(places, "continuous")) < _ROUNDING
+    assert _largest_jump(lambda places: outcome(places, "mujoco")) > 1e-4
+    phases = (np.arange(64) + 0.5) / 64
+    smooth, teeth = (np.asarray(outcome(phases, kind)) for kind in ("continuous", "mujoco"))
+    size = np.ptp(teeth, axis=0)
+    has_teeth = size > 1e-4  # across a normal only with friction
+    assert has_teeth.sum() == num_pushed
+    assert (np.ptp(smooth, axis=0) < 0.1 * size)[has_teeth].all()
+    # A tenth of the teeth: the mean of a sawtooth is its centre only where it is linear.
+    assert (np.abs(smooth.mean(axis=0) - teeth.mean(axis=0)) < 0.1 * size)[has_teeth].all()
+
+
+@pytest.mark.slow
+def test_a_throw_through_the_softened_wall_has_no_teeth():
+    task = mg.tasks.ball_wall().with_softness(wall_softness(300.0))
+
+    def costs(task):
+        return np.asarray(jax.jit(jax.vmap(lambda angle: task.cost(angle[None])))(jnp.linspace(0.32, 0.57, 400)))
+
+    def roughness(values):
+        place = np.linspace(-1, 1, len(values))
+        return (values - np.polyval(np.polyfit(place, values, 5), place)).std()
+
+    assert roughness(costs(task)) < 0.05 * roughness(costs(task.with_onset(None)))
+
+
+_PUSHED = """
+<mujoco>
+  <option timestep="{timestep}"/>
+  <worldbody>
+    <geom type="plane" size="5 5 .1" friction=".5"/>
+    <body pos="-.15 0 .05"><joint name="p" type="slide" axis="1 0 0" damping="1"/>
+      <geom size=".05" mass=".5" contype="2" conaffinity="2"/></body>
+    <body pos="0 0 .05"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{turning}
+      <geom type="{kind}" size=".05 .05 .05" mass=".5" friction=".5" contype="3" conaffinity="3"/></body>
+  </worldbody>
+  <actuator><motor joint="p" gear="5"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "turning"), [("sphere", ""), ("box", '<joint type="hinge" axis="0 1 0"/>')])
+@pytest.mark.parametrize("timestep", [1e-3, 4e-3])
+def test_a_thing_pushed_along_the_floor_keeps_a_derivative_of_a_size_to_be_believed(kind, turning, timestep):
+    """Contacts that chatter multiply the tangent at every switch: without a floor of the width by 10² to 10⁹."""
+    scene = mg.load_scene(_PUSHED.format(timestep=timestep, kind=kind, turning=turning))
+
+    def speed(force):
+        start = mg.initial_state(scene)
+        controls = force * jnp.ones((round(0.24 / timestep), 1))
+        return mg.rollout(scene, start, controls, onset=mg.Onset()).qvel[-1, 1]
+
+    derivatives = jax.jit(jax.vmap(jax.grad(speed)))(jnp.linspace(0.7, 0.98, 64))
+    # The slope of the outcome is 0.7 to 1.1 (m/s per unit of control).
+    assert np.abs(np.median(derivatives)) < 3
+    assert derivatives.std() < 30
+
+
+_FOOT = """
+<mujoco>
+  <option timestep=".004" tolerance="1e-12"/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .5"><joint type="slide" axis="0 0 1"/><joint type="slide" axis="1 0 0"/>
+      <geom type="box" size=".1 .1 .1" mass="10" contype="0" conaffinity="0"/>
+      <body pos="0 0 -.4"><joint name="ankle" axis="0 1 0" armature=".005" damping=".2"/>
+        <geom type="capsule" fromto="-.1 0 0 .1 0 0" size=".015" mass=".2" contype="0" conaffinity="0"/>
+        <geom name="heel" pos="-.1 0 -.02" size=".015" mass=".05" condim="1"/>
+        <geom name="toe" pos=".1 0 -.02" size=".015" mass=".05" condim="1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="ankle" kp="100"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
+    """It rocks from heel to toe. With widths by gravity alone derivatives are up to 60 times the slope, their mean twice it."""
+    scene = mg.load_scene(_FOOT)
+    time = 4e-3 * jnp.arange(75)
+
+    def turning(place, onset):
+        controls = 0.6 * jnp.sin(2 * jnp.pi * 6 * time + place)
+        start = mg.initial_state(
+            scene, qpos=jnp.stack([-0.06, 0.0, 0.05 + 0.1 * place]), qvel=jnp.array([-0.6, 0.1, 0])
+        )
+        return mg.rollout(scene, start, controls[:, None], onset=onset).qvel[-1, 2]
+
+    places = jnp.linspace(-1, 1, 128)
+    values, derivatives = jax.jit(jax.vmap(jax.value_and_grad(lambda x: turning(x, mg.Onset()))))(places)
+    mujocos = jax.jit(jax.vmap(lambda x: turning(x, None)))(places)
+    slope = (values[-1] - values[0]) / 2
+    assert np.abs(derivatives).max() < 15 * np.abs(slope)
+    assert np.abs(derivatives.mean() - slope) < 3 * derivatives.std() / np.sqrt(128)
+    # The bound of the width: without it the foot stops short of the floor, and its slope is three quarters of MuJoCo's.
+    assert np.abs(slope - (mujocos[-1] - mujocos[0]) / 2) < 0.15 * np.abs(slope)
+
+
+def test_an_impedance_without_a_width_begins_where_mujocos_does():
+    scene = mg.load_scene(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1" solimp=".8 .95 0"/>
+        <body pos="0 0 .12"><freejoint/><geom size=".1" solimp=".8 .95 0"/></body></worldbody></mujoco>"""
+    )
+    heights = [
+        mg.rollout(scene, mg.initial_state(scene), horizon=300, onset=onset).qpos[:, 2] for onset in (None, mg.Onset())
+    ]
+    np.testing.assert_allclose(heights[0], heights[1], atol=2e-4)  # half of what the fall passes in a step, at 0.6 m/s
+
+
+@pytest.mark.slow
+def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
+    """The same push at 4 ms with the slope at MuJoCo's motion, which chatter multiplies.
+
+    A free flight grows by its duration at most.
+    """
+    scene = mg.load_scene(_PUSHED.format(timestep=1e-3, kind="sphere", turning=""))
+    controls = jnp.linspace(0.7, 0.98, 32)[:, None, None] * jnp.ones((240, 1))
+
+    def pushed(force, **how):
+        start = mg.initial_state(scene)
+        return mg.rollout(scene, start, force, measure_growth=True, **how)
+
+    event = jax.jit(jax.vmap(lambda force: pushed(force, gradient="slope")))(controls)
+    assert event.explodes.any()
+    free = mg.load_scene(
+        _PUSHED.replace('type="plane"', 'type="plane" pos="0 0 -9"').format(timestep=1e-3, kind="sphere", turning="")
+    )
+    flight = mg.rollout(free, mg.initial_state(free), horizon=20, measure_growth=True)
+    assert not flight.explodes
+    assert 0.5 < flight.growth < 2
+    assert not mg.rollout(free, mg.initial_state(free), horizon=20).explodes
+
+
+@pytest.mark.slow
+def test_the_width_can_be_swept_and_differentiated():
+    scene = _scene(_BALL.format(cone="pyramidal", condim=3))
+    start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5.00001), qvel=jnp.array([0.0, 0, -1e-3, 0, 0, 0]))
+
+    def after(width):
+        return mg.step(scene.model, start, onset=mg.Onset(width)).qvel[2]
+
+    widths = jnp.array([0.05, 0.1, 0.4])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(after)))(widths)
+    assert len(np.unique(values)) == 3
+    # Longer steps than rounding asks for: a solve of tolerance 1e-13 is known to some 1e-13 m/s.
+    ends = jax.jit(jax.vmap(after))(jnp.concatenate([widths + 1e-4, widths - 1e-4])).reshape(2, 3)
+    np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / 2e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("width", [-0.1, np.nan, np.inf])
+def test_a_width_without_meaning_is_refused(width):
+    with pytest.raises(ValueError, match="width must be finite and not negative"):
+        mg.Onset(width)
+
+
+def test_the_event_gradient_is_refused_beside_an_onset():
+    scene = _scene(_BALL.format(cone="pyramidal", condim=3))
+    with pytest.raises(ValueError, match="gradient must be 'discrete' with an onset"):
+        mg.step(scene.model, scene.data, gradient="slope", onset=mg.Onset())
+    with pytest.raises(ValueError, match=r"sweep under jax\.vmap"):
+        mg.step(scene.model, scene.data, onset=mg.Onset(jnp.ones(3)))
+
+
+@pytest.mark.slow
+def test_smoothing_of_contacts_leaves_the_onset_to_the_limits():
+    """Noise on the distance already makes contact continuous; a joint limit has none."""
+    both = """
+    <mujoco>
+      <option timestep="0.002" gravity="0 0 0"/>
+      <worldbody>
+        <geom type="plane" size="5 5 .1"/>
+        <body pos="0 0 .05"><joint type="slide" axis="0 0 1"/><geom size=".05"/></body>
+        <body pos="1 0 .5"><joint type="slide" axis="0 0 1" range="-.1 1" limited="true"/><geom size=".05"/></body>
+      </worldbody>
+    </mujoco>
+    """
+    scene = _scene(both)
+    start = scene.data.replace(qpos=jnp.array([0.0004, -0.0996]), qvel=jnp.array([-1.0, -1.0]))
+    smoothing = mg.Smoothing(1e-3)
+    plain, soft, whole = (
+        jax.jit(functools.partial(mg.step, onset=onset, smoothing=s))(scene.model, start).qvel
+        for onset, s in ((mg.Onset(), None), (None, smoothing), (mg.Onset(), smoothing))
+    )
+    np.testing.assert_allclose(whole, [soft[0], plain[1]], rtol=1e-12)
+    assert plain[1] > soft[1] + 1e-3  # without an onset the limit does not act yet
+
+
+_BALL_ON_BOX = """
+<mujoco>
+  <default><geom margin="5"/></default>
+  <worldbody>
+    <body><freejoint/><geom type="sphere" size=".03"/></body>
+    <body><freejoint/><geom type="box" size=".1 .2 .05"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_the_distance_of_a_ball_from_a_box_is_cs_inside_and_outside():
+    model = mujoco.MjModel.from_xml_string(_BALL_ON_BOX)
+    random = np.random.default_rng(3)
+    mjx_model = mjx.put_model(model)
+    template = mjx.make_data(mjx_model)
+
+    @jax.jit
+    def find(qpos):
+        data = template.replace(qpos=qpos)
+        contact = collide(mjx_model, mjx.kinematics(mjx_model, data))._impl.contact
+        return contact.dist[0], contact.frame[0, 0], contact.pos[0]
+
+    data, num_inside = mujoco.MjData(model), 0
+    for _ in range(200):
+        quaternion = random.normal(size=4)
+        data.qpos[:] = [
+            *random.uniform(-0.25, 0.25, 3),
+            1,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            *(quaternion / np.linalg.norm(quaternion)),
+        ]
+        mujoco.mj_forward(model, data)
+        dist, normal, pos = find(jnp.asarray(data.qpos))
+        theirs = data.contact[0]
+        num_inside += theirs.dist < -0.03
+        np.testing.assert_allclose(dist, theirs.dist, atol=1e-12)
+        np.testing.assert_allclose(normal, theirs.frame[:3], atol=1e-9)
+        np.testing.assert_allclose(pos, theirs.pos, atol=1e-9)
+    assert num_inside > 10
+
+
+def test_a_weight_that_rounds_to_one_keeps_its_derivative():
+    """In single precision that of several contacts just short of whole does, and nothing is left of the step before them."""
+    block = object.__new__(Block)
+    for name, value in {"residual": jnp.zeros(5), "rows_each": 1}.items():
+        object.__setattr__(block, name, value)
+
+    def weight_and_before(shares):
+        found = _split([block], [jnp.append(shares, jnp.float32(1))], [None])
+        return found.weight, found.before
+
+    shares = 1 - jnp.array([2, 3, 1, 3], jnp.float32) * 2.0**-24
+    weight, _ = weight_and_before(shares)
+    assert weight == 1
+    assert np.isfinite(jax.jacrev(lambda x: weight_and_before(x)[1])(shares)).all()

@@ -1,0 +1,98 @@
+"""Room for the nearest contacts alone: the same motion while that is enough, and a count of the steps in which it may not be."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.contact.collision import collide, first_missed
+from mjxgrad.stepping import onset as onsets
+from mjxgrad.stepping.assembly import gather
+
+# Two balls that touch the floor and each other, and two far above: nine contacts could be with friction, one without.
+_SLIDES = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+SCENE = f"""<mujoco><option timestep="0.004" cone="{{cone}}" tolerance="1e-14"/><worldbody><geom type="plane" size="5 5 .1"/>
+<body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
+<body pos=".19 0 .1">{_SLIDES}<geom size=".1" mass=".5"/></body>
+<body pos="1 1 2">{_SLIDES}<geom size=".1" mass="1" condim="1"/></body>
+<body pos="1 1 3">{_SLIDES}<geom size=".1" mass="1" condim="1"/></body></worldbody></mujoco>"""
+HORIZON = 12
+
+
+def _rolled(scene, onset):
+    velocity = jnp.asarray(np.random.default_rng(2).normal(scale=0.3, size=scene.model.nv))
+
+    def last(velocity):
+        trajectory = mg.rollout(scene, mg.initial_state(scene, qvel=velocity), horizon=HORIZON, onset=onset)
+        return jnp.sin(trajectory.qpos[-1]).sum(), trajectory
+
+    return jax.jit(jax.value_and_grad(last, has_aux=True))(velocity)
+
+
+@pytest.mark.parametrize(
+    ("cone", "onset"),
+    [("pyramidal", mg.Onset()), pytest.param("elliptic", None, marks=pytest.mark.slow)],
+    ids=["onset", "elliptic"],
+)
+def test_room_for_those_that_touch_changes_neither_motion_nor_derivative(cone, onset):
+    """Three act, and the fourth that could is over a metre away."""
+    scenes = [mg.load_scene(SCENE.format(cone=cone), max_contacts=room) for room in (None, 4)]
+    rows = [scene.data._impl.efc_J.shape[0] for scene in scenes]
+    assert rows[1] < rows[0]
+    ((_, all_of_them), gradient), ((_, nearest), other) = (_rolled(scene, onset) for scene in scenes)
+    # Sums in another order, over twelve steps of impacts.
+    np.testing.assert_allclose(nearest.qpos, all_of_them.qpos, atol=1e-12)
+    np.testing.assert_allclose(other, gradient, atol=1e-12 * np.abs(gradient).max())
+    assert nearest.crowded == all_of_them.crowded == 0
+
+
+@pytest.mark.parametrize("onset", [None, mg.Onset()], ids=["MuJoCo's", "onset"])
+def test_more_contacts_than_room_are_counted_in_every_step(onset):
+    """A box at rest stands on four corners."""
+    box = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .0999"><freejoint/>
+        <geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+    scene = mg.load_scene(box, max_contacts=2)
+    trajectory = jax.jit(lambda: mg.rollout(scene, mg.initial_state(scene), horizon=3, onset=onset))()
+    assert trajectory.crowded == 3
+
+
+def test_no_contact_acts_from_farther_than_the_reach():
+    """For balls that fly about, at any speed up to 20 m/s."""
+    scene = mg.load_scene(SCENE.format(cone="pyramidal"))
+    model = scene.model
+
+    @jax.jit
+    @jax.vmap
+    def look(qpos, qvel):
+        data = mg.forward(model, scene.data.replace(qpos=qpos, qvel=qvel))
+        rows, _ = onsets.begin(model, data, gather(model, data), mg.Onset())
+        active = jnp.concatenate([row.is_active[:: row.rows_each] for row in rows if row.is_contact])
+        contact = data._impl.contact
+        farthest = jnp.max(jnp.where(active, contact.dist - contact.includemargin, -jnp.inf))
+        return farthest, onsets.reach(model, data, mg.Onset())
+
+    random = np.random.default_rng(5)
+    qpos = np.tile(np.asarray(scene.data.qpos), (3000, 1)) + random.normal(scale=0.05, size=(3000, model.nq))
+    qpos[:, [-3, -1]] -= [[1.8, 2.8]]  # the upper ones above the floor, too
+    qvel = random.normal(size=(3000, model.nv)) * 10 ** random.uniform(-2, 1, size=(3000, 1))
+    farthest, reach = look(jnp.asarray(qpos), jnp.asarray(qvel))
+    assert (farthest > 0).sum() > 50
+    assert (farthest <= reach).all()
+
+
+def test_the_first_that_finds_no_room_is_no_nearer_than_any_that_does():
+    scene = mg.load_scene(SCENE.format(cone="pyramidal"), max_contacts=2)
+    every = mg.load_scene(SCENE.format(cone="pyramidal"))
+    missed = jax.jit(lambda data: first_missed(scene.model, collide(scene.model, data)))
+    data = jax.jit(mg.forward)(every.model, every.data)
+    contact = data._impl.contact
+    expected = np.sort(contact.dist[contact.dim == 3])[1]
+    placed = scene.data.replace(geom_xpos=data.geom_xpos, geom_xmat=data.geom_xmat)
+    np.testing.assert_allclose(missed(placed), expected, rtol=1e-12)
+    assert first_missed(every.model, data) == np.inf
+
+
+def test_room_for_none_is_refused():
+    with pytest.raises(ValueError, match="max_contacts must be at least 1, got 0; None has room for all"):
+        mg.load_scene(SCENE.format(cone="elliptic"), max_contacts=0)

@@ -1,0 +1,247 @@
+"""Steps under smoothing: what they simulate, what they differentiate, what they refuse."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy import optimize
+
+import mjxgrad as mg
+from mjxgrad._mjx import mjx
+from mjxgrad.scene import SceneWarning
+from mjxgrad.solver.kernels import KERNELS
+from mjxgrad.stepping import smoothing_warnings
+from tests.solver.test_kernels import DISTRIBUTIONS
+from tests.solver.test_smoothed_law import _nodes
+
+# A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
+SCENE = """<mujoco><option timestep="0.002" cone="{cone}" tolerance="1e-13" iterations="100"/><worldbody>
+  <geom type="plane" size="5 5 .1" condim="1" solimp=".6 .9 .004"/>
+  <body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><joint type="slide" axis="1 0 0"/>
+    <geom size=".1" condim="{dim}" mass="2" solimp=".6 .9 .004"/></body>
+  <body pos="3 0 1"><joint type="slide" axis="1 0 0" range="-1 .1" limited="true"/>
+    <geom size=".1" mass="2" contype="0" conaffinity="0"/></body>
+</worldbody></mujoco>"""
+LENGTH = 2e-3
+HEIGHT, SINK = 1e-3, -0.2  # m above the plane, m/s
+
+
+@functools.cache
+def _scene(cone="pyramidal", dim=1):
+    model = mujoco.MjModel.from_xml_string(SCENE.format(cone=cone, dim=dim))
+    put = mjx.put_model(model)
+    return put, mjx.make_data(put)
+
+
+@eqx.filter_jit
+def _acceleration(model, data, position, velocity, smoothing):
+    moved = mg.forward(model, data.replace(qpos=position, qvel=velocity), smoothing=smoothing)
+    return moved.qacc
+
+
+def _at(height, sink=SINK, slide=0.0, limit=0.0, smoothing=None, **scene):
+    model, data = _scene(**scene)
+    position, velocity = jnp.array([height, 0.0, limit]), jnp.array([sink, slide, 0.0])
+    return np.asarray(_acceleration(model, data, position, velocity, smoothing))
+
+
+# Other laws than the plain Gaussian's compile for a while; what is theirs, `test_law` tests apart from the step.
+scenes = pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param({}, id="pyramidal"),
+        pytest.param({"cone": "elliptic", "dim": 3}, id="elliptic", marks=pytest.mark.slow),
+    ],
+)
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "gaussian" else pytest.param(name, marks=pytest.mark.slow) for name in KERNELS]
+)
+def test_acceleration_balances_the_mean_force_under_noise(name):
+    """Root of a + g = F(a), the force averaged over noise by quadrature: the solve's own accuracy, 1e-8.
+
+    solref is (0.02, 1), so K = (dw tc)⁻², B = 2 / (dw tc); the compiled inverse weight is 1/m. With power 2 and midpoint 1/2 the
+    impedance at depth e < width / 2 is d0 + (dw - d0) 2 (e/width)²; e is the mean penetration under noise where there is one.
+    """
+    w, share = _nodes(np.array([-HEIGHT / LENGTH]), DISTRIBUTIONS[name])
+    touches = LENGTH * w < -HEIGHT
+    depth = -np.sum(share * (HEIGHT + LENGTH * w) * touches) / np.sum(share * touches)
+    assert depth < 0.5 * 4e-3
+    d = 0.6 + 0.3 * 2 * (depth / 4e-3) ** 2
+    rate, damping, weight = d / (0.9 * 0.02) ** 2, 2 / (0.9 * 0.02), 2 * d / (1 - d)
+
+    def excess(a):
+        x = a + damping * SINK + rate * HEIGHT
+        last = min(-HEIGHT, -x / rate) / LENGTH
+        w, share = _nodes(np.array([last]), DISTRIBUTIONS[name])
+        push = np.where(w < last, x + rate * LENGTH * w, 0.0)
+        return 2 * (a + 9.81) + weight * np.sum(share * push)
+
+    exact = optimize.brentq(excess, -20, 100, xtol=1e-13)
+    found = _at(HEIGHT, smoothing=mg.Smoothing(LENGTH, name))[0]
+    assert found == pytest.approx(exact, rel=1e-8)
+    assert found > -9.0  # it is not the fall
+
+
+@scenes
+def test_without_length_it_is_the_step_of_mujoco(scene):
+    """Noise of a tenth of a micrometre; the impedance's slope times that depth, 1e-7 / 4e-3 of the force, and less."""
+    small = mg.Smoothing(1e-7)
+    for height in (-1e-3, 1e-3, 0.3):
+        found, hard = (_at(height, slide=0.4, smoothing=s, **scene) for s in (small, None))
+        np.testing.assert_allclose(found, hard, rtol=1e-4, atol=1e-6)
+
+
+def test_without_the_gate_an_approaching_body_is_braked_from_afar():
+    """At 1 m/s a row without gate acts from 2 ζ |v| / ω = 40 mm (dw B / (d K)) on; with it, from a few lengths."""
+    far = 0.02
+    assert _at(far, -1.0, smoothing=mg.Smoothing(LENGTH))[0] == pytest.approx(-9.81, abs=1e-9)
+    assert _at(far, -1.0, smoothing=mg.Smoothing(LENGTH, gated=False))[0] > 5.0
+
+
+def test_limits_are_smoothed_by_a_length_of_their_own():
+    """A slider at rest 1 mm before its limit is pushed back if limits are smoothed, and only then."""
+    contacts, both = mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, limit_length=LENGTH)
+    assert _at(1.0, limit=0.099, smoothing=contacts)[2] == 0
+    assert _at(1.0, limit=0.099, smoothing=both)[2] < -0.1
+    assert _at(1.0, limit=0.0, smoothing=both)[2] == pytest.approx(0, abs=1e-9)
+
+
+@scenes
+def test_derivatives_are_central_differences(scene):
+    """By height, velocities and length; differences of width 1e-6 of a law that bends over 1e-3: 1e-6."""
+    model, data = _scene(**scene)
+
+    def outcome(p):
+        position, velocity = jnp.array([p[0], 0.0, 0.0]), jnp.array([p[1], p[2], 0.0])
+        moved = mg.step(model, data.replace(qpos=position, qvel=velocity), smoothing=mg.Smoothing(p[3]))
+        return jnp.dot(moved.qvel, jnp.array([1.0, 0.7, 0.0]))
+
+    point = jnp.array([HEIGHT, SINK, 0.3, LENGTH])
+    program = jax.jit(jax.value_and_grad(outcome))
+    found = program(point)[1]
+    width = np.array([1e-6, 1e-5, 1e-5, 1e-6])
+    ends = np.array([program(end)[0] for end in jnp.concatenate([point + np.diag(width), point - np.diag(width)])])
+    exact = (ends[:4] - ends[4:]) / (2 * width)
+    np.testing.assert_allclose(found, exact, rtol=1e-5, atol=1e-5 * np.abs(exact).max())
+    assert np.abs(found).min() > 1e-3
+
+
+@scenes
+def test_backward_moves_as_without_and_differentiates_the_smoothed_step(scene):
+    """To the last bit the one, and to that of the solve the other: two starts of one iteration."""
+    model, data = _scene(**scene)
+    modes = (None, mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, mode="backward"))
+
+    def outcome(height, smoothing):
+        position = jnp.array([0.0, 0.0, 0.0]).at[0].set(height)
+        start = data.replace(qpos=position, qvel=jnp.array([SINK, 0.3, 0.0]))
+        moved = mg.step(model, start, smoothing=smoothing)
+        return moved.qvel, moved.qfrc_constraint, moved._impl.efc_force
+
+    @jax.jit
+    def program(height):
+        one = jnp.ones_like(height)
+        return [jax.jvp(functools.partial(outcome, smoothing=s), (height,), (one,)) for s in modes]
+
+    for height in (HEIGHT, -HEIGHT):
+        (hard, hard_slope), (_, smooth_slope), (backward, slope) = program(jnp.array(height))
+        for true, found in zip(hard, backward, strict=True):
+            np.testing.assert_array_equal(true, found)
+        for smooth, found in zip(smooth_slope, slope, strict=True):
+            np.testing.assert_allclose(found, smooth, rtol=1e-8, atol=1e-9 * np.abs(smooth).max())
+        assert np.abs(slope[0] - hard_slope[0]).max() > 0.1
+
+
+def test_runge_kutta_takes_the_smoothed_acceleration_at_each_stage():
+    """The classical rule written out, to the accuracy of the solves."""
+    model, data = _scene()
+    start = np.array([HEIGHT, 0.0, 0.0]), np.array([SINK, 0.3, 0.0])
+    smoothing, h = mg.Smoothing(LENGTH), 2e-3
+    rungs = model.tree_replace({"opt.integrator": mjx.IntegratorType.RK4})
+    moved = eqx.filter_jit(mg.step)(rungs, data.replace(qpos=start[0], qvel=start[1]), smoothing=smoothing)
+    rates, position, velocity = [], *start
+    for share in (0.5, 0.5, 1.0, None):
+        rates.append((velocity, np.asarray(_acceleration(model, data, position, velocity, smoothing))))
+        if share is not None:
+            position, velocity = (x + h * share * rate for x, rate in zip(start, rates[-1], strict=True))
+    for found, x, each in zip((moved.qpos, moved.qvel), start, zip(*rates, strict=True), strict=True):
+        np.testing.assert_allclose(found, x + h / 6 * np.dot([1, 2, 2, 1], each), rtol=1e-10, atol=1e-13)
+    assert rates[0][1][0] > -9.0  # there is a force at a distance
+
+
+def test_lengths_are_swept_in_one_program():
+    """One vmap over a Smoothing equals single steps."""
+    model, data = _scene()
+    lengths = jnp.array([1e-3, 3e-3])
+    sweep = jax.vmap(lambda s: _acceleration(model, data, jnp.array([HEIGHT, 0, 0]), jnp.array([SINK, 0, 0]), s))
+    each = [_at(HEIGHT, smoothing=mg.Smoothing(length)) for length in lengths]
+    np.testing.assert_allclose(sweep(mg.Smoothing(lengths)), each, rtol=1e-10)
+
+
+BOX = """<mujoco><worldbody>
+  <body pos="0 0 .105"><joint type="slide" axis="0 0 1"/>
+    <geom name="pin" type="capsule" size=".1 .05" euler="90 0 0" condim="1"/></body>
+  <geom name="box" type="box" size=".1 .1 .1" pos="0 0 -.1" condim="1"/></worldbody></mujoco>"""
+
+
+def test_a_capsule_over_a_box_has_no_force_at_a_distance_and_the_warning_says_so():
+    """MJX says 1 m of 5 mm, within reach of the log barrier; the fall stays a fall."""
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX))
+    smoothing = mg.Smoothing(5e-3, "log_barrier")
+    moved = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), smoothing=smoothing)
+    np.testing.assert_allclose(moved.qacc, [-9.81], atol=1e-12)
+    assert "pin – box" in smoothing_warnings(smoothing, model)[0]
+
+
+def test_a_ball_over_a_box_has_force_at_a_distance_and_no_warning():
+    """The nearest point of a box is known from anywhere."""
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX.replace('type="capsule" size=".1 .05"', 'size=".1"')))
+    smoothing = mg.Smoothing(5e-3, "log_barrier")
+    assert not smoothing_warnings(smoothing, model)
+    forward = jax.jit(lambda data: mg.forward(model, data, smoothing=smoothing))
+    assert forward(mjx.make_data(model)).qacc[0] > -9.81 + 1
+
+
+def test_a_scene_without_contact_or_limits_is_named():
+    """By the rollout, too, with the scene's name and the kernel's."""
+    scene = mg.load_scene(
+        '<mujoco model="void"><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    with pytest.warns(SceneWarning, match="logistic contact has no effect"):
+        jax.eval_shape(
+            lambda s: mg.rollout(scene, s, horizon=2, smoothing=mg.Smoothing(1e-3, "logistic")), mg.initial_state(scene)
+        )
+    assert "limit_length has no effect" in smoothing_warnings(mg.Smoothing(1.0, limit_length=0.1), scene.model)[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"length": 0.0}, "length must be positive and finite, got 0.0"),
+        ({"length": -1e-3}, "length must be positive"),
+        ({"length": [1e-3, np.inf]}, "length must be positive"),
+        ({"length": 1e-3, "limit_length": -1.0}, "limit_length must be positive"),
+        (
+            {"length": 1e-3, "kernel": "cauchy"},
+            "kernel must be one of 'gaussian', 'logistic', 'log_barrier', got 'cauchy'",
+        ),
+        ({"length": 1e-3, "mode": "both"}, "mode must be one of 'forward', 'backward', got 'both'"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(settings, message):
+    """With the value and the choices."""
+    with pytest.raises(ValueError, match=message):
+        mg.Smoothing(**settings)
+
+
+def test_what_a_step_cannot_take_is_refused():
+    """A batch of lengths, and two corrections of one event."""
+    model, data = _scene()
+    with pytest.raises(ValueError, match="length must be one value for a step, got shape \\(2,\\)"):
+        mg.step(model, data, smoothing=mg.Smoothing([1e-3, 2e-3]))
