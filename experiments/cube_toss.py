@@ -22,8 +22,8 @@ from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, ZEROTH, Drawings, le
 from experiments.words import capitalised, joined, percent, quantity
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import data_of
-from mjxgrad.integration import adaptive_rollout
+from mjxgrad.rollouts.integration import adaptive_rollout
+from mjxgrad.rollouts.state import data_of
 from mjxgrad.stepping import Gradient, assembly
 from mjxgrad.tasks import scene_path
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.settings import VideoSettings
 from experiments.workspace import Workspace
-from mjxgrad.render import RenderingUnavailableError, frames, write_video
+from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
 
 FILE = "video.mp4"
 

@@ -1,35 +1,27 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import (
-    baselines,
-    diagnostics,
-    envs,
-    estimators,
-    identification,
-    integration,
-    learning,
-    planning,
-    render,
-    tasks,
-)
+from mjxgrad import baselines, diagnostics, envs, estimators, identification, learning, planning, tasks
 from mjxgrad._programs import keep_compiled
-from mjxgrad._rollout import (
-    DivergedError,
-    State,
-    Trajectory,
-    check_trajectory,
-    initial_state,
-    rollout,
-)
 from mjxgrad.batched import over_devices
 from mjxgrad.bodies import set_const
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
-from mjxgrad.linearisation import Linearisation, linearise
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from mjxgrad.optimiser import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.policy import linear_policy, mlp_policy
+from mjxgrad.rollouts import (
+    DivergedError,
+    Linearisation,
+    State,
+    Trajectory,
+    check_trajectory,
+    initial_state,
+    integration,
+    linearise,
+    render,
+    rollout,
+)
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
 from mjxgrad.task import SceneTask

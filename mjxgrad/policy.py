@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from mjxgrad._rollout import State
+from mjxgrad.rollouts import State
 from mjxgrad.task import as_pytree
 
 # The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import form
-from mjxgrad._rollout import Engine, Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.contact import Softness
+from mjxgrad.rollouts import Engine, Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad._rollout import State
 from mjxgrad.policy import Affine
+from mjxgrad.rollouts import State
 from tests.estimators import textbook
 
 STATE = jnp.array([0.7, -0.4])

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad._rollout import initial_state
 from mjxgrad.objective import closed_loop, open_loop
+from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask
 from tests.estimators import textbook

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 import mjxgrad as mg
 from experiments.motion import advance
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, data_of, state_of
+from mjxgrad.rollouts import State
+from mjxgrad.rollouts.state import data_of, state_of
 from mjxgrad.tasks import scene_path
 from mjxgrad.tasks.hopper import hopper
 

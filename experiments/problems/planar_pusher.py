@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad._rollout import initial_state
 from mjxgrad.planning import SceneSystem
+from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 

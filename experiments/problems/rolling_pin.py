@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._rollout import Trajectory, initial_state
+from mjxgrad.rollouts import Trajectory, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import ActionTask, scene_path
 

@@ -19,10 +19,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._rollout import State, data_of, initial_state
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs import Environment
+from mjxgrad.rollouts import State, initial_state
+from mjxgrad.rollouts.state import data_of
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 

@@ -18,7 +18,7 @@ import mjxgrad as mg
 from experiments.parallel import num_cores
 from experiments.stability.scenes import FIELDS, Points, StabilityScene, catalogue, configure
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import Observe, Trajectory
+from mjxgrad.rollouts import Observe, Trajectory
 from mjxgrad.stepping import Gradient
 
 VELOCITY_LIMIT = 1e4

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from mjxgrad._rollout import Trajectory
+from mjxgrad.rollouts import Trajectory
 from mjxgrad.scene import Scene
 
 

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._rollout import State, initial_state
 from mjxgrad.bodies.spatial import exponential, multiply, rotation_matrix
 from mjxgrad.envs.environment import Environment
 from mjxgrad.envs.gymnasium_robots import robot_scene
+from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import scene_path
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
-from mjxgrad._rollout import State, Trajectory, initial_state, rollout
+from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient
 from mjxgrad.task import InScene, optional_pytree

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from mjxgrad import render
 from mjxgrad.envs import ENVIRONMENTS, load
 from mjxgrad.envs.environment import Environment, EnvState
+from mjxgrad.rollouts import render
 
 try:
     import gymnasium

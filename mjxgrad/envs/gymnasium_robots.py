@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._rollout import State, data_of, initial_state
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.envs.environment import Environment
+from mjxgrad.rollouts import State, initial_state
+from mjxgrad.rollouts.state import data_of
 from mjxgrad.scene import Scene, load_scene
 
 _ANY = (-float("inf"), float("inf"))

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from mjxgrad._rollout import State, initial_state
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs.environment import Environment
+from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import scene_path
 

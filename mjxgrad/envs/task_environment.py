@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from mjxgrad._rollout import State, Trajectory
 from mjxgrad.envs.environment import Environment, EnvState
+from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.task import SceneTask
 
 Memory = dict[str, Array]

@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import initial_state, rollout
 from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
@@ -29,6 +28,7 @@ from mjxgrad.identification.parameters import (
     softness,
 )
 from mjxgrad.identification.recording import Recording, Windows
+from mjxgrad.rollouts import initial_state, rollout
 from mjxgrad.scene import Scene, sensor
 from mjxgrad.scene.scene import numbers_of
 

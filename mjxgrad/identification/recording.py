@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, initial_state, rollout
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene, sensor
 from mjxgrad.stepping import Gradient, Onset
 

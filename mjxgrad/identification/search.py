@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._programs import compile_once
-from mjxgrad._rollout import DivergedError
 from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
 from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
+from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient, Onset
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._programs import compile_once
-from mjxgrad._rollout import Engine
 from mjxgrad.envs import Environment, EnvState
+from mjxgrad.rollouts import Engine
 
 
 class Evaluation(eqx.Module):

@@ -16,8 +16,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
-from mjxgrad._rollout import State
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Smoothing, step
 from mjxgrad.task import as_pytree

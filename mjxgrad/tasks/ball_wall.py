@@ -12,9 +12,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import Trajectory, initial_state, rollout
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ParameterNoise, parameter_noise
+from mjxgrad.rollouts import Trajectory, initial_state, rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.action_task import scene_path

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import State, Trajectory, initial_state
 from mjxgrad.policy import linear_policy
+from mjxgrad.rollouts import State, Trajectory, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import ActionTask
 

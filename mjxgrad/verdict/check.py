@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import Engine, Trajectory
 from mjxgrad._text import format_number
 from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.rollouts import Engine, Trajectory
 from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.scene.load import count_pairs
 from mjxgrad.verdict.findings import (

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from mjxgrad._rollout import LARGEST_GROWTH
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
+from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.measure import STDDEVS, Measured
 from mjxgrad.verdict.motions import Motions

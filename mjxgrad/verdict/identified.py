@@ -13,10 +13,10 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad import render
 from mjxgrad.identification import Identification, Recording, Stopped
 from mjxgrad.identification.files import simulated
 from mjxgrad.identification.recording import stack
+from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.page import document
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._rollout import State
 from mjxgrad._text import format_number
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.horizon import Crossover, crossover
@@ -20,6 +19,7 @@ from mjxgrad.estimators import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
 from mjxgrad.estimators.samples import Plan, Samples
 from mjxgrad.objective.base import unchanged
+from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
 from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
 from mjxgrad.verdict.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjxgrad._rollout import State, Trajectory, pose_warnings
 from mjxgrad.contact.parameters import geom_name
+from mjxgrad.rollouts import State, Trajectory
+from mjxgrad.rollouts.state import pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
 

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
-from mjxgrad._rollout import State, Trajectory, rollout
 from mjxgrad.batched import device
 from mjxgrad.native.derivative import to_coordinates, to_tangent
 from mjxgrad.native.engine import engine_of
+from mjxgrad.rollouts import State, Trajectory, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.task import finite_cost
 

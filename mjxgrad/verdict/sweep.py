@@ -21,7 +21,6 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
-from mjxgrad._rollout import Engine, Trajectory, initial_state
 from mjxgrad._text import format_number
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.contact import Softness
@@ -29,6 +28,7 @@ from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
+from mjxgrad.rollouts import Engine, Trajectory, initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Gradient
 from mjxgrad.task import SceneTask

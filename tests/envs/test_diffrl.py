@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad._rollout import initial_state
 from mjxgrad.envs import diffrl
+from mjxgrad.rollouts import initial_state
 
 # Turned by 0.4 about the vertical, then by 0.3 about the own y: R = Rz(0.4) Ry(0.3).
 LEAN, TURN = 0.3, 0.4

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mjxgrad._rollout import rollout
 from mjxgrad.envs.diffrl import CartPole
+from mjxgrad.rollouts import rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 

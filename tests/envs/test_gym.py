@@ -12,11 +12,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from mjxgrad import render
-from mjxgrad._rollout import initial_state
 from mjxgrad.envs import ENVIRONMENTS
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.envs.gym import GymEnv, GymVectorEnv, gym_name
+from mjxgrad.rollouts import initial_state, render
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 

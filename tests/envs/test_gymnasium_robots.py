@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad._rollout import initial_state
 from mjxgrad.envs import load
+from mjxgrad.rollouts import initial_state
 
 _UNSEEN = dict.fromkeys(("cinert", "cvel", "qfrc_actuator", "cfrc_ext"), False)
 OPTIONS = {

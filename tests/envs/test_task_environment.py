@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad._rollout import initial_state
 from mjxgrad.envs import from_task
+from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask
 

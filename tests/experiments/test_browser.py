@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from experiments.report import Figure, Report, Table, gallery, overview, page
-from mjxgrad.render import write_video
+from mjxgrad.rollouts.render import write_video
 
 BROWSER = os.environ.get("CHROME_BIN") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None

@@ -23,7 +23,7 @@ from experiments.bias_variance import measure
 from experiments.report import Report
 from experiments.settings import VideoSettings
 from experiments.workspace import Workspace
-from mjxgrad.render import RenderingUnavailableError
+from mjxgrad.rollouts.render import RenderingUnavailableError
 
 SETTINGS = """\
 # Does a <steep> step mislead?

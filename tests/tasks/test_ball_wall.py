@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad._rollout import initial_state, rollout
 from mjxgrad.estimators import first_and_zeroth_order
 from mjxgrad.objective import closed_loop
+from mjxgrad.rollouts import initial_state, rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask, ball_wall, scene_path
 from mjxgrad.tasks.ball_wall import wall_softness

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from experiments.problems.published_scenes import friction, motion_planning, push, push_softness, tennis
-from mjxgrad._rollout import rollout
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
+from mjxgrad.rollouts import rollout
 from mjxgrad.tasks import scene_path
 
 TIMESTEP, MASS, RAIL_DAMPING = 0.005, 0.1, 0.04  # s, kg, N s/m: of the push

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from experiments.problems.trot import trot
 from mjxgrad import learning
-from mjxgrad._rollout import initial_state
+from mjxgrad.rollouts import initial_state
 
 LEGS = ("LF", "RF", "LH", "RH")
 HIP, KNEE = np.pi / 6, np.pi / 4  # of the stance

@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._rollout import Engine, State, data_of
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import INPUTS
 from mjxgrad.native import linearise as by_mujoco
+from mjxgrad.rollouts.arguments import Engine
+from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient, Onset, step
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.integration import adaptive_rollout
+from mjxgrad.rollouts.integration import adaptive_rollout
 
 pytest.importorskip("diffrax")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.video import tile
-from mjxgrad.render import RenderingUnavailableError, frames, write_video
+from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
 
 # A white ball that slides along x, seen from a camera that looks along y: its place in the picture is its place in x.
 SLIDER = """
@@ -50,7 +50,7 @@ def test_without_opengl_the_error_names_the_packages():
     """MUJOCO_GL=disable is what a machine without OpenGL comes down to."""
     program = (
         "import mujoco, numpy as np\n"
-        "from mjxgrad.render import RenderingUnavailableError, frames\n"
+        "from mjxgrad.rollouts.render import RenderingUnavailableError, frames\n"
         "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')\n"
         "try:\n    frames(model, np.zeros((1, 0)), timestep=0.01)\n"
         "except RenderingUnavailableError as error:\n    print(error)\n"

@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from mjxgrad._arrays import known
-from mjxgrad._rollout import State, data_of
 from mjxgrad.bodies.kinematics import integrate_position
+from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import forward
 

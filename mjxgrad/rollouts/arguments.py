@@ -1,0 +1,107 @@
+"""What a rollout is called with: the types of it, and what is refused."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from mjxgrad._arrays import form, known, whole
+from mjxgrad._mjx import mjx
+from mjxgrad.native import INPUTS
+from mjxgrad.rollouts.state import State
+from mjxgrad.scene import Scene
+
+Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
+"""From its parameters and what it sees to controls."""
+Observe = Callable[[mjx.Model, mjx.Data], PyTree]
+"""From model and data to anything made of arrays."""
+Sees = Literal["state", "observations"]
+Engine = Literal["mjx", "mujoco"]
+
+
+def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
+    """Refuse to show a policy what there is not."""
+    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
+        raise ValueError(
+            f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}, {observe=}'
+        )
+
+
+def sequence_of(
+    controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
+) -> tuple[Array | None, int]:
+    """Return the controls where they are a sequence, and the number of steps; or refuse what does not go together."""
+    sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
+    horizon = _horizon(horizon, controls=sequence, noise=noise)
+    for name, value in (("controls", sequence), ("noise", noise)):
+        if value is not None:
+            _check_sequence(name, jnp.asarray(value), (horizon, num_controls))
+    return sequence, horizon
+
+
+def check_shapes(scene: Scene, state: State) -> None:
+    """Refuse a state of another scene, or several at once."""
+    for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
+        if (shape := jnp.shape(getattr(state, name))) != (size,):
+            remedy = "map over batches with jax.vmap"
+            raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
+
+
+def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
+    """Return what is given to each step besides controls, or refuse what there is not."""
+    found = {}
+    for name, value in ({} if inputs is None else inputs).items():
+        if name not in INPUTS[1:]:
+            raise ValueError(f"inputs must be among {', '.join(INPUTS[1:])}, got {name!r}")
+        shape = (horizon, *getattr(scene.data, name).shape)
+        if np.shape(value) != shape:
+            raise ValueError(f"inputs[{name!r}] must have shape {shape}, one row per step, got {np.shape(value)}")
+        found[name] = jnp.asarray(value, getattr(scene.data, name).dtype)
+    return found
+
+
+def check_engine(engine: str, **given: Any) -> None:
+    """Refuse an engine that there is not, and what C MuJoCo's motion does not know."""
+    if engine != "mujoco":
+        raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
+    if named := [name for name, value in given.items() if value is not None]:
+        raise ValueError(f'engine="mujoco" is MuJoCo\'s own motion, got {" and ".join(named)}: leave it out')
+
+
+def one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
+    """Refuse what a policy chose unless it is one control per actuator: others would be added up, or shared out, in silence."""
+    chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
+    if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (num_controls,):
+        raise ValueError(
+            f"the policy must return one control per actuator, shape ({num_controls},), got {form(chosen)}"
+        )
+    return jnp.asarray(chosen)
+
+
+def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
+    lengths = {k: int(jnp.shape(v)[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
+    if horizon is not None:
+        lengths["horizon"] = whole("horizon", horizon)
+    if not lengths:
+        raise ValueError("horizon must be given where neither controls nor noise give it, got None")
+    if len(set(lengths.values())) > 1:
+        given = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"controls, noise and horizon must agree on the number of steps, got {given}")
+    length = next(iter(lengths.values()))
+    if length < 1:
+        raise ValueError(f"horizon must be at least 1, got {length}")
+    return length
+
+
+def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
+    if value.shape != shape:
+        meaning = "one row per step and one column per actuator"
+        raise ValueError(f"{name} must have shape {shape}, {meaning}, got {value.shape}")
+    numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
+    if numbers is None or np.isfinite(numbers).all():
+        return
+    row, column = np.argwhere(~np.isfinite(numbers))[0]
+    raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")

@@ -1,0 +1,116 @@
+"""A rollout by C MuJoCo: on all cores of the processor, with nothing to compile, differentiable once."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from mjxgrad.native import INPUTS, roll_out
+from mjxgrad.rollouts.arguments import Policy, one_each
+from mjxgrad.rollouts.state import State, direction, is_sound
+from mjxgrad.rollouts.trajectory import Trajectory
+from mjxgrad.scene import Scene
+from mjxgrad.stepping import Gradient
+
+
+def rolled_out(
+    scene: Scene,
+    state: State,
+    controls: Policy | Float[Array, "horizon nu"],
+    params: PyTree,
+    noise: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
+    *,
+    measure_growth: bool,
+) -> Trajectory:
+    """Return what C MuJoCo makes of controls, noise included, or of a policy; from the first bad step on the last good state."""
+    if callable(controls):
+        found = _by_policy(scene, state, controls, params, noise, applied, gradient, velocity_limit)
+    else:
+        found = _course(scene, state, controls, applied, gradient, velocity_limit)
+    growth = _growth(scene, state, found.ctrl, applied, gradient) if measure_growth else None
+    return dataclasses.replace(found, growth=growth)
+
+
+def _by_policy(
+    scene: Scene,
+    state: State,
+    policy: Policy,
+    params: PyTree,
+    noise: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
+) -> Trajectory:
+    """Step by step, as each control is chosen in the state that it finds."""
+
+    def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
+        state, first_bad = carry
+        index, disturbance, forces = given
+        ctrl = one_each(policy(params, state), scene.model.nu) + disturbance
+        forces = jax.tree.map(lambda x: x[None], forces)
+        one = _course(scene, state, ctrl[None], forces, gradient, velocity_limit)
+        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
+        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
+        return (moved, first_bad), (state, ctrl)
+
+    steps = jnp.arange(len(noise), dtype=jnp.int32)
+    (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), (steps, noise, applied))
+    return _trajectory(jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), states, final), ctrl, first_bad)
+
+
+@eqx.filter_jit
+def _course(
+    scene: Scene,
+    state: State,
+    ctrl: Float[Array, "horizon nu"],
+    applied: dict[str, Array],
+    gradient: Gradient,
+    velocity_limit: float | None,
+) -> Trajectory:
+    """Return the motion under known controls: one call of C MuJoCo."""
+    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
+    is_finite = jnp.isfinite(ctrl)  # MuJoCo takes another for zero
+    given = {
+        name: jnp.broadcast_to(getattr(scene.data, name), (len(ctrl), *getattr(scene.data, name).shape))
+        for name in INPUTS[1:]
+        if getattr(scene.data, name).size
+    }
+    found = roll_out(scene, start, given | applied | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
+    qpos, qvel, act = (
+        jnp.concatenate([first[None], rest])
+        for first, rest in zip((state.qpos, state.qvel, state.act), found, strict=True)
+    )
+    time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
+    states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
+    is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
+    first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
+    kept = jnp.arange(len(ctrl) + 1)
+    kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
+    return _trajectory(jax.tree.map(lambda x: x[kept], states), ctrl, first_bad)
+
+
+def _trajectory(states: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
+    final = jax.tree.map(lambda x: x[-1], states)
+    return Trajectory(states.qpos, states.qvel, ctrl, None, final, first_bad >= 0, first_bad, act=states.act)  # pyright: ignore[reportCallIssue]
+
+
+def _growth(scene: Scene, state: State, ctrl: Array, applied: dict[str, Array], gradient: Gradient) -> Float[Array, ""]:
+    """Return how many times longer a change of the start becomes; it has no derivative."""
+    given = (scene, state, ctrl, applied)
+    scene, state, ctrl, applied = jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, given
+    )
+
+    def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        start = dataclasses.replace(state, qpos=qpos, qvel=qvel)
+        found = _course(scene, start, ctrl, applied, gradient, None)
+        return found.qpos, found.qvel
+
+    _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))
+    size = jnp.linalg.norm(jnp.concatenate(change, axis=1), axis=1).max()
+    return jnp.where(jnp.isfinite(size), jnp.maximum(size, 1.0), jnp.inf)

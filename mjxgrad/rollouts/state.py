@@ -1,0 +1,160 @@
+"""States: what the next step needs, where to begin, and what is wrong with a pose."""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from mjxgrad._arrays import is_known, known
+from mjxgrad._mjx import mjx
+from mjxgrad.contact.parameters import geom_name
+from mjxgrad.scene import Scene, SceneWarning
+
+_DEEP = 0.02  # m, that a pose may have a geom inside another
+_NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
+
+
+class State(eqx.Module):
+    """What the next step needs.
+
+    Attributes:
+        qpos: generalised positions (m, rad, unit quaternions).
+        qvel: generalised velocities (m/s, rad/s).
+        act: actuator activations.
+        time: simulated time (s).
+        warmstart: acceleration from which the next solve starts. It affects the time a solve takes, not its result.
+    """
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    act: Float[Array, " na"]
+    time: Float[Array, ""]
+    warmstart: Float[Array, " nv"]
+
+
+def initial_state(
+    scene: Scene,
+    qpos: Float[ArrayLike, " nq"] | None = None,
+    qvel: Float[ArrayLike, " nv"] | None = None,
+    act: Float[ArrayLike, " na"] | None = None,
+    *,
+    keyframe: str | int | None = None,
+) -> State:
+    """Return the state at the scene's reference pose, at rest, or at one of its key frames, with the given parts replaced.
+
+    Where values are known it warns of a joint that begins beyond its limits, which would push it back from the first step, and
+    of a pose of the file that is deep inside something.
+
+    Args:
+        scene: where it lives.
+        qpos: generalised positions (m, rad, unit quaternions).
+        qvel: generalised velocities (m/s, rad/s).
+        act: actuator activations.
+        keyframe: name or number of a key frame of the file, for its positions, velocities and activations.
+
+    Raises:
+        ValueError: if a part does not have the shape that the scene gives it, is not finite, has a quaternion of zeros, or there
+            is no such key frame.
+    """
+    check_scene(scene)
+    data, keys, parts = scene.data, {}, []
+    if keyframe is not None:
+        key = _keyframe(scene.mj_model, keyframe)
+        keys = {name: getattr(scene.mj_model, f"key_{name}")[key] for name in ("qpos", "qvel", "act")}
+    for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
+        template = getattr(data, name)
+        part = jnp.asarray(keys.get(name, template) if given is None else given, template.dtype)
+        if part.shape != template.shape:
+            raise ValueError(f"{name} must have shape {template.shape} in this scene, got {part.shape}")
+        if is_known(part) and not np.isfinite(part).all():
+            raise ValueError(f"{name} must be finite, got {np.asarray(part).tolist()}")
+        parts.append(part)
+    for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
+        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
+    return State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+
+
+def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
+    names = [model.key(i).name or i for i in range(model.nkey)]
+    if keyframe in names:
+        return names.index(keyframe)
+    if isinstance(keyframe, int) and 0 <= keyframe < model.nkey:
+        return keyframe
+    raise ValueError(f"keyframe must be one of {names or 'none'} in this scene, got {keyframe!r}")
+
+
+def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayLike) -> Iterator[str]:
+    """Say what is wrong with a known pose: joints beyond their limits and, of one that a file has, geoms deep in others.
+
+    Raises:
+        ValueError: if a quaternion is zero.
+    """
+    pose, ranges = known(qpos), known(model.jnt_range)
+    if pose is None or ranges is None or pose.shape != (model.nq,) or ranges.shape != (model.njnt, 2):
+        return
+    units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
+    has_limits = not model.opt.disableflags & _NO_LIMITS
+    for joint, (kind, first) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
+        value, (low, high) = pose[first], ranges[joint]
+        quaternion = pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4]
+        slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
+        is_within = (
+            kind not in units or not has_limits or not model.jnt_limited[joint] or low - slack <= value <= high + slack
+        )
+        if is_within and (kind in units or quaternion.any()):
+            continue
+        name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+        if is_within:
+            raise ValueError(
+                f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
+            )
+        unit = units[int(kind)]
+        yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
+    if of_file is None:
+        return
+    data = mujoco.MjData(of_file)
+    data.qpos[:] = pose
+    mujoco.mj_fwdPosition(of_file, data)
+    deepest = min(data.contact, key=lambda contact: contact.dist, default=None)
+    if deepest is not None and deepest.dist < -_DEEP:
+        names = " in ".join(geom_name(of_file, geom) for geom in deepest.geom[::-1].tolist())
+        yield f"{names} begins {-1e3 * deepest.dist:.3g} mm deep: give qpos or keyframe"
+
+
+def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
+    """Return data in a state, ready to be stepped."""
+    return scene.data.replace(
+        qpos=state.qpos, qvel=state.qvel, act=state.act, time=state.time, qacc_warmstart=state.warmstart, ctrl=ctrl
+    )
+
+
+def state_of(data: mjx.Data) -> State:
+    """Return the state that data is in."""
+    return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
+
+
+def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
+    """Return whether a state is finite and below the velocity limit."""
+    limit = jnp.inf if velocity_limit is None else velocity_limit
+    numbers = jnp.concatenate([state.qpos, state.act])
+    # A comparison with NaN is false, so one test finds both.
+    return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
+
+
+def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """Return a change of the start of length one, the same for every rollout of a scene."""
+    random = np.random.default_rng(0)
+    parts = (random.normal(size=state.qpos.shape), random.normal(size=state.qvel.shape))
+    size = np.sqrt(sum((part**2).sum() for part in parts))
+    return tuple(jnp.asarray(part / size, state.qvel.dtype) for part in parts)  # pyright: ignore[reportReturnType]
+
+
+def check_scene(scene: Any) -> None:
+    """Refuse what is no scene."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be of mg.load_scene, got {type(scene).__name__}")

@@ -1,0 +1,75 @@
+"""The record of a rollout, and the exception for one that has diverged."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from mjxgrad.rollouts.state import State
+
+LARGEST_GROWTH = 1e3
+"""Of a change of the start. Half a second of free motion makes half a metre of a metre per second, a bounce less of it."""
+
+
+class Trajectory(eqx.Module):
+    """The course of one rollout; under `jax.vmap` every field gains leading axes.
+
+    Attributes:
+        qpos: positions before each step and after the last.
+        qvel: velocities, likewise.
+        ctrl: controls applied in each step, noise included.
+        observations: what `observe` returned for each of these states, stacked, under the control of the step that follows
+            (of the last step for the last state); None without it.
+        seen: what a policy that sees observations was called with, stacked; None for others.
+        final: the last state, to continue from.
+        diverged: whether some step gave a non-finite or runaway state, or the model holds what is no number.
+        first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
+        unsolved: number of steps before it whose solve ran into the model's limit of iterations, short of its tolerance, or
+            whose forces, by an estimate of rounding, this precision does not resolve to a thousandth. There the motion is not
+            quite that of the model, and the derivative, which takes the solve for finished, not quite its own. Zero, unless
+            `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
+            hardly have such a limit). Only `rollout` counts it.
+        crowded: number of steps before it in which more contacts may have acted than the scene has room for, see `max_contacts`
+            of `load_scene`. Under smoothing, where contacts act at any distance, it counts every step of such a scene.
+        growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
+            velocities and positions alike; None unless asked for.
+        act: activations of actuators, as positions; only `rollout` keeps them.
+    """
+
+    qpos: Float[Array, "states nq"]
+    qvel: Float[Array, "states nv"]
+    ctrl: Float[Array, "horizon nu"]
+    observations: PyTree
+    final: State
+    diverged: Bool[Array, ""]
+    first_bad_step: Int[Array, ""]
+    unsolved: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    crowded: Int[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    growth: Float[Array, ""] | None = None
+    act: Float[Array, "states na"] | None = None
+    seen: PyTree = None
+
+    @property
+    def explodes(self) -> Bool[Array, "*batch"]:
+        """Whether the derivative has grown beyond belief: a thousandfold, or out of all numbers. False if it was not measured."""
+        return jnp.zeros_like(self.diverged) if self.growth is None else self.growth > LARGEST_GROWTH
+
+
+class DivergedError(FloatingPointError):
+    """A rollout left the range in which its numbers mean anything."""
+
+
+def check_trajectory(trajectory: Trajectory) -> None:
+    """Raise if any rollout of a trajectory, batched or not, has diverged. Call it on the host.
+
+    Raises:
+        DivergedError: naming how many diverged and the earliest bad step.
+    """
+    diverged = jnp.atleast_1d(trajectory.diverged)
+    if not bool(diverged.any()):
+        return
+    first = int(jnp.min(jnp.where(diverged, jnp.atleast_1d(trajectory.first_bad_step), 2**30)))
+    raise DivergedError(
+        f"{int(diverged.sum())} of {diverged.size} rollouts diverged, the earliest in step {first}: "
+        "the state must stay finite and below the velocity limit; shorten the time step, soften the contact, "
+        "or look for a non-finite control"
+    )
