@@ -7,9 +7,16 @@ from mjxgrad.bodies import set_const
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
-from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
+from mjxgrad.objective import (
+    Objective,
+    SceneTask,
+    closed_loop,
+    linear_policy,
+    mlp_policy,
+    open_loop,
+    parameter_noise,
+)
 from mjxgrad.optimiser import History, Optimisation, Stopped, estimated_gradient, optimise
-from mjxgrad.policy import linear_policy, mlp_policy
 from mjxgrad.rollouts import (
     DivergedError,
     Linearisation,
@@ -24,7 +31,6 @@ from mjxgrad.rollouts import (
 )
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
-from mjxgrad.task import SceneTask
 from mjxgrad.verdict import Verdict, check, sweep
 
 __all__ = [

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from experiments.problems import published
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.policy import linear_policy
+from mjxgrad.objective.policy import linear_policy
 
 Schedule = Callable[[Int[Array, ""] | int], Float[Array, ""] | float]
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._arrays import known
 from mjxgrad._programs import compiled
+from mjxgrad.objective.task import optional_pytree
 from mjxgrad.planning import LinearModel, Smoother, System
 from mjxgrad.planning.system import ControlVector, StateVector
-from mjxgrad.task import optional_pytree
 
 Index = Int[Array, ""]
 

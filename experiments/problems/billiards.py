@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad.objective import ParameterNoise, parameter_noise
+from mjxgrad.objective.task import InScene, finite_cost
 from mjxgrad.rollouts import Trajectory, initial_state, rollout
 from mjxgrad.scene import load_scene
-from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks import scene_path
 
 _PLACE = (-1.0, -1.0)  # of the knocked ball, from which its joints count (m)

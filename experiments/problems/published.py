@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.task import Outcome, Policy, Task
+from mjxgrad.objective.task import Outcome, Policy, Task
 
 
 class QuadraticCost(eqx.Module):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from experiments.problems import published
 from mjxgrad.contact import Softness
-from mjxgrad.policy import linear_policy
+from mjxgrad.objective.policy import linear_policy
 from mjxgrad.rollouts import State, Trajectory, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks import ActionTask, scene_path

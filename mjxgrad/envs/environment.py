@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
+from mjxgrad.objective.task import InScene, optional_pytree
 from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient
-from mjxgrad.task import InScene, optional_pytree
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """From a key and a scene to one with other friction, masses, gains, by `scene.with_model`."""

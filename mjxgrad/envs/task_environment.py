@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.envs.environment import Environment, EnvState
+from mjxgrad.objective.task import SceneTask
 from mjxgrad.rollouts import State, Trajectory
-from mjxgrad.task import SceneTask
 
 Memory = dict[str, Array]
 

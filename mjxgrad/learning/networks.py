@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.policy import FINAL_SCALE
+from mjxgrad.objective.policy import FINAL_SCALE
 
 
 class Network(eqx.Module):

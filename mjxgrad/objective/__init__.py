@@ -1,8 +1,10 @@
-"""What an estimator sees: a value under noise, the score of that noise, and both by the noisy quantity."""
+"""Objectives: what costs (tasks), what chooses controls (policies), and noise with its score, as an estimator sees them."""
 
 from mjxgrad.objective.actions import ActionNoise, ClosedLoop, OpenLoop, closed_loop, open_loop
 from mjxgrad.objective.base import Differentiated, Objective
 from mjxgrad.objective.parameters import ParameterNoise, as_vector, flattened, of_vector, parameter_noise
+from mjxgrad.objective.policy import linear_policy, mlp_policy
+from mjxgrad.objective.task import Outcome, SceneTask, Task
 
 __all__ = [
     "ActionNoise",
@@ -10,10 +12,15 @@ __all__ = [
     "Differentiated",
     "Objective",
     "OpenLoop",
+    "Outcome",
     "ParameterNoise",
+    "SceneTask",
+    "Task",
     "as_vector",
     "closed_loop",
     "flattened",
+    "linear_policy",
+    "mlp_policy",
     "of_vector",
     "open_loop",
     "parameter_noise",

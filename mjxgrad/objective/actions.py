@@ -22,7 +22,7 @@ from mjxgrad.objective.base import (
     value_and_gradient,
 )
 from mjxgrad.objective.parameters import flattened
-from mjxgrad.task import Outcome, Task, as_pytree
+from mjxgrad.objective.task import Outcome, Task, as_pytree
 
 
 class ActionNoise(Objective):

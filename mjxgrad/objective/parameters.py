@@ -21,7 +21,7 @@ from mjxgrad.objective.base import (
     unchanged,
     value_and_gradient,
 )
-from mjxgrad.task import as_pytree
+from mjxgrad.objective.task import as_pytree
 
 
 class ParameterNoise(Objective):

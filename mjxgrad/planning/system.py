@@ -17,10 +17,10 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Smoothing, step
-from mjxgrad.task import as_pytree
 
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]

@@ -1,6 +1,6 @@
 """Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and what another needs."""
 
-from mjxgrad.task import Outcome, SceneTask, Task
+from mjxgrad.objective.task import Outcome, SceneTask, Task
 from mjxgrad.tasks.action_task import ActionTask, scene_path
 from mjxgrad.tasks.ball_wall import BallWall, ball_wall, wall_softness
 from mjxgrad.tasks.hopper import hopper

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.task import Policy, SceneTask
+from mjxgrad.objective.task import Policy, SceneTask
 
 # Beside the package in a checkout, inside it when installed from a wheel.
 _FOLDERS = (Path(__file__).parents[2] / "mjcf", Path(__file__).parents[1] / "mjcf")

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ParameterNoise, parameter_noise
+from mjxgrad.objective.task import InScene, finite_cost
 from mjxgrad.rollouts import Trajectory, initial_state, rollout
 from mjxgrad.scene import load_scene
-from mjxgrad.task import InScene, finite_cost
 from mjxgrad.tasks.action_task import scene_path
 
 # The knob is the wall alone: with the floor softened as well, the ball would sink and slide farther, too.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjxgrad.policy import linear_policy
+from mjxgrad.objective.policy import linear_policy
 from mjxgrad.rollouts import State, Trajectory, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import ActionTask

@@ -22,9 +22,9 @@ from mjxgrad._mjx import mjx
 from mjxgrad.batched import device
 from mjxgrad.native.derivative import to_coordinates, to_tangent
 from mjxgrad.native.engine import engine_of
+from mjxgrad.objective.task import finite_cost
 from mjxgrad.rollouts import State, Trajectory, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.task import finite_cost
 
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")

@@ -28,10 +28,10 @@ from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
+from mjxgrad.objective.task import SceneTask
 from mjxgrad.rollouts import Engine, Trajectory, initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Gradient
-from mjxgrad.task import SceneTask
 from mjxgrad.verdict.check import Cost, Source, _outcomes
 from mjxgrad.verdict.motions import half_range
 from mjxgrad.verdict.moving import CONTACT_FIELDS, compiler_options

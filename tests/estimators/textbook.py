@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from mjxgrad import estimators
 from mjxgrad.estimators import GradientEstimate
-from mjxgrad.task import Outcome
+from mjxgrad.objective.task import Outcome
 from mjxgrad.tasks import Task
 
 STDDEV = 0.1

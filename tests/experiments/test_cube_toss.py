@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from tests.rollouts.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
 
 import mjxgrad as mg
 from experiments.cube_toss import Course, Outcome, Point, cube_toss, fastest, substepped_step, verdict
 from mjxgrad.rollouts.state import data_of
+from tests.rollouts.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
 
 REFERENCE = np.array([0.5, 0.5, 0.5])
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
+from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
-from mjxgrad.task import as_pytree
 
 # The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend
 # little on the state; the choice that mattered most among initialisations in Andrychowicz et al. (below).

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.policy import Affine
+from mjxgrad.objective.policy import Affine
 from mjxgrad.rollouts import State
 from tests.estimators import textbook
 
