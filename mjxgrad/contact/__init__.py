@@ -1,4 +1,4 @@
-"""What is known of a contact or limit without stepping: who can touch, the law of its force, how soft it is, where it rests."""
+"""Contacts: which geoms can touch and where they do, the law of the force, how soft it is, where a body rests."""
 
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
