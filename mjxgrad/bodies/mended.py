@@ -11,6 +11,7 @@ uses MJX beside this library. Values are MJX's to the bit but where a guard acts
 - `support.wrap`: see `wrapping`, whose values are those of C MuJoCo.
 - `math.quat_to_axis_angle`: axis and angle apart have no derivative at rest, so that servos lost theirs. Rounding differs.
 - `math.safe_div`, `ray._ray_quad`: rays that run along a face, or miss a ball, have a distance without derivative.
+- `ray.ray`: fails in a scene without materials.
 """
 
 import importlib.util
@@ -18,11 +19,13 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjxgrad._mjx import mjx
 from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.bodies import spatial, wrapping
 
@@ -65,6 +68,12 @@ def _ray_quad(a: _Scalar, b: _Scalar, c: _Scalar) -> tuple[_Scalar, _Scalar]:
     return tuple(jnp.where(is_real & (x >= 0), x, jnp.inf) for x in found)  # pyright: ignore[reportReturnType]
 
 
+def _cast(ray: Callable, model: mjx.Model, *others: Any, **options: Any) -> Any:
+    """Cast a ray in a scene that need have no material: MJX looks one up for every geom."""
+    none = model if len(model.mat_rgba) else model.replace(mat_rgba=jnp.ones((1, 4)))
+    return ray(none, *others, **options)
+
+
 # Nothing in these modules asks for more than the product of axis and angle.
 _math = copy_of("math", quat_to_axis_angle=lambda q: (spatial.logarithm(q), 1.0), safe_div=_safe_div)
 _support = copy_of(
@@ -73,7 +82,9 @@ _support = copy_of(
 _support.wrap = partial(wrapping.wrap, _support.wrap_circle)
 _smooth = copy_of("smooth", math=_math, support=_support)
 _forward = copy_of("forward", support=_support)
-_sensor = copy_of("sensor", ray=copy_of("ray", math=_math, _ray_quad=_ray_quad), smooth=_smooth, support=_support)
+_ray = copy_of("ray", math=_math, _ray_quad=_ray_quad)
+_ray.ray = partial(_cast, _ray.ray)
+_sensor = copy_of("sensor", ray=_ray, smooth=_smooth, support=_support)
 
 tendon, tendon_armature, tendon_bias = _smooth.tendon, _smooth.tendon_armature, _smooth.tendon_bias
 transmission, fwd_actuation, euler = _smooth.transmission, _forward.fwd_actuation, _forward.euler

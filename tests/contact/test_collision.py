@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import kinematics
 from mjxgrad.contact.collision import collide, slot_geoms
@@ -164,3 +165,20 @@ def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
     np.testing.assert_allclose(
         np.sort(few, axis=0), np.sort(every[np.argsort(every[:, 0])[:2]], axis=0), rtol=0, atol=1e-14
     )
+
+
+@pytest.mark.parametrize("kind", ['type="box" size=".1 .2 .05"', 'type="mesh" mesh="block"'])
+def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
+    """A block lies 3 mm deep in another that is larger; the four corners, in C's order after sorting."""
+    scene = mg.load_scene(f"""<mujoco><asset><mesh name="block"
+      vertex="-.1 -.2 -.05 .1 -.2 -.05 -.1 .2 -.05 .1 .2 -.05 -.1 -.2 .05 .1 -.2 .05 -.1 .2 .05 .1 .2 .05"/></asset>
+      <worldbody><geom type="box" size=".5 .5 .1"/><body pos=".02 .03 .147"><freejoint/><geom {kind}/></body></worldbody>
+    </mujoco>""")
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    found = mg.forward(scene.model, scene.data)._impl.contact
+    acts = np.asarray(found.dist) < 0
+    ours, theirs = np.asarray(found.pos)[acts].round(9), data.contact.pos.round(9)
+    assert len(ours) == len(theirs) == 4
+    np.testing.assert_allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], atol=1e-8)
+    np.testing.assert_allclose(np.asarray(found.dist)[acts], data.contact.dist, atol=1e-9)
