@@ -91,8 +91,9 @@ def learn(
         log: called after every `log_every` updates with their means: `to_csv("run.csv")`, or for a tracker
             `lambda update, metrics: wandb.log(metrics, step=update)`.
         log_every: updates in one program; between them are logs and checkpoints.
-        checkpoint: file to go on from if it is there, and to write after every `log_every` updates. The same settings,
-            environment and key are needed; the result is that of an uninterrupted run to the bit, but for `seconds`.
+        checkpoint: file to go on from if it is there, and to write after every `log_every` updates. The same settings, the same
+            environment in numbers and code, and the same key are needed; the result is that of an uninterrupted run to the bit,
+            but for `seconds`.
 
     Raises:
         ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is of another run.
@@ -126,11 +127,12 @@ def learn(
     numbers = np.broadcast_to(numbers, (*shape, *numbers.shape[key.ndim :]))
     start = jit(lambda arrays, numbers: of_each(begin, arrays)(jax.random.wrap_key_data(numbers, impl=kind)))
     learner = compile_once(start.lower(arrays, numbers))(arrays, numbers)
-    found = jax.eval_shape(lambda arrays, learner: of_each(update, arrays)(learner)[1], arrays, learner)
+    one = jax.jit(lambda arrays, learner: of_each(update, arrays)(learner)).trace(arrays, learner)
+    found = one.out_info[1]
     found["seconds"] = jax.ShapeDtypeStruct(shape, np.float64)
     history = {name: np.zeros((0, *x.shape), x.dtype) for name, x in found.items()}
     path = None if checkpoint is None else Path(checkpoint)
-    fingerprint = _fingerprint(environments, settings, num_updates, key)
+    fingerprint = {} if path is None else _fingerprint(environments, settings, num_updates, key, one.lower().as_text())
     if path is not None and path.is_file():
         learner, history = checkpoints.load(path, (learner, history), fingerprint)
         learner = place(learner)
@@ -143,17 +145,29 @@ def learn(
         return compile_once(jit(run).lower(arrays, learner))
 
     is_first = jax.process_index() == 0
-    while (done := int(learner.num_updates.max())) < num_updates:
-        count = min(log_every, num_updates - done)
-        program, start_time = several(count), time.perf_counter()
-        learner, found = jax.block_until_ready(program(arrays, learner))
-        seconds = np.full((count, *shape), (time.perf_counter() - start_time) / count)
-        found = {name: np.asarray(values) for name, values in found.items()} | {"seconds": seconds}
-        history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
-        if path is not None and is_first:
+    on_disk = done = int(learner.num_updates.max())
+
+    def save() -> None:
+        nonlocal on_disk
+        if path is not None and is_first and done > on_disk:
             checkpoints.save(path, (learner, history), fingerprint)
-        if log is not None and is_first:
-            log(int(learner.num_updates.max()), {name: _mean(values) for name, values in found.items()})
+            on_disk = done
+
+    try:
+        while done < num_updates:
+            count = min(log_every, num_updates - done)
+            program, start_time = several(count), time.perf_counter()
+            learner, found = jax.block_until_ready(program(arrays, learner))
+            seconds = np.full((count, *shape), (time.perf_counter() - start_time) / count)
+            found = {name: np.asarray(values) for name, values in found.items()} | {"seconds": seconds}
+            history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
+            done += count
+            save()
+            if log is not None and is_first:
+                log(done, {name: _mean(values) for name, values in found.items()})
+    finally:
+        # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
+        save()
     return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
 
 
@@ -243,7 +257,7 @@ def _mean(values: np.ndarray) -> float:
 
 
 def _fingerprint(
-    environments: Sequence[Environment], settings: Settings, num_updates: int, key: Key[Array, "*seeds"]
+    environments: Sequence[Environment], settings: Settings, num_updates: int, key: Key[Array, "*seeds"], program: str
 ) -> dict[str, Any]:
     """Return what must agree between a checkpoint and the run that goes on from it."""
     return {
@@ -252,4 +266,6 @@ def _fingerprint(
         "environment": type(environments[0]).__qualname__,
         "numbers of the environment": checkpoints.digest(eqx.filter(environments, eqx.is_array)),
         "key": checkpoints.digest(key),
+        # A class of the same name may have other code: its rewards are in the text of the lowered update.
+        "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
     }

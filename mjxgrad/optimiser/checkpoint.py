@@ -77,7 +77,7 @@ def digest(tree: PyTree) -> str:
 
 def _difference(name: str, there: Any, here: Any) -> str:
     explanations = {
-        "program": "objective, estimator, optimiser, method or versions of the libraries",
+        "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
         "arrays": "arrays in objective or method",
         "start": "params or key",
     }

@@ -63,6 +63,40 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
 
 
+def _judged_by(reward):
+    """A class whose name is always the same, with the code that it is given for its reward."""
+
+    class Judged(CartPole):
+        def rewards(self, before, action, after, memory):
+            return {"speed": reward(after.qvel[0])}
+
+    return Judged
+
+
+def test_a_checkpoint_of_another_reward_is_refused(cartpole, key, tmp_path):
+    """Same name, same numbers, other code: what was learned for the old reward is not the answer for the new one."""
+    learn = functools.partial(learning.learn, key=key, num_updates=1, settings=SMALL, checkpoint=tmp_path / "run")
+    learn(_judged_by(lambda speed: speed)(cartpole.scene))
+    with pytest.raises(ValueError, match=r"of the same run, got .* of one with other settings: .*environment"):
+        learn(_judged_by(lambda speed: -speed)(cartpole.scene))
+
+
+def test_an_interruption_in_the_middle_of_a_save_loses_nothing(cartpole, key, tmp_path, monkeypatch):
+    """Ctrl-C at the first time that the file is written: it is written again on the way out."""
+    sync, told = os.fsync, []
+
+    def interrupted(handle):
+        monkeypatch.setattr("os.fsync", sync)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", interrupted)
+    learn = functools.partial(learning.learn, cartpole, key, num_updates=2, log_every=1, settings=SMALL)
+    with pytest.raises(KeyboardInterrupt):
+        learn(checkpoint=tmp_path / "run")
+    learn(checkpoint=tmp_path / "run", log=lambda update, metrics: told.append(update))
+    assert told == [2]
+
+
 class Cornered(CartPole):
     """Its reward has an infinite slope where the action is zero, which the first window's first environment begins with."""
 
