@@ -7,6 +7,7 @@ from mjxgrad.bodies import set_const
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
+from mjxgrad.loop import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.objective import (
     Objective,
     SceneTask,
@@ -16,7 +17,6 @@ from mjxgrad.objective import (
     open_loop,
     parameter_noise,
 )
-from mjxgrad.optimiser import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.rollouts import (
     DivergedError,
     Linearisation,

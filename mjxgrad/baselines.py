@@ -19,22 +19,25 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
+from mjxgrad.loop.descent import Carry, Descent, RunOptions
+from mjxgrad.loop.result import Optimisation, Record
+from mjxgrad.loop.run import run
 from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise
 from mjxgrad.objective.base import as_objective
-from mjxgrad.optimiser import Method, Optimisation, Record, RunOptions, run
 
 __all__ = ["cross_entropy", "mppi", "predictive_sampling"]
 
 Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tuple[Array, Array]]
 
 
-class Population(Method):
+class Population(Descent):
     """Draw candidates, roll them out, move; the state is the width of the search, at the start `stddev`.
 
     `move` goes from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
     point and width. A step is taken if at least `least_finite` candidates are finite; the present point may be the first.
     """
 
+    options: RunOptions
     objective: Objective
     stddev: Float[Array, " dim"]
     move: Move = eqx.field(static=True)
@@ -42,23 +45,22 @@ class Population(Method):
     least_finite: int = eqx.field(static=True, default=2)
     has_present: bool = eqx.field(static=True, default=False)
 
-    def init(self, params: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    def init_state(self, params: Float[Array, " dim"]) -> Float[Array, " dim"]:
         return self.stddev.astype(params.dtype)
 
-    def advance(
-        self, params: Float[Array, " dim"], state: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
-    ) -> tuple[Float[Array, " dim"], Float[Array, " dim"], Record]:
-        search_key, rollout_key = jax.random.split(key)
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        params, width = carry.params, carry.state
+        search_key, rollout_key = jax.random.split(jax.random.fold_in(carry.key, index))
         objective = self.objective.sized_for(params)
         directions = jax.random.normal(search_key, (self.num_samples, params.size), params.dtype)
-        at = params + state * (directions.at[0].set(0) if self.has_present else directions)
+        at = params + width * (directions.at[0].set(0) if self.has_present else directions)
         rollout_keys = jax.random.split(rollout_key, self.num_samples)
         costs = jax.vmap(objective.value)(at, jax.vmap(lambda one: without_action_noise(objective, one))(rollout_keys))
         is_finite = jnp.isfinite(costs)
         is_taken = is_finite.sum() >= self.least_finite
-        new, stddev = self.move(params, state, at, jnp.where(is_finite, costs, jnp.inf))
-        new, stddev = jnp.where(is_taken, new, params).astype(params.dtype), jnp.where(is_taken, stddev, state)
-        return new, stddev, _record(costs, is_finite, jnp.linalg.norm(new - params), is_taken)
+        new, stddev = self.move(params, width, at, jnp.where(is_finite, costs, jnp.inf))
+        new, stddev = jnp.where(is_taken, new, params).astype(params.dtype), jnp.where(is_taken, stddev, width)
+        return self.moved(carry, index, new, stddev, _record(costs, is_finite, jnp.linalg.norm(new - params), is_taken))
 
 
 def cross_entropy(
@@ -121,8 +123,8 @@ def cross_entropy(
         new = keep * mean + (1 - keep) * elite.mean(axis=0)
         return new, jnp.maximum(keep * stddev + (1 - keep) * elite.std(axis=0), min_stddev)
 
-    method = Population(objective, width, move, num_samples, least_finite=num_elite)
-    return run(method, params, key, RunOptions(num_steps, **options))
+    method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=num_elite)
+    return run(method, **method.begun(params, key))
 
 
 def mppi(
@@ -168,8 +170,8 @@ def mppi(
         # Weighting the offsets, not the candidates: equal to rounding, and exact where a weight of one is left.
         return mean + jax.nn.softmax(-costs / scale) @ (at - mean), stddev
 
-    method = Population(objective, width, move, num_samples)
-    return run(method, params, key, RunOptions(num_steps, **options))
+    method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples)
+    return run(method, **method.begun(params, key))
 
 
 def predictive_sampling(
@@ -196,8 +198,10 @@ def predictive_sampling(
     def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
         return at[jnp.argmin(costs)], stddev
 
-    method = Population(objective, width, move, num_samples, least_finite=1, has_present=True)
-    return run(method, params, key, RunOptions(num_steps, **options))
+    method = Population(
+        RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=1, has_present=True
+    )
+    return run(method, **method.begun(params, key))
 
 
 def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:

@@ -21,7 +21,7 @@ ORDER = (
     ("rollouts",),
     ("objective",),
     ("estimators",),
-    ("optimiser",),
+    ("loop",),
     ("baselines",),
     ("diagnostics", "identification", "planning"),
     ("tasks",),

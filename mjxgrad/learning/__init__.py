@@ -1,8 +1,10 @@
 """Policies learned through contact: short windows with a value function, by first order, zeroth order, or a mixture."""
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
-from mjxgrad.learning.learn import Learned, Log, learn, to_csv
-from mjxgrad.learning.learner import Learner, Policy, Settings, apg
+from mjxgrad.learning.learn import Learned, learn, to_csv
+from mjxgrad.learning.learner import Learner, Policy
+from mjxgrad.learning.settings import Settings, apg
+from mjxgrad.loop import Log
 
 __all__ = [
     "Evaluation",

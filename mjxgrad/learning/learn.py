@@ -19,28 +19,20 @@ References:
 """
 
 import csv
-import functools
 import os
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Float, Key, UInt32
 
-from mjxgrad._programs import compile_once
-from mjxgrad.batched.device import all_devices
 from mjxgrad.envs import Environment
-from mjxgrad.learning.learner import Learner, Policy, Settings, begin
-from mjxgrad.learning.update import update
-from mjxgrad.optimiser import checkpoint as checkpoints
-
-Log = Callable[[int, dict[str, float]], Any]
+from mjxgrad.learning.learner import ActorCritic, Learner, Policy
+from mjxgrad.learning.settings import Settings
+from mjxgrad.loop.run import Log, run, side_by_side
 
 
 class Learned(eqx.Module):
@@ -104,71 +96,26 @@ def learn(
             raise ValueError(f"{name} must be at least 1, got {number}")
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.wrap_key_data(key)
-    place, jit = _on_all_devices()
-    # As arguments, the environments' numbers are no part of the program: one that is stiffer needs no other.
-    is_one = isinstance(environment, Environment)
-    environments = [environment] if is_one else list(environment)
+    environments = [environment] if isinstance(environment, Environment) else list(environment)
     if not environments:
         raise ValueError("environment must be one or several, got an empty sequence")
-    own, common, structure = _apart(environments)
-    arrays = place((own, common))
-
-    of_each = functools.partial(
-        _of_each,
-        structure=structure,
-        num_environments=None if is_one else len(environments),
-        has_seeds=bool(key.ndim),
-        settings=settings,
-        num_updates=num_updates,
+    method, axes = side_by_side([ActorCritic(one, settings, num_updates) for one in environments])
+    shape, over = key.shape, [None] * key.ndim
+    if not isinstance(environment, Environment):
+        shape, over = (len(environments), *shape), [axes, *over]
+    progress = run(
+        method,
+        jnp.broadcast_to(key, shape),
+        num_steps=num_updates,
+        segment=log_every,
+        over=over,
+        log=log,
+        checkpoint=None if checkpoint is None else Path(checkpoint),
+        on_all_devices=True,
     )
-    shape = key.shape if is_one else (len(environments), *key.shape)
-    # As numbers on the host, a key is the same in all processes.
-    numbers, kind = np.asarray(jax.random.key_data(key)), jax.random.key_impl(key)
-    numbers = np.broadcast_to(numbers, (*shape, *numbers.shape[key.ndim :]))
-    start = jit(lambda arrays, numbers: of_each(begin, arrays)(jax.random.wrap_key_data(numbers, impl=kind)))
-    learner = compile_once(start.lower(arrays, numbers))(arrays, numbers)
-    one = jax.jit(lambda arrays, learner: of_each(update, arrays)(learner)).trace(arrays, learner)
-    found = one.out_info[1]
-    found["seconds"] = jax.ShapeDtypeStruct(shape, np.float64)
-    history = {name: np.zeros((0, *x.shape), x.dtype) for name, x in found.items()}
-    path = None if checkpoint is None else Path(checkpoint)
-    fingerprint = {} if path is None else _fingerprint(environments, settings, num_updates, key, one.lower().as_text())
-    if path is not None and path.is_file():
-        learner, history = checkpoints.load(path, (learner, history), fingerprint)
-        learner = place(learner)
-
-    @functools.lru_cache
-    def several(count: int) -> Callable[[Any, Learner], tuple[Learner, dict[str, Array]]]:
-        def run(arrays: Any, learner: Learner) -> tuple[Learner, dict[str, Array]]:
-            return jax.lax.scan(lambda now, _: of_each(update, arrays)(now), learner, length=count)
-
-        return compile_once(jit(run).lower(arrays, learner))
-
-    is_first = jax.process_index() == 0
-    on_disk = done = int(learner.num_updates.max())
-
-    def save() -> None:
-        nonlocal on_disk
-        if path is not None and is_first and done > on_disk:
-            checkpoints.save(path, (learner, history), fingerprint)
-            on_disk = done
-
-    try:
-        while done < num_updates:
-            count = min(log_every, num_updates - done)
-            program, start_time = several(count), time.perf_counter()
-            learner, found = jax.block_until_ready(program(arrays, learner))
-            seconds = np.full((count, *shape), (time.perf_counter() - start_time) / count)
-            found = {name: np.asarray(values) for name, values in found.items()} | {"seconds": seconds}
-            history = {name: np.concatenate([before, found[name]]) for name, before in history.items()}
-            done += count
-            save()
-            if log is not None and is_first:
-                log(done, {name: _mean(values) for name, values in found.items()})
-    finally:
-        # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
-        save()
-    return Learned(learner.policy, {name: jnp.asarray(values) for name, values in history.items()}, learner)
+    seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (num_updates, *shape))
+    history = {name: jnp.asarray(values) for name, values in (progress.found | {"seconds": seconds}).items()}
+    return Learned(progress.carry.policy, history, progress.carry)
 
 
 def to_csv(path: str | os.PathLike[str]) -> Log:
@@ -198,74 +145,3 @@ def to_csv(path: str | os.PathLike[str]) -> Log:
             writer.writerow([step, *metrics.values()])
 
     return log
-
-
-def _of_each(
-    function: Callable,
-    arrays: tuple[Environment, Environment],
-    structure: Environment,
-    num_environments: int | None,
-    has_seeds: bool,
-    **given: Any,
-) -> Callable[[Any], Any]:
-    """Return a function of all policies, environment by environment and seed by seed, from one of an environment and a policy."""
-    own, common = arrays
-
-    def in_one(own: Environment, state: Any) -> Any:
-        one = functools.partial(function, eqx.combine(own, common, structure), **given)
-        return (jax.vmap(one) if has_seeds else one)(state)
-
-    in_all = in_one if num_environments is None else jax.vmap(in_one, axis_size=num_environments)
-    return functools.partial(in_all, own)
-
-
-def _apart(environments: Sequence[Environment]) -> tuple[Environment, Environment, Environment]:
-    """Return arrays that environments have each their own of, stacked, those that all share, and what is no array."""
-    parts = [eqx.partition(one, eqx.is_array) for one in environments]
-    (first, structure), *others = parts
-    if not all(eqx.tree_equal(structure, other) for _, other in others):
-        raise ValueError("environments that learn side by side must differ in numbers alone: learn in each by itself")
-    is_common = jax.tree.map(lambda *x: len(set(map(checkpoints.digest, x))) == 1, *(x for x, _ in parts))
-    common, own = eqx.partition(first, is_common)
-    others = [eqx.filter(x, is_common, inverse=True) for x, _ in others]
-    return jax.tree.map(lambda *x: jnp.stack(x), own, *others), common, structure
-
-
-def _on_all_devices() -> tuple[Callable[[Any], Any], Callable[[Callable], Any]]:
-    """Return how to place arrays, and how to compile what gives arrays, that all devices of all processes are to have."""
-    devices = all_devices()
-    if len(devices) == 1:
-        return lambda tree: tree, jax.jit
-    if jax.process_count() > 1:
-        # Meet before compiling: by how much that differs in time can exceed the deadline for connecting.
-        sync_global_devices("learn")
-    whole = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec())
-
-    def put(x: Array) -> Array:
-        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(put(jax.random.key_data(x)), impl=jax.random.key_impl(x))
-        # From the host: what one process has on a device others cannot always be sent.
-        return jax.device_put(np.asarray(x), whole)
-
-    return functools.partial(jax.tree.map, put), functools.partial(jax.jit, out_shardings=whole)
-
-
-def _mean(values: np.ndarray) -> float:
-    """Return the mean of what is a number; NaN if nothing is."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if known.size else float("nan")
-
-
-def _fingerprint(
-    environments: Sequence[Environment], settings: Settings, num_updates: int, key: Key[Array, "*seeds"], program: str
-) -> dict[str, Any]:
-    """Return what must agree between a checkpoint and the run that goes on from it."""
-    return {
-        "settings": repr(settings),
-        "num_updates": num_updates,
-        "environment": type(environments[0]).__qualname__,
-        "numbers of the environment": checkpoints.digest(eqx.filter(environments, eqx.is_array)),
-        "key": checkpoints.digest(key),
-        # A class of the same name may have other code: its rewards are in the text of the lowered update.
-        "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
-    }

@@ -1,4 +1,7 @@
-"""What learns and how: settings, a policy, and all that an update needs to know."""
+"""SHAC and its kin as a method of the loop: a window in every environment, a step of the policy, a fit of the value function.
+
+Another learner is another file like this: a carry with all that an update needs, and a `Method` that begins it and updates it.
+"""
 
 import dataclasses
 from typing import Any
@@ -9,101 +12,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
+from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.estimators.rules import Consistent, FixedAlpha, Rule
 from mjxgrad.learning.networks import Network, Normaliser, make_actor, make_critic
+from mjxgrad.learning.settings import Settings
+from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, window_gradients
+from mjxgrad.loop.run import Method
 
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How to learn; the defaults are SHAC's.
-
-    Attributes:
-        num_environments: side by side.
-        window: steps of each environment per update.
-        discount: per step.
-        trace: λ of the value function's targets.
-        rule: from the evidence of a step and action to the weight of its first-order gradient. It is asked for every one of
-            them: one that sees bias by chance in a twentieth brings in much noise, so the default is surer.
-        stddev: of the noise on actions before their squashing, in the first and in the last update.
-        actor_layers: hidden sizes of the policy.
-        actor_scale: what the first gains of its hidden layers are multiplied with.
-        critic_layers: hidden sizes of the value function.
-        actor_rate: learning rate, which decreases linearly to zero.
-        actor_decay: what the rate is multiplied with at every update instead, unless None.
-        critic_rate: of the value function, likewise.
-        critic_iterations: passes over a window's states per update.
-        critic_batches: parts of such a pass.
-        target_rate: share by which the target value function follows the value function.
-        largest_norm: to which gradients are clipped.
-        largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
-            zeroth-order one over environments: at 0.3 its variance is at most a tenth of that. Infinity shortens none.
-        has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
-        is_episodic: whether every window begins anew.
-    """
-
-    num_environments: int = 64
-    window: int = 32
-    discount: float = 0.99
-    trace: float = 0.95
-    rule: Rule = dataclasses.field(default_factory=lambda: Consistent(failure_probability=1e-3))
-    stddev: tuple[float, float] = (0.4, 0.1)
-    actor_layers: tuple[int, ...] = (128, 64, 32)
-    actor_scale: float = 1.0
-    critic_layers: tuple[int, ...] = (64, 64)
-    actor_rate: float = 2e-3
-    actor_decay: float | None = None
-    critic_rate: float = 2e-3
-    critic_iterations: int = 16
-    critic_batches: int = 4
-    target_rate: float = 0.8
-    largest_norm: float = 1.0
-    largest_sample: float = 0.3
-    has_critic: bool = True
-    is_episodic: bool = False
-
-    def __post_init__(self):
-        for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("discount", "trace", "target_rate"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
-        if not self.largest_sample > 0:
-            raise ValueError(f"largest_sample must be positive, got {self.largest_sample}")
-        if min(self.stddev) <= 0:
-            raise ValueError(f"stddev must be positive at the beginning and at the end, got {self.stddev}")
-        if (self.num_environments * self.window) % self.critic_batches:
-            raise ValueError(
-                f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
-                f"got {self.critic_batches}"
-            )
-
-
-def apg(**changes: Any) -> Settings:
-    """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
-
-    Windows follow one another. Two things are not as there. The noise, from 0.07, is not learned, but falls linearly to 0.01.
-    Gradients are clipped as a whole, not number by number, and long derivatives are shortened: that stands larger rates.
-
-    Args:
-        changes: settings that are to be others.
-
-    References:
-        Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
-        (`brax/training/agents/apg`).
-    """
-    settings = {
-        "discount": 1.0,
-        "rule": FixedAlpha(1.0),
-        "stddev": (0.07, 0.01),
-        "actor_layers": (256, 128),
-        "actor_scale": 0.01,
-        "actor_rate": 1e-4,
-        "actor_decay": 0.997,
-        "has_critic": False,
-    }
-    return Settings(**(settings | changes))
+Metrics = dict[str, Float[Array, ""]]
 
 
 class Policy(eqx.Module):
@@ -150,45 +66,183 @@ class Learner(eqx.Module):
     key: PRNGKeyArray
 
 
-def begin(environment: Environment, key: PRNGKeyArray, *, settings: Settings, num_updates: int) -> Learner:
-    """Draw networks and starts."""
-    actor_key, critic_key, start_key, spread_key, model_key, next_key = jax.random.split(key, 6)
-    count = settings.num_environments
-    model_keys = jax.random.split(model_key, count)
-    environments = starts(environment, model_keys, start_key)
-    if not settings.is_episodic:
-        # Otherwise all episodes would end together, and an update see only one part of them.
-        spread = jax.random.randint(spread_key, (count,), 0, environment.episode_length)
-        environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
-    num_observations = environments.obs.shape[-1]
-    actor = make_actor(
-        num_observations, environment.num_actions, settings.actor_layers, actor_key, settings.actor_scale
-    )
-    # Without a value function it is one that is zero and stays so.
-    scale = 1.0 if settings.has_critic else 0.0
-    critic = make_critic(num_observations, settings.critic_layers, critic_key, final_scale=scale)
-    actor_optimiser, critic_optimiser = optimisers(settings, num_updates)
-    return Learner(
-        policy=Policy(actor, Normaliser.make(num_observations).with_more(environments.obs)),
-        critic=critic,
-        target=critic,
-        actor_moments=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
-        critic_moments=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
-        environments=environments,
-        model_keys=model_keys,
-        episode_return=jnp.zeros(count),
-        num_updates=jnp.zeros((), jnp.int32),
-        key=next_key,
-    )
+class ActorCritic(Method):
+    """The method: its carry is a `Learner`, its step an update.
 
+    Attributes:
+        environment: to learn in.
+        settings: how.
+        num_updates: in all, for what decreases from the first to the last.
+    """
 
-def starts(environment: Environment, model_keys: Key[Array, " environments"], key: PRNGKeyArray) -> EnvState:
-    """Begin an episode in each copy."""
+    environment: Environment
+    settings: Settings
+    num_updates: int
 
-    def start(model_key: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:
-        return environment.randomised(model_key).reset(key)
+    def init(self, start: PRNGKeyArray) -> Learner:
+        """Draw networks and starts."""
+        actor_key, critic_key, start_key, spread_key, model_key, next_key = jax.random.split(start, 6)
+        settings, count = self.settings, self.settings.num_environments
+        model_keys = jax.random.split(model_key, count)
+        environments = self._starts(model_keys, start_key)
+        if not settings.is_episodic:
+            # Otherwise all episodes would end together, and an update see only one part of them.
+            spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
+            environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
+        num_seen, num_actions = environments.obs.shape[-1], self.environment.num_actions
+        actor = make_actor(num_seen, num_actions, settings.actor_layers, actor_key, settings.actor_scale)
+        # Without a value function it is one that is zero and stays so.
+        scale = 1.0 if settings.has_critic else 0.0
+        critic = make_critic(num_seen, settings.critic_layers, critic_key, final_scale=scale)
+        actor_optimiser, critic_optimiser = optimisers(settings, self.num_updates)
+        return Learner(
+            policy=Policy(actor, Normaliser.make(num_seen).with_more(environments.obs)),
+            critic=critic,
+            target=critic,
+            actor_moments=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
+            critic_moments=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
+            environments=environments,
+            model_keys=model_keys,
+            episode_return=jnp.zeros(count),
+            num_updates=jnp.zeros((), jnp.int32),
+            key=next_key,
+        )
 
-    return jax.vmap(start)(model_keys, jax.random.split(key, len(model_keys)))
+    def step(self, carry: Learner, index: Int[Array, ""]) -> tuple[Learner, Metrics]:
+        """Do one update; what it finds is described in `learn`."""
+        settings, learner, environments = self.settings, carry, carry.environments
+        noise_key, start_key, critic_key, next_key = jax.random.split(learner.key, 4)
+        first, last = settings.stddev
+        stddev = first + (last - first) * learner.num_updates / self.num_updates
+        if settings.is_episodic:
+            environments = self._starts(learner.model_keys, start_key)
+        window, environments, gradients = self._windows(learner, environments, noise_key, stddev)
+        policy, actor_moments, found = self._improve(learner, window, gradients)
+        critic, target, critic_moments, critic_loss = (
+            learner.critic,
+            learner.target,
+            learner.critic_moments,
+            jnp.zeros(()),
+        )
+        if settings.has_critic:
+            critic, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
+            target = jax.tree.map(lambda old, new: old + settings.target_rate * (new - old), learner.target, critic)
+        so_far = jnp.zeros_like(learner.episode_return) if settings.is_episodic else learner.episode_return
+        episode_return, ended = _episodes(window, so_far)
+        following = dataclasses.replace(
+            learner,
+            policy=eqx.tree_at(lambda p: p.normaliser, policy, learner.policy.normaliser.with_more(window.obs)),
+            critic=critic,
+            target=target,
+            actor_moments=actor_moments,
+            critic_moments=critic_moments,
+            environments=environments,
+            episode_return=episode_return,
+            num_updates=learner.num_updates + 1,
+            key=next_key,
+        )
+        facts = {
+            "reward": window.rewards.mean(),
+            "ended": window.terminated.any(axis=1).mean(),
+            "diverged": window.metrics["diverged"].sum(),
+            "critic_loss": critic_loss,
+        }
+        return following, {**facts, **ended, **found}
+
+    def identity(self) -> dict[str, Any]:
+        name = type(self.environment).__qualname__
+        return {"settings": repr(self.settings), "num_updates": self.num_updates, "environment": name}
+
+    def _starts(self, model_keys: Key[Array, " environments"], key: PRNGKeyArray) -> EnvState:
+        """Begin an episode in each copy."""
+
+        def start(model_key: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:
+            return self.environment.randomised(model_key).reset(key)
+
+        return jax.vmap(start)(model_keys, jax.random.split(key, len(model_keys)))
+
+    def _windows(
+        self, learner: Learner, environments: EnvState, key: PRNGKeyArray, stddev: Float[Array, ""]
+    ) -> tuple[Window, EnvState, Gradients]:
+        """Run a window everywhere, on all devices, and differentiate what it returns."""
+        shape = (self.settings.num_environments, self.settings.window, self.environment.num_actions)
+        noise = jax.random.normal(key, shape, environments.obs.dtype)
+
+        arrays, structure = eqx.partition(self.environment, eqx.is_array)
+
+        def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
+            arrays, policy, critic, stddev = shared
+            own = eqx.combine(arrays, structure)
+            return window_gradients(
+                own, state, model_key, noise, policy.actor, critic, policy.normaliser, stddev, self.settings.discount
+            )
+
+        # The environment is one of them: closed over, arrays of all devices are refused where each has its part (jax 0.11).
+        shared = (arrays, learner.policy, learner.target, stddev)
+        return over_devices(one, num_shared=1)(shared, environments, learner.model_keys, noise)
+
+    def _improve(
+        self, learner: Learner, window: Window, gradients: Gradients
+    ) -> tuple[Policy, optax.OptState, Metrics]:
+        """Move the policy along the mixture, unless that is not finite; and say what it was made of."""
+        policy = learner.policy
+        gradients, is_shortened = gradients.shortened(self.settings.largest_sample)
+        mixture, weights, evidence = mix(gradients, self.settings.rule)
+
+        def acted(actor: Network) -> Float[Array, "environments steps nu"]:
+            return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(window.obs)
+
+        _, pull_back = jax.vjp(acted, policy.actor)
+        # Down the negative mean return per step, as optimisers take it.
+        (gradient,) = pull_back(-mixture / (self.settings.num_environments * self.settings.window))
+        norm = optax.tree.norm(gradient)
+        is_finite = jnp.isfinite(norm)
+        optimiser, _ = optimisers(self.settings, self.num_updates)
+        new = _stepped(optimiser, gradient, learner.actor_moments, policy.actor)
+        actor, moments = jax.tree.map(
+            lambda x, y: jnp.where(is_finite, x, y), new, (policy.actor, learner.actor_moments)
+        )
+        found = {
+            "alpha": weights.alpha.mean(),
+            "gradient_norm": norm,
+            "first_variance": evidence.first_variance.sum(),
+            "zeroth_variance": evidence.zeroth_variance.sum(),
+            "squared_bias": (evidence.difference_norm**2 - evidence.difference_variance / evidence.real_count).sum(),
+            "not_finite": (~gradients.is_finite).mean(),
+            "shortened": is_shortened.mean(),
+            "skipped": (~is_finite).astype(norm.dtype),
+        }
+        return Policy(actor, policy.normaliser), moments, found
+
+    def _fit_critic(
+        self, learner: Learner, window: Window, key: PRNGKeyArray
+    ) -> tuple[Network, optax.OptState, Float[Array, ""]]:
+        """Fit the value function to the window's targets, in batches of shuffled states."""
+        normaliser = learner.policy.normaliser
+
+        def targets(window: Window) -> Float[Array, " steps"]:
+            return lambda_returns(
+                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, self.settings.trace
+            )
+
+        wanted = jax.vmap(targets)(window).reshape(-1)
+        seen = jax.vmap(normaliser)(window.obs.reshape(len(wanted), -1))
+        _, optimiser = optimisers(self.settings, self.num_updates)
+
+        def loss(critic: Network, seen: Array, wanted: Array) -> Float[Array, ""]:
+            return ((jax.vmap(critic)(seen)[:, 0] - wanted) ** 2).mean()
+
+        def fit(carry: tuple[Network, optax.OptState], rows: Array):
+            critic, moments = carry
+            value, gradient = jax.value_and_grad(loss)(critic, seen[rows], wanted[rows])
+            return _stepped(optimiser, gradient, moments, critic), value
+
+        orders = jax.vmap(lambda k: jax.random.permutation(k, len(wanted)))(
+            jax.random.split(key, self.settings.critic_iterations)
+        )
+        rows = orders.reshape(self.settings.critic_iterations * self.settings.critic_batches, -1)
+        (critic, moments), losses = jax.lax.scan(fit, (learner.critic, learner.critic_moments), rows)
+        return critic, moments, losses[-self.settings.critic_batches :].mean()
 
 
 def optimisers(
@@ -207,3 +261,23 @@ def optimisers(
         actor_rate = optax.exponential_decay(settings.actor_rate, 1, settings.actor_decay)
     critic_rate = optax.linear_schedule(settings.critic_rate, 0.0, num_updates * per_update)
     return optimiser(actor_rate), optimiser(critic_rate)
+
+
+def _stepped(
+    optimiser: optax.GradientTransformation, gradient: Any, moments: optax.OptState, network: Network
+) -> tuple[Network, optax.OptState]:
+    changes, moments = optimiser.update(gradient, moments)
+    return eqx.apply_updates(network, changes), moments
+
+
+def _episodes(window: Window, so_far: Float[Array, " environments"]) -> tuple[Float[Array, " environments"], Metrics]:
+    """Return what running episodes have returned so far, and the mean of those that ended, NaN if none did."""
+
+    def add(total: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward, is_over = now
+        total = total + reward
+        return jnp.where(is_over, 0.0, total), jnp.where(is_over, total, 0.0)
+
+    so_far, whole = jax.lax.scan(add, so_far, (window.rewards.T, window.done.T))
+    num_ended = window.done.sum()
+    return so_far, {"return": jnp.where(num_ended > 0, whole.sum() / jnp.maximum(num_ended, 1), jnp.nan)}

@@ -128,7 +128,7 @@ def test_an_interrupted_run_keeps_what_was_learned(tmp_path, monkeypatch):
     def written(*args):
         raise AssertionError("what is finished is learned again")
 
-    monkeypatch.setattr("mjxgrad.optimiser.checkpoint.save", written)
+    monkeypatch.setattr("mjxgrad.loop.checkpoint.save", written)
     assert main(command) == 0
     assert (tmp_path / "learn_cartpole" / "report.html").is_file()
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from mjxgrad import envs
 from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
-from mjxgrad.learning import update as updates
+from mjxgrad.learning import learner
 from mjxgrad.learning.networks import Normaliser, make_actor, make_critic
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, returned, run_window, window_gradients
 
@@ -62,7 +62,7 @@ def test_targets_do_not_look_across_an_end():
 def test_episodes_are_added_up_across_windows():
     """Two environments; the first ends after its second step, having returned 5 before."""
     windows = jax.tree.map(lambda x, y: jnp.stack([x, y]), window_of([1, 2, 3], terminated=[1]), window_of([1, 1, 1]))
-    so_far, found = updates._episodes(windows, jnp.array([5.0, 7.0]))
+    so_far, found = learner._episodes(windows, jnp.array([5.0, 7.0]))
     assert_allclose(so_far, [3, 10])
     assert_allclose(found["return"], 5 + 1 + 2)
 

@@ -78,7 +78,7 @@ def digest(tree: PyTree) -> str:
 def _difference(name: str, there: Any, here: Any) -> str:
     explanations = {
         "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
-        "arrays": "arrays in objective or method",
+        "arrays": "arrays in environment, objective or method",
         "start": "params or key",
     }
     return explanations.get(name, f"{name} was {there} and is {here}")

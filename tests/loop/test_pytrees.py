@@ -9,7 +9,7 @@ import pytest
 
 import mjxgrad as mg
 from tests.estimators import textbook
-from tests.optimiser import problems
+from tests.loop import problems
 
 
 class Gains(eqx.Module):

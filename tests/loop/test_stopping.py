@@ -9,8 +9,8 @@ import optax
 import pytest
 
 import mjxgrad as mg
-from tests.optimiser import problems
-from tests.optimiser.problems import made_up
+from tests.loop import problems
+from tests.loop.problems import made_up
 
 START = jnp.array([0.0, 0.5])
 

@@ -1,5 +1,6 @@
 """What a run gives: where it ended, what it saw on the way, and why it stopped."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.estimators import GradientEstimate, Reason
+from mjxgrad.loop.run import Progress
 
 
 class Stopped(eqx.Enumeration):
@@ -140,6 +142,16 @@ class History(Record):
 
     noise_free_cost: Float[np.ndarray, "..."]
     seconds: Float[np.ndarray, " steps"]
+
+    @classmethod
+    def of(cls, progress: Progress) -> "History":
+        """Put the records together that a descent has found, counts and seconds summed up."""
+        records, noise_free_cost = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), progress.found)
+        fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
+        for name in ("num_rollouts", "num_gradient_rollouts"):
+            # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
+            fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
+        return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(progress.seconds))
 
     def __getitem__(self, steps: slice) -> "History":
         return jax.tree.map(lambda leaf: leaf[..., steps], self)

@@ -8,8 +8,8 @@ import optax
 
 import mjxgrad as mg
 from mjxgrad import estimators
-from tests.optimiser import problems
-from tests.optimiser.problems import made_up
+from tests.loop import problems
+from tests.loop.problems import made_up
 
 
 def test_a_schedule_of_noise_is_followed(key):

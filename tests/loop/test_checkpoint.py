@@ -7,7 +7,7 @@ import optax
 import pytest
 
 import mjxgrad as mg
-from tests.optimiser import problems
+from tests.loop import problems
 
 START = jnp.array([0.0, 0.5])
 KEY = jax.random.key(2)

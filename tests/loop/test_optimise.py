@@ -12,8 +12,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.estimators import Reason
-from tests.optimiser import problems
-from tests.optimiser.problems import CENTRE, CURVATURE, STDDEV, made_up
+from tests.loop import problems
+from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
 
 START = jnp.array([0.0, 0.5])
 SGD = optax.sgd(0.1)

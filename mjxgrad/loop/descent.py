@@ -1,0 +1,204 @@
+"""Descents: methods that improve a vector of parameters, with a history, the best of it, and reasons to stop."""
+
+import dataclasses
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+
+from mjxgrad._arrays import whole
+from mjxgrad._programs import compile_once
+from mjxgrad.estimators.estimate import Reason
+from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
+from mjxgrad.loop.run import Log, Method, Progress, mean
+
+# Progress shows in steps of five per cent; each costs one return from the device.
+NUM_SEGMENTS = 20
+
+# Where nothing was felt and nothing moved, the next step differs by its noise alone. Three draws of it: a jump that one
+# sample in thirty meets goes unseen by three steps of 50 with a chance of 0.6 %.
+STILL_STEPS = 3
+
+
+def _as_path(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+class RunOptions(eqx.Module):
+    """What every run can be told besides its method.
+
+    Attributes:
+        num_steps: at most.
+        evaluate: cost of a point without noise, or any other measure of it; traceable. It is measurement: the rollouts
+            in it are not counted, and nothing but the choice of the best parameters depends on it.
+        evaluate_every: steps between two evaluations. The last point is always evaluated.
+        patience: steps in a row whose estimate is not finite, or whose samples feel nothing (`Reason.nothing_felt`), before
+            the run gives up; if such steps do not move the parameters either, three in a row are enough.
+        log: called after every twentieth of the steps with those done and what `History` has of the last one, the mean over
+            the seeds that took it, and `best_cost`: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
+        checkpoint: file to save the run in, as often, and to resume it from. A resumed run gives, on the same device, bit
+            for bit what the uninterrupted one would have given, its seconds apart.
+        checkpoint_every: twentieths of the steps between two saves. An interrupted run is saved in any case.
+    """
+
+    num_steps: int
+    evaluate: Callable[[Float[Array, " dim"]], Float[Array, ""]] | None = None
+    evaluate_every: int = 10
+    patience: int = 10
+    log: Log | None = None
+    checkpoint: Path | None = eqx.field(default=None, converter=_as_path)
+    checkpoint_every: int = 1
+
+    def __check_init__(self):
+        for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every"):
+            whole(name, getattr(self, name))
+        if self.checkpoint is not None and not self.checkpoint.parent.is_dir():
+            folder = self.checkpoint.parent
+            raise ValueError(f"checkpoint must be in a folder that exists, got {self.checkpoint}; make {folder} first")
+
+
+class Carry(eqx.Module):
+    """One run between two steps.
+
+    Of the steps done, `num_steps`, some were not taken, the last `num_in_a_row` of them in a row; the last `num_still` felt
+    nothing. The noise of a step comes from `key` and its number.
+    """
+
+    params: Float[Array, " dim"]
+    state: PyTree
+    key: PRNGKeyArray
+    best: Best
+    num_steps: Int[Array, ""]
+    num_skipped: Int[Array, ""]
+    num_in_a_row: Int[Array, ""]
+    num_still: Int[Array, ""]
+    stopped: Stopped
+
+
+class Descent(Method):
+    """A method for a vector of parameters: a subclass gives `init_state`, and a `step` that ends in `moved`."""
+
+    options: eqx.AbstractVar[RunOptions]
+
+    @abstractmethod
+    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+        """Return what the method carries from step to step besides the parameters."""
+
+    def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
+        """Return what `run` is to be told besides the method: one start, or one for each key along an axis that there may be."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, params, key))):
+            raise ValueError(
+                "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles itself, and takes "
+                "several seeds by several keys"
+            )
+        key, params = jnp.asarray(key), jnp.asarray(params)
+        if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim > 1:
+            raise ValueError(
+                f"key must come from jax.random.key, with at most one leading axis, got {key.dtype} of shape {key.shape}; "
+                "jax.random.split(jax.random.key(0), num_seeds) gives one per seed"
+            )
+        if not jnp.issubdtype(params.dtype, jnp.floating):
+            raise ValueError(f"params must be floating-point, got {params.dtype}; write 1.0 in place of 1")
+        if params.ndim == 2 and key.shape != params.shape[:1]:
+            raise ValueError(
+                f"params must have a leading axis only where key has the same, got shapes {params.shape} and {key.shape}; "
+                "jax.random.split(key, len(params)) gives a key for each"
+            )
+        if params.ndim not in (1, 2):
+            raise ValueError(
+                f"params must be a vector of shape (dim,), or one per seed, got shape {params.shape}; "
+                "use jnp.atleast_1d for one number, objective.ravel for controls"
+            )
+        return {
+            "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
+            "over": [None] * key.ndim,
+            "segment": math.ceil(self.options.num_steps / NUM_SEGMENTS),
+            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint", "checkpoint_every")},
+        }
+
+    def init(self, start: tuple[Float[Array, " dim"], PRNGKeyArray]) -> Carry:
+        params, key = start
+        nan = jnp.full((), jnp.nan, params.dtype)
+        best = Best(params, nan, nan + jnp.inf, nan)
+        zero, stopped = jnp.zeros((), jnp.int32), jax.tree.map(jnp.asarray, Stopped.running)
+        return Carry(params, self.init_state(params), key, best, zero, zero, zero, zero, stopped)
+
+    def moved(
+        self, carry: Carry, index: Int[Array, ""], params: Float[Array, " dim"], state: PyTree, record: Record
+    ) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        """Return the carry after a step that led to these, and the step's record; nothing changes where a run has stopped.
+
+        Args:
+            carry: before the step.
+            index: number of the step.
+            params: after it; where it could not be taken, as they were, and `record.is_taken` False.
+            state: likewise.
+            record: of it.
+        """
+        options, at, nan = self.options, carry.params, jnp.full((), jnp.nan, carry.params.dtype)
+        noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)
+        if (evaluate := options.evaluate) is not None:
+            is_due = index % options.evaluate_every == 0
+            noise_free = jax.lax.cond(is_due, lambda x: jnp.asarray(evaluate(x), x.dtype), lambda _: nan, at)
+            candidate = Best.measured(at, noise_free)
+        num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
+        num_still = jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0)
+        # The weightiest reason to stop comes last.
+        stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, Stopped.running)
+        enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
+        stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
+        stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
+        num_skipped, best = carry.num_skipped + ~record.is_taken, carry.best.against(candidate)
+        after = Carry(
+            params, state, carry.key, best, carry.num_steps + 1, num_skipped, num_in_a_row, num_still, stopped
+        )
+        # One of several may have stopped before the others.
+        as_it_was, as_it_is = (carry, (Record.blank(at.dtype), nan)), (after, (record, noise_free))
+        return jax.tree.map(lambda old, new: jnp.where(self.is_over(carry), old, new), as_it_was, as_it_is)
+
+    def is_over(self, carry: Carry) -> Bool[Array, "..."]:
+        return carry.stopped != Stopped.running
+
+    def identity(self) -> dict[str, Any]:
+        return {name: getattr(self.options, name) for name in ("num_steps", "evaluate_every", "patience")}
+
+    def metrics(self, progress: Progress, count: int) -> dict[str, float]:
+        """Return the last step, the mean over the seeds that took it; NaN where there is no such thing."""
+        history = History.of(progress)
+        last = {f.name: getattr(history, f.name)[..., -1] for f in dataclasses.fields(History) if f.name != "reason"}
+        return {name: mean(x) for name, x in (last | {"best_cost": np.asarray(progress.carry.best.cost)}).items()}
+
+    def result(self, progress: Progress) -> Optimisation:
+        carry, history = progress.carry, History.of(progress)
+        best, final_cost = carry.best, jnp.full_like(carry.best.cost, jnp.nan)
+        if self.options.evaluate is not None:
+            arrays, static = eqx.partition(self.options.evaluate, eqx.is_array)
+            numbers, structure = jax.tree.flatten(arrays)
+
+            def finish(numbers: list[Array], at: Float[Array, " dim"], best: Best) -> tuple[Float[Array, ""], Best]:
+                cost = jnp.asarray(eqx.combine(jax.tree.unflatten(structure, numbers), static)(at), at.dtype)
+                return cost, best.against(Best.measured(at, cost))  # the last point competes with the best before
+
+            of_all = jax.jit(jax.vmap(finish, (None, 0, 0)) if carry.params.ndim == 2 else finish)
+            final_cost, best = compile_once(of_all.lower(numbers, carry.params, best))(numbers, carry.params, best)
+        return Optimisation(
+            params=carry.params,
+            best_params=best.params,
+            best_cost=best.cost,
+            final_cost=final_cost,
+            history=history,
+            stopped=carry.stopped,
+            num_steps=np.asarray(carry.num_steps),
+            num_skipped=np.asarray(carry.num_skipped),
+            num_rollouts=history.num_rollouts[..., -1],
+            num_gradient_rollouts=history.num_gradient_rollouts[..., -1],
+            seconds=float(progress.seconds.sum()),
+            compile_seconds=progress.compile_seconds,
+        )

@@ -1,0 +1,274 @@
+"""Descent along estimated gradients with any optimiser of optax, and one step of it as an optax transformation."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+
+from mjxgrad.estimators.estimate import Estimator, GradientEstimate
+from mjxgrad.loop.descent import Carry, Descent, RunOptions
+from mjxgrad.loop.result import Optimisation, Record
+from mjxgrad.loop.run import run
+from mjxgrad.objective import Objective, flattened, of_vector
+from mjxgrad.objective.base import as_objective
+from mjxgrad.objective.parameters import Restored
+
+AnnealedObjective = Callable[[Float[Array, ""]], Objective]
+Annealing = Callable[[ArrayLike], ArrayLike]
+"""From the number of a step to a scale in (0, 1]."""
+
+
+def optimise(
+    objective: Objective | AnnealedObjective,
+    params: PyTree,
+    key: Key[Array, "..."],
+    *,
+    estimator: Estimator,
+    optimiser: optax.GradientTransformation,
+    num_steps: int,
+    annealing: Annealing | None = None,
+    clip_norm: float | None = None,
+    **options: Any,
+) -> Optimisation:
+    r"""Minimise a cost under noise by descent along estimated gradients.
+
+        estimator = functools.partial(mg.estimators.zeroth_order, num_samples=64)
+        result = mg.optimise(
+            objective, params, jax.random.key(0),
+            estimator=estimator, optimiser=optax.adam(1e-2), num_steps=300,
+        )
+        result.best_params, result.history.cost, mg.Stopped[result.stopped]
+
+    One compilation, however many steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
+    five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
+
+    A step whose estimate is not finite is not taken: parameters and optimiser stay as they were, the step is counted in
+    `num_skipped`, and the next one draws other noise. Where all samples cost the same and no derivative differs from zero,
+    such as where a policy touches nothing, the run stops after a few steps with `Stopped.nothing_felt`.
+
+    With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
+    (0, 1], and `annealing` is the schedule of the scale.
+
+        noisy = mg.parameter_noise(function, stddev=0.3)
+        mg.optimise(
+            lambda scale: noisy.with_stddev(0.3 * scale), params, key,
+            annealing=optax.exponential_decay(1.0, 100, 0.5, end_value=0.05), ...
+        )
+        # Contact from soft to stiff:
+        mg.optimise(
+            lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
+            annealing=optax.exponential_decay(1.0, 10, 0.5, end_value=0.01), ...
+        )
+
+    With a bar of tqdm:
+
+        mg.optimise(..., log=lambda step, metrics: (bar.update(step - bar.n), bar.set_postfix(cost=metrics["cost"])))
+
+    Args:
+        objective: what to minimise, or with `annealing` a function from a scale to it.
+        params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
+            dict or an equinox module. The function of `parameter_noise` and `evaluate` then take its form, and the
+            result has it. Estimators see all its arrays as one vector.
+        key: consumed here; with a leading axis, one per seed.
+        estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
+            `functools.partial`, or your own.
+        optimiser: from optax; it is handed the mean cost under noise as `value`, too.
+        num_steps: at most.
+        annealing: a schedule from step to scale, such as one of optax.
+        clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
+        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
+
+    Returns:
+        The last and the best parameters, the history, why it stopped and what was spent.
+
+    Raises:
+        ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
+            or a checkpoint is damaged or of another run.
+    """
+    vector, restore = flattened(params)
+    chosen = RunOptions(num_steps, **options)
+    if restore is not None and chosen.evaluate is not None:
+        chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
+    method = GradientStep(chosen, of_vector(objective, restore), estimator, optimiser, annealing, clip_norm)
+    result = run(method, **method.begun(vector, key))
+    if restore is None:
+        return result
+    return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
+
+
+class GradientStep(Descent):
+    """Everything that turns an estimate into a step; see `optimise`."""
+
+    options: RunOptions
+    objective: Objective | AnnealedObjective
+    estimator: Estimator
+    optimiser: optax.GradientTransformation
+    annealing: Annealing | None
+    clip_norm: float | None
+
+    def __check_init__(self):
+        if self.annealing is None:
+            as_objective(self.objective)
+        elif not callable(self.annealing):
+            raise ValueError(
+                f"annealing must be a schedule from step to scale, got {self.annealing!r}; "
+                "for a fixed scale give the objective that scale"
+            )
+        elif isinstance(self.objective, Objective):
+            raise ValueError(
+                "objective must be a function from a scale to an objective when annealing is given, got an objective; "
+                "write lambda scale: objective.with_stddev(scale * stddev)"
+            )
+        if not callable(self.estimator):
+            named = "functools.partial(mg.estimators.alpha_order, num_samples=64)"
+            raise ValueError(f"estimator must be a function such as {named}, got {self.estimator!r}")
+        if not isinstance(self.optimiser, optax.GradientTransformation):
+            raise ValueError(
+                f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {self.optimiser!r}"
+            )
+        if self.clip_norm is not None and not self.clip_norm > 0:
+            raise ValueError(f"clip_norm must be positive, got {self.clip_norm}")
+
+    @property
+    def transformation(self) -> optax.GradientTransformationExtraArgs:
+        """Return the optimiser, clipped; the cost goes along for those that watch it, such as `reduce_on_plateau`."""
+        if self.clip_norm is None:
+            return optax.with_extra_args_support(self.optimiser)
+        return optax.with_extra_args_support(optax.chain(optax.clip_by_global_norm(self.clip_norm), self.optimiser))
+
+    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+        return jax.tree.map(jnp.asarray, self.transformation.init(params))
+
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        scale, objective = self.annealed(self.objective, carry.params, index)
+        estimate = self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index))
+        change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
+        record = Record.of_estimate(estimate, scale=scale, step_norm=jnp.linalg.norm(change), is_taken=is_taken)
+        return self.moved(carry, index, carry.params + change, state, record)
+
+    def annealed(
+        self, objective: Objective | AnnealedObjective, params: Float[Array, " dim"], step: Int[Array, ""]
+    ) -> tuple[Float[Array, ""], Objective]:
+        """Return the scale of a step, 1 without annealing, and the objective at it."""
+        if self.annealing is None:
+            return jnp.ones((), params.dtype), as_objective(objective)
+        scale = jnp.asarray(self.annealing(step), params.dtype)
+        return scale, objective if isinstance(objective, Objective) else objective(scale)
+
+    def change(
+        self,
+        params: Float[Array, " dim"],
+        state: PyTree,
+        estimate: GradientEstimate,
+        gradient: Float[Array, " dim"],
+    ) -> tuple[Float[Array, " dim"], PyTree, Bool[Array, ""]]:
+        """Ask the optimiser for the change of the parameters.
+
+        The gradient is that of the estimate and of anything else in the cost. A step that would not be finite is not
+        taken: the change is zero and the state stays as it was.
+        """
+        is_finite = jnp.isfinite(gradient).all()
+        # NaN must not reach the optimiser: what it does with one that is thrown away later is not defined.
+        gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
+        updates, moved = self.transformation.update(gradient, state, params, value=estimate.objective_mean)
+        change = jnp.asarray(updates)
+        is_taken = is_finite & jnp.isfinite(params + change).all()
+        moved = jax.tree.map(lambda new, old: jnp.where(is_taken, new, old), moved, state)
+        return jnp.where(is_taken, change, 0).astype(params.dtype), moved, is_taken
+
+
+class EstimatedGradientState(eqx.Module):
+    """The state of `estimated_gradient`.
+
+    Attributes:
+        step: number of updates so far; the noise of each comes from it.
+        num_skipped: of those, the ones that were not finite and so were zero.
+        scale: of the annealing at the last update.
+        estimate: the last one, of the vector; all NaN before the first.
+        inner: state of the optimiser.
+    """
+
+    step: Int[Array, ""]
+    num_skipped: Int[Array, ""]
+    scale: Float[Array, ""]
+    estimate: GradientEstimate
+    inner: PyTree
+
+
+def estimated_gradient(
+    objective: Objective | AnnealedObjective,
+    key: PRNGKeyArray,
+    *,
+    estimator: Estimator,
+    optimiser: optax.GradientTransformation | None = None,
+    annealing: Annealing | None = None,
+    clip_norm: float | None = None,
+) -> optax.GradientTransformationExtraArgs:
+    """Return the step of `optimise` as an optax transformation, for a loop of your own.
+
+        transformation = mg.estimated_gradient(objective, key, estimator=estimator, optimiser=optax.adam(1e-2))
+        state = transformation.init(params)
+        for _ in range(100):
+            change, state = transformation.update(None, state, params)
+            params = optax.apply_updates(params, change)
+        state.estimate  # the last one, with its error bars
+
+    Update number n draws its noise from `fold_in(key, n)`, as `optimise` does, so both give the same trajectory. The
+    arguments are those of `optimise`, but `optimiser` may be None, which gives the gradient itself, clipped, to be chained
+    with others.
+
+    Returns:
+        A transformation of a vector, or of a pytree as in `optimise`. What it is given as updates is added to the
+        estimate: the gradient of anything else in the cost, or None. Its `update` takes two further arguments, `key` and
+        `objective`, in place of its own for that update. Where the estimate is not finite the update is zero, and
+        `num_skipped` counts it.
+
+    Raises:
+        ValueError: if `objective` and `annealing` do not belong together.
+    """
+    rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing, clip_norm)
+
+    def init(params: PyTree) -> EstimatedGradientState:
+        vector, restore = flattened(params)
+
+        def first(
+            vector: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
+        ) -> tuple[Float[Array, ""], GradientEstimate]:
+            scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
+            return scale, estimator(annealed, vector, key)
+
+        zero = jnp.zeros((), jnp.int32)
+        scale, estimate = jax.tree.map(_nothing, jax.eval_shape(first, vector, key, zero))
+        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(vector))
+
+    def update(
+        updates: PyTree,
+        state: EstimatedGradientState,
+        params: PyTree = None,
+        *,
+        key: PRNGKeyArray = key,
+        objective: Objective | AnnealedObjective = objective,
+        **unused: Any,
+    ) -> tuple[PyTree, EstimatedGradientState]:
+        del unused  # extra arguments of others in a chain
+        if params is None:
+            raise ValueError("params must be given to update, got None: the gradient is estimated there")
+        vector, restore = flattened(params)
+        scale, annealed = rule.annealed(of_vector(objective, restore), vector, state.step)
+        estimate = jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, state.step)))
+        gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
+        change, inner, is_taken = rule.change(vector, state.inner, estimate, gradient)
+        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)
+        return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
+
+    return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
+
+
+def _nothing(leaf: jax.ShapeDtypeStruct) -> Array:
+    return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else 0, leaf.dtype)
