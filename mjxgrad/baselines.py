@@ -37,7 +37,6 @@ class Population(Descent):
     point and width. A step is taken if at least `least_finite` candidates are finite; the present point may be the first.
     """
 
-    options: RunOptions
     objective: Objective
     stddev: Float[Array, " dim"]
     move: Move = eqx.field(static=True)

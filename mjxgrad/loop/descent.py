@@ -85,7 +85,7 @@ class Carry(eqx.Module):
 class Descent(Method):
     """A method for a vector of parameters: a subclass gives `init_state`, and a `step` that ends in `moved`."""
 
-    options: eqx.AbstractVar[RunOptions]
+    options: RunOptions
 
     @abstractmethod
     def init_state(self, params: Float[Array, " dim"]) -> PyTree:

@@ -105,7 +105,6 @@ def optimise(
 class GradientStep(Descent):
     """Everything that turns an estimate into a step; see `optimise`."""
 
-    options: RunOptions
     objective: Objective | AnnealedObjective
     estimator: Estimator
     optimiser: optax.GradientTransformation

@@ -153,9 +153,6 @@ class History(Record):
             fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
         return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(progress.seconds))
 
-    def __getitem__(self, steps: slice) -> "History":
-        return jax.tree.map(lambda leaf: leaf[..., steps], self)
-
 
 class Optimisation(eqx.Module):
     """The result of a run, or of one per seed: all but the seconds then have a leading axis.
