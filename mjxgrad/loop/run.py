@@ -128,9 +128,6 @@ def run(
     arrays, static = eqx.partition(method, eqx.is_array)
     # Structures name functions: a list of numbers is that of any run of the same program.
     numbers, structure = jax.tree.flatten(arrays)
-    identity = method.identity()
-    if checkpoint is not None:
-        identity |= {"start": checkpoints.digest(start), "arrays": checkpoints.digest(numbers)}
     sharding = _everywhere() if on_all_devices else None
     numbers, start = _placed((numbers, start), sharding)
 
@@ -150,12 +147,10 @@ def run(
     steps = jax.jit(_steps(step, traced.out_info[1], method.is_over, segment), out_shardings=sharding)
     nothing = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), traced.out_info[1])
     progress = Progress(carry, nothing, np.zeros(0), time.perf_counter() - began)
-    if checkpoint is not None:
-        # It has every number in it that is not an argument, such as a learning rate.
-        identity["program"] = checkpoints.digest(np.frombuffer(traced.lower().as_text().encode(), np.uint8))
-        if checkpoint.exists():
-            carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
-            progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
+    identity = {} if checkpoint is None else _identity(method, start, numbers, traced.lower().as_text())
+    if checkpoint is not None and checkpoint.exists():
+        carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
+        progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
     on_disk, compiled, is_first = progress.num_steps, None, jax.process_index() == 0
     try:
         while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
@@ -175,6 +170,17 @@ def run(
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
     return method.result(progress)
+
+
+def _identity(method: Method, start: PyTree, numbers: list[Array], program: str) -> dict[str, Any]:
+    """Say what a resumed run must have in common with this one; a class of the same name may have other code."""
+    return {
+        **method.identity(),
+        "start": checkpoints.digest(start),
+        "arrays": checkpoints.digest(numbers),
+        # The lowered program has every number in it that is not an argument, such as a learning rate.
+        "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
+    }
 
 
 def mean(values: Shaped[np.ndarray, "..."]) -> float:
