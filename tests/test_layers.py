@@ -25,7 +25,7 @@ ORDER = (
     ("baselines",),
     ("diagnostics", "identification", "planning"),
     ("tasks",),
-    ("envs", "verdict"),
+    ("check", "envs"),
     ("learning",),
     ("cli",),
     ("__main__",),

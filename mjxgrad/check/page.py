@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjxgrad.verdict.findings import Finding
-from mjxgrad.verdict.measure import Line, Measured
+from mjxgrad.check.findings import Finding
+from mjxgrad.check.measure import Line, Measured
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _PANEL, _GAP = 360.0, 330.0, 68.0, 8.0, 24.0, 126.0, 22.0
 _STYLE = """

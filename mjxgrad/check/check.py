@@ -17,12 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
-from mjxgrad.diagnostics.contacts import contacts_needed
-from mjxgrad.diagnostics.stability import StabilityReport, check_stability
-from mjxgrad.rollouts import Engine, Trajectory
-from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.scene.load import count_pairs
-from mjxgrad.verdict.findings import (
+from mjxgrad.check.findings import (
     MANY_PAIRS,
     Finding,
     Recommendation,
@@ -34,10 +29,15 @@ from mjxgrad.verdict.findings import (
     static_findings,
     touch_speed,
 )
-from mjxgrad.verdict.measure import Measured, measure
-from mjxgrad.verdict.motions import Motions, first_keyframe, half_range, random_motions
-from mjxgrad.verdict.moving import Mover, Outcomes
-from mjxgrad.verdict.page import page
+from mjxgrad.check.measure import Measured, measure
+from mjxgrad.check.motions import Motions, first_keyframe, half_range, random_motions
+from mjxgrad.check.moving import Mover, Outcomes
+from mjxgrad.check.page import page
+from mjxgrad.diagnostics.contacts import contacts_needed
+from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.rollouts import Engine, Trajectory
+from mjxgrad.scene import Scene, SceneError, load_scene
+from mjxgrad.scene.load import count_pairs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene

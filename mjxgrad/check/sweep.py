@@ -23,6 +23,10 @@ from jaxtyping import Array, Float, PyTree
 from mjxgrad._arrays import is_known
 from mjxgrad._text import format_number
 from mjxgrad.bodies.kinematics import kinematics
+from mjxgrad.check.check import Cost, Source, _outcomes
+from mjxgrad.check.motions import half_range
+from mjxgrad.check.moving import CONTACT_FIELDS, compiler_options
+from mjxgrad.check.page import document
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
@@ -32,10 +36,6 @@ from mjxgrad.objective.task import SceneTask
 from mjxgrad.rollouts import Engine, Trajectory, initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Gradient
-from mjxgrad.verdict.check import Cost, Source, _outcomes
-from mjxgrad.verdict.motions import half_range
-from mjxgrad.verdict.moving import CONTACT_FIELDS, compiler_options
-from mjxgrad.verdict.page import document
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # and how many bodies or sites each is of

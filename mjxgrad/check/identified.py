@@ -13,12 +13,12 @@ import jax
 import mujoco
 import numpy as np
 
+from mjxgrad.check.page import document
 from mjxgrad.identification import Identification, Recording, Stopped
 from mjxgrad.identification.files import simulated
 from mjxgrad.identification.recording import stack
 from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
-from mjxgrad.verdict.page import document
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 360.0, 130.0, 66.0, 18.0
 _MOST_SIGNALS, _MOST_DOTS = 8, 300
