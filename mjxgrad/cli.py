@@ -125,7 +125,7 @@ def check(
         budget: how long it may take in s, once the scene is loaded; what does not fit is left out by name.
         seed: of what is random.
     """
-    _writable(html)
+    _writable(html, is_page=True)
     mg, started = _library(), time.monotonic()
 
     def log(text: str) -> None:
@@ -171,9 +171,10 @@ def sweep(
         seed: of what is random.
         html: the page to write.
     """
-    mg, started = _library(), time.monotonic()
     if not html.parent.is_dir():
         raise CommandError(f"there is no folder {html.parent} for {html}")
+    _writable(html, is_page=True)
+    mg, started = _library(), time.monotonic()
     found = mg.sweep(
         _existing(scene),
         cost,
@@ -222,9 +223,11 @@ def identify(
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """
-    _writable(output / "report.html", makes_folder=True)
+    _writable(output / "report.html", makes_folder=True, is_page=True)
     mg, started = _library(), time.monotonic()
-    files, page = (importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "check.identified"))
+    files, page = (
+        importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
+    )
 
     def log(text: str) -> None:
         _say(f"{time.monotonic() - started:4.0f} s  {text}")
@@ -355,8 +358,8 @@ def _existing(path: str) -> str:
     return path
 
 
-def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
-    """Refuse, before any work, a file that could not be written after it."""
+def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = False) -> None:
+    """Refuse, before any work, a file that could not be written after it, or a page without what writes pages."""
     if path is None:
         return
     there = (
@@ -366,3 +369,5 @@ def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
     )
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
+    if is_page:
+        importlib.import_module("mjxgrad.report").require()

@@ -10,8 +10,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
-from mjxgrad.check.identified import _titles
 from mjxgrad.identification import files
+from mjxgrad.identification.page import _titles
 from mjxgrad.identification.parameters import write_all
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
