@@ -13,16 +13,18 @@ import zlib
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
 from experiments.config import ExperimentError, Run, flatten, load_runs, part
 from experiments.output import building, keeping, recover, write_csv, write_text, write_toml, writing
 from experiments.parallel import num_cores
-from experiments.report import Report, gallery, overview, page
 from experiments.words import joined, merged
 from experiments.workspace import CompileClock, Workspace
+
+if TYPE_CHECKING:
+    from experiments.report import Report
 
 ROOT = Path(__file__).parent.parent
 _PACKAGES = ("mjxgrad", "jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "numpy", "scipy", "matplotlib", "mediapy")
@@ -46,6 +48,8 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
     for run, folder in zip(runs, folders, strict=True):
         _run_one(run, folder, command, force)
     if is_sweep:
+        from experiments.report import overview
+
         with writing(top):
             summary = _of_sweep(runs[0], folders)
             write_text(top / "report.html", overview(runs, folders, summary["answer"]))
@@ -98,6 +102,8 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
 
 def write_gallery(output: Path) -> Path:
     """Write the page over all results in a folder of runs; an `ExperimentError` if there are none."""
+    from experiments.report import gallery
+
     found = {path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in output.glob("*/summary.json")}
     # Results of an earlier version have no question.
     shown = {name: summary for name, summary in sorted(found.items()) if "question" in summary}
@@ -127,10 +133,11 @@ def _can_draw() -> bool:
     return can_draw()
 
 
-def _call(run: Run, workspace: Workspace) -> Report:
+def _call(run: Run, workspace: Workspace) -> "Report":
     """Run the experiment; what the library warns of, and what it finds unstable, goes into the report, not to the terminal."""
     with workspace.listening():
         # Late, once the precision is chosen: these import JAX and MuJoCo.
+        from experiments.report import Report
         from experiments.theme import save
 
         measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
@@ -150,7 +157,9 @@ def _call(run: Run, workspace: Workspace) -> Report:
     return replace(report, warnings=merged([*report.warnings, *workspace.told, *workspace.warnings]))
 
 
-def _write(run: Run, report: Report, folder: Path, facts: dict[str, Any]) -> None:
+def _write(run: Run, report: "Report", folder: Path, facts: dict[str, Any]) -> None:
+    from experiments.report import page
+
     header = "\n".join(filter(None, [run.question, f"Expected: {run.expected}" if run.expected else ""]))
     write_toml(folder / "config.toml", run.settings.model_dump(mode="json"), header)
     write_csv(folder / "metrics.csv", report.metrics)

@@ -26,12 +26,12 @@ from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, 
 from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
+from mjxgrad.check.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import Engine
 from mjxgrad.stepping import Gradient
 from mjxgrad.tasks import scene_path
-from mjxgrad.verdict.sweep import Knob
 
 RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
 BallName = Literal["ball_frictionless", "ball", "ball_elliptic", "ball_torsion", "ball_rolling"]

@@ -18,15 +18,15 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments.report import Figure
 from experiments.words import superscript
+from mjxgrad.report import INK, STYLE, svg
 
 # Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
-FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", "#22262e"
+FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", INK
 DEFAULT, MUTED, ONSET = "#cc79a7", "#8b94a1", "#009e73"
 # For what comes besides, in order; told apart by their markers, too.
 OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#393b79")
 MARKERS = "osD^vP*X<>"
-_STYLE = Path(__file__).parent / "report.mplstyle"
-WIDTH = 11.0  # inches; at 160 dots per inch sharp on a screen twice as dense as the page is wide
+WIDTH = 11.0  # inches, of a page
 
 # By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
 Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
@@ -35,7 +35,7 @@ Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
 def subplots(rows: int, columns: int, *, height: float, **settings):
     """Make a figure in the theme, of a height in inches, and an array (rows, columns) of axes."""
     # Titles, ticks and legends read the rules when they are made, so a context around this call would not reach them.
-    plt.style.use(_STYLE)
+    plt.style.use(STYLE)
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
 
 
@@ -45,9 +45,9 @@ def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
     figures = []
     for name, drawing in drawings.items():
         picture, title, caption = drawing(outcome)
-        picture.savefig(folder / "figures" / f"{name}.png")
-        plt.close(picture)
-        figures.append(Figure(f"figures/{name}.png", title, caption))
+        file = f"figures/{name}.svg"
+        (folder / file).write_text(svg(lambda picture=picture: picture, title), encoding="utf-8")
+        figures.append(Figure(file, title, caption))
     return figures
 
 

@@ -4,6 +4,7 @@ from mjxgrad import baselines, diagnostics, envs, estimators, identification, le
 from mjxgrad._programs import keep_compiled
 from mjxgrad.batched import over_devices
 from mjxgrad.bodies import set_const
+from mjxgrad.check import Verdict, check, sweep
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
@@ -31,7 +32,6 @@ from mjxgrad.rollouts import (
 )
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
-from mjxgrad.verdict import Verdict, check, sweep
 
 __all__ = [
     "DivergedError",

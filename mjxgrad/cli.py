@@ -125,13 +125,13 @@ def check(
         budget: how long it may take in s, once the scene is loaded; what does not fit is left out by name.
         seed: of what is random.
     """
-    _writable(html)
+    _writable(html, is_page=True)
     mg, started = _library(), time.monotonic()
 
     def log(text: str) -> None:
         _say(f"{time.monotonic() - started:4.0f} s  {text}")
 
-    function = None if cost is None else importlib.import_module("mjxgrad.verdict.sweep").load_function(cost)
+    function = None if cost is None else importlib.import_module("mjxgrad.check.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict.as_json() if as_json else verdict.summary(), flush=True)
     if html is not None:
@@ -171,9 +171,10 @@ def sweep(
         seed: of what is random.
         html: the page to write.
     """
-    mg, started = _library(), time.monotonic()
     if not html.parent.is_dir():
         raise CommandError(f"there is no folder {html.parent} for {html}")
+    _writable(html, is_page=True)
+    mg, started = _library(), time.monotonic()
     found = mg.sweep(
         _existing(scene),
         cost,
@@ -222,10 +223,10 @@ def identify(
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """
-    _writable(output / "report.html", makes_folder=True)
+    _writable(output / "report.html", makes_folder=True, is_page=True)
     mg, started = _library(), time.monotonic()
     files, page = (
-        importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "verdict.identified")
+        importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
     )
 
     def log(text: str) -> None:
@@ -282,7 +283,7 @@ def new(
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
-    key = importlib.import_module("mjxgrad.verdict.motions").first_keyframe(verdict.scene.mj_model)
+    key = importlib.import_module("mjxgrad.check.motions").first_keyframe(verdict.scene.mj_model)
     text = TEMPLATE.format(
         name=repr(Path(scene).name)[1:-1].replace('"', "'"),  # within a docstring
         path=str(Path(scene)),
@@ -313,7 +314,7 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
     mg = _library()
     loaded = mg.load_scene(_existing(scene))
     if qpos is None:
-        from mjxgrad.verdict.motions import random_motions
+        from mjxgrad.check.motions import random_motions
 
         states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
     else:
@@ -357,8 +358,8 @@ def _existing(path: str) -> str:
     return path
 
 
-def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
-    """Refuse, before any work, a file that could not be written after it."""
+def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = False) -> None:
+    """Refuse, before any work, a file that could not be written after it, or a page without what writes pages."""
     if path is None:
         return
     there = (
@@ -368,3 +369,5 @@ def _writable(path: Path | None, *, makes_folder: bool = False) -> None:
     )
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
+    if is_page:
+        importlib.import_module("mjxgrad.report").require()

@@ -111,7 +111,7 @@ def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatc
 
 def test_importing_the_library_imports_no_command_line_and_no_pictures():
     """Nor what only experiments need."""
-    heavy = ("cyclopts", "OpenGL", "gymnasium", "matplotlib", "mediapy")
+    heavy = ("cyclopts", "OpenGL", "gymnasium", "jinja2", "matplotlib", "mediapy")
     code = f"import sys, mjxgrad; print([name for name in {heavy} if name in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert ran.stdout.strip() == "[]"
@@ -138,6 +138,21 @@ def test_what_could_not_be_written_is_refused_before_the_work(scene, capsys, mon
     monkeypatch.setattr(cli, "_library", lambda: pytest.fail("the work was begun"))
     assert cli.main(arguments) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["check", "scene.xml", "--html", "page.html"],
+        ["sweep", "scene.xml"],
+        ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball"],
+    ],
+)
+def test_a_page_that_nothing_could_write_is_refused_before_the_work(scene, capsys, monkeypatch, arguments):
+    monkeypatch.setattr(cli, "_library", lambda: pytest.fail("the work was begun"))
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    assert cli.main(arguments) == 2
+    assert capsys.readouterr().err == "a page needs jinja2, not installed: pip install 'mjxgrad[render]'\n"
 
 
 def test_a_program_starts_at_the_key_frame_and_holds_no_code_of_a_file_name(scene, monkeypatch):

@@ -11,7 +11,7 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # Each line may import those above it; parts of one line do not know each other.
 ORDER = (
-    ("_arrays", "_mjx", "_programs", "_text"),
+    ("_arrays", "_mjx", "_programs", "_text", "report"),
     ("batched",),
     ("bodies",),
     ("contact", "solver"),
@@ -25,7 +25,7 @@ ORDER = (
     ("baselines",),
     ("diagnostics", "identification", "planning"),
     ("tasks",),
-    ("envs", "verdict"),
+    ("check", "envs"),
     ("learning",),
     ("cli",),
     ("__main__",),

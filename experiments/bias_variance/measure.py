@@ -20,11 +20,11 @@ from experiments.motion import own_task
 from experiments.theme import power
 from experiments.words import percent
 from experiments.workspace import Workspace
+from mjxgrad.check.moving import compiler_options
+from mjxgrad.check.sweep import Knob
 from mjxgrad.diagnostics import BiasVariance, bias_variance, mean_interval
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
-from mjxgrad.verdict.moving import compiler_options
-from mjxgrad.verdict.sweep import Knob
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 _DEFAULT = (1 / (0.02 * 1.0) ** 2, 1.0, (0.9, 0.95), 0.001)

@@ -237,7 +237,7 @@ def growth(outcome: Outcome):
         last.set(title="The pendulum's steps and its motion", xlabel="time, s")
         last.legend(fontsize=7.5)
     caption = (
-        "Grey: logarithm of the largest singular value of the product of all steps' Jacobians, rollout by rollout; black, "
+        "Grey: logarithm of the largest singular value of the product of all steps' Jacobians, rollout by rollout; thick, "
         "its median. Half the logarithm of the estimate's variance runs along with it. The pendulum's are held against "
         "integration with error control: where the steps' distance from it nears one they are another motion."
     )

@@ -19,10 +19,10 @@ from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems import published_scenes
 from experiments.workspace import Workspace
+from mjxgrad.check.motions import half_range
 from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
 from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import GradientEstimate, Reason, rules
-from mjxgrad.verdict.motions import half_range
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
 ROUNDING = 1e-6

@@ -202,7 +202,7 @@ def plane(outcome: Outcome):
     axes[0, 0].set_ylabel("y in m")
     axes[0, 0].autoscale_view()
     caption = (
-        "Rod and finger every 0.3 s and at the end, from light to dark; the dashed outline is the goal, the ring where the "
+        "Rod and finger every 0.3 s and at the end, from faint to strong; the dashed outline is the goal, the ring where the "
         "finger starts."
     )
     return figure, "The plan, seen from above", caption

@@ -45,7 +45,7 @@ REACH = 6.0
 _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
-_LOOKS = {"first": ("#d55e00", "o"), "zeroth": ("#0072b2", "s"), "alpha_order": ("#009e73", "D")}
+_LOOKS = {"first": ("#d55e00", "o", "-"), "zeroth": ("#0072b2", "s", "--"), "alpha_order": ("#009e73", "D", ":")}
 _TOO_STIFF = "without gaining energy"  # in what a scene says of a contact that its time step cannot follow
 
 
@@ -187,32 +187,45 @@ class BiasVariance(eqx.Module):
                 found["alpha"] = one.alpha
         return {name: np.asarray(value) for name, value in found.items() if name != "truth_is_biased"}
 
-    def summary(self, labels: Sequence[str] | None = None) -> str:
-        """Write the table for a terminal; labels name the softnesses in place of their numbers."""
+    def rows(self, labels: Sequence[str] | None = None) -> list[list[str]]:
+        """Return the table as text, its head first; labels name the softnesses in place of their numbers."""
         (title, swept), table = self.knob, self.table()
         names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
         has_alpha = "alpha_order" in names
         first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
         lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, *["α"] * has_alpha]]
-        bad = [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
         for i, j in np.ndindex(self.cost.shape):
             one = {name: value[i, j] for name, value in table.items()}
             half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
             truth, *biases = (f"{one[x]:.3g}{half[x]}" for x in ("truth", *(f"{name}_bias" for name in names)))
             biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
-            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(bad[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
+            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(self._too_stiff[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
             variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
             at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
             lines.append([label, at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
-        columns = [column for column in zip(*lines, strict=True) if column[0] != "at" or len(points) > 1]
-        padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
-        what = "gradient" if points.shape[1] == 1 else "norm of the gradient"
+        return [
+            [cell for cell, head in zip(line, lines[0], strict=True) if head != "at" or len(points) > 1]
+            for line in lines
+        ]
+
+    def notes(self) -> list[str]:
+        """Say how the table is to be read, and what its time step is too long for."""
+        what = "gradient" if self.params.shape[1] == 1 else "norm of the gradient"
         told = (
             f"Truth: {what} of the cost under noise, from rollouts of its own; ± is half a {self.confidence:.0%} interval. "
             "Variance: of one rollout. *: a bias beyond chance over the whole table."
         )
-        stiff = [f"!: the time step does not hold it. {text}." for text in bad if text][:1]
-        return "\n".join(["  ".join(row).rstrip() for row in zip(*padded, strict=True)] + ["", told, *stiff])
+        return [told, *[f"!: the time step does not hold it. {text}." for text in self._too_stiff if text][:1]]
+
+    @property
+    def _too_stiff(self) -> list[str]:
+        return [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
+
+    def summary(self, labels: Sequence[str] | None = None) -> str:
+        """Write the table for a terminal; labels name the softnesses in place of their numbers."""
+        columns = zip(*self.rows(labels), strict=True)
+        padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+        return "\n".join(["  ".join(row).rstrip() for row in zip(*padded, strict=True)] + ["", *self.notes()])
 
     def __str__(self) -> str:
         return self.summary()
@@ -228,17 +241,17 @@ class BiasVariance(eqx.Module):
         figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
         for j, (upper, lower) in enumerate(axes.T):
             upper.axhline(0, color="grey", lw=0.8)
-            upper.plot(swept, table["truth"][:, j], color="grey", ls="--", label="the gradient itself")
+            upper.plot(swept, table["truth"][:, j], color="grey", ls="-.", label="the gradient itself")
             for axis, what in ((upper, "bias"), (lower, "variance")):
-                for name, (colour, marker) in _LOOKS.items():
+                for name, (colour, marker, line) in _LOOKS.items():
                     if f"{name}_{what}" in table:
                         y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
-                        look = {"color": colour, "marker": marker, "label": ESTIMATES[name]}
+                        look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
             lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
-        axes[0, 0].set_ylabel("bias of the gradient")
+        axes[0, 0].set_ylabel("bias of the gradient (cost per unit)")
         axes[1, 0].set_ylabel("variance of one rollout")
-        axes[0, 0].legend(fontsize="small")
+        axes[0, 0].legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
         return figure
 
 

@@ -82,8 +82,8 @@ def test_the_verdict_counts_where_the_derivatives_hold(outcome):
 def test_every_contact_and_time_step_is_in_metrics_and_figures(outcome, tmp_path):
     assert len(outcome.rows()) == 3 * 8
     assert [figure.file for figure in save(drawings(outcome), outcome, tmp_path)] == [
-        "figures/derivative.png",
-        "figures/error.png",
+        "figures/derivative.svg",
+        "figures/error.svg",
     ]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from experiments.report import Figure, Report, Table, gallery, overview, page
+from mjxgrad.report import svg
 from mjxgrad.rollouts.render import write_video
 
 BROWSER = os.environ.get("CHROME_BIN") or next(
@@ -22,14 +23,14 @@ BROWSER = os.environ.get("CHROME_BIN") or next(
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser is installed: CHROME_BIN names one")
 
 WIDTH = 390  # of a telephone, in pixels
-PICTURE = 1000  # pixels from side to side
+PICTURE = 11 * 96  # pixels from side to side, of a figure of 11 inches
 # The page's own scripts, if it had any, would be refused; this one alone may run.
 PROBE = """\
 <meta http-equiv="Content-Security-Policy"
  content="default-src 'none'; img-src data: file:; media-src data: file:; style-src 'unsafe-inline'; script-src 'nonce-probe'">
 <script nonce="probe">
 addEventListener("load", () => {
-  const zoom = document.querySelector(".zoom img");
+  const zoom = document.querySelector(".zoom svg");
   const wide = () => zoom.getBoundingClientRect().width;
   const loaded = [...document.images].every(one => one.naturalWidth > 0);
   const found = {width: innerWidth, beyond: document.documentElement.scrollWidth - innerWidth, loaded};
@@ -37,9 +38,9 @@ addEventListener("load", () => {
     found.before = wide();
     found.hint = getComputedStyle(zoom.parentElement, "::before").content;
     found.shade = getComputedStyle(document.querySelector(".scroll:has(> table)")).backgroundImage;
-    zoom.click();
+    zoom.dispatchEvent(new MouseEvent("click", {bubbles: true}));
     found.full = wide();
-    zoom.click();
+    zoom.dispatchEvent(new MouseEvent("click", {bubbles: true}));
     found.again = wide();
   }
   parent.postMessage(JSON.stringify(found), "*");
@@ -72,14 +73,14 @@ def opened(text: str, place: Path, width: int = WIDTH) -> tuple[dict[str, Any], 
 @pytest.fixture
 def report(tmp_path):
     """A report of every part there is, with words and tables too wide for a telephone."""
-    plt.imsave(tmp_path / "picture.png", np.random.default_rng(0).random((400, PICTURE)))
+    (tmp_path / "picture.svg").write_text(svg(lambda: plt.figure(figsize=(11, 4)), "Nothing"))
     write_video(tmp_path / "video.mp4", np.zeros((3, 64, 96, 3), np.uint8), fps=30)
     wide = [f"column{i}" for i in range(30)]
     made = Report(
         answer="First order, `discrete`, up to 100 1/s².",
         verdict="It is so.",
         findings=["With `mjxgrad.diagnostics.first_order_samples_of_everything_that_there_is_to_be_found`."],
-        figures=[Figure("picture.png", "Picture", "All of it."), Figure("picture.png", "Once more", "As above.")],
+        figures=[Figure("picture.svg", "Picture", "All of it."), Figure("picture.svg", "Once more", "As above.")],
         tables=[Table(wide, [["1.234"] * 30], "Wide."), Table(wide, [["1.234"] * 30] * 20, "Wide and long.")],
         metrics=[],
         video="video.mp4",
@@ -132,9 +133,9 @@ def test_a_gallery_fits_a_telephone_with_its_pictures(report, tmp_path):
     del report
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
-        shutil.copy(tmp_path / "picture.png", tmp_path / name)
+        shutil.copy(tmp_path / "picture.svg", tmp_path / name)
         shutil.copy(tmp_path / "video.mp4", tmp_path / name)
-    still = {"name": "first", "question": "Why?", "answer": "So.", "figure": "picture.png", "video": None}
+    still = {"name": "first", "question": "Why?", "answer": "So.", "figure": "picture.svg", "video": None}
     found, complaints = opened(gallery({"first": still, "second": still | {"video": "video.mp4"}}), tmp_path)
     assert not complaints
     assert found["beyond"] <= 0

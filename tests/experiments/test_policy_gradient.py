@@ -160,7 +160,7 @@ def test_every_task_gets_its_figure(tmp_path):
     one = outcome(*throws, named("push_soft", 5), named("push_stiff", 5), named("hopper", 21), courses=[course])
     figures = save(drawings(one), one, tmp_path)
     assert [figure.file for figure in figures] == [
-        f"figures/{name}.png" for name in ("summary", "throw", "hopper", "push", "descent")
+        f"figures/{name}.svg" for name in ("summary", "throw", "hopper", "push", "descent")
     ]
     assert all((tmp_path / figure.file).is_file() for figure in figures)
     assert len(one.rows()) == 2 * 5 + 1

@@ -57,16 +57,16 @@ def test_a_power_of_ten_is_written_as_one(value, text):
 
 
 def test_the_answer_comes_first_then_its_picture_then_the_rest(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"")
+    (tmp_path / "a.svg").write_text("<svg></svg>")
     table = Table(columns=["x"], rows=[["1"]] * 13, caption="many")
     report = Report(
-        answer="It is `small`.", verdict="The verdict.", figures=[Figure("a.png", "a", "shown")], tables=[table],
+        answer="It is `small`.", verdict="The verdict.", figures=[Figure("a.svg", "a", "shown")], tables=[table],
         metrics=[], warnings=["beware"],
     )  # fmt: skip
     text = page(report, tmp_path, name="n", question="Why?", expected="", about={"Settings": {"key": "value"}})
     order = [
-        '<p class="answer">It is <code>small</code>.',
-        "<img",
+        "<h1>It is <code>small</code>.",
+        "<svg",
         "The verdict.",
         "beware",
         "13 rows",

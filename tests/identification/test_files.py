@@ -11,8 +11,8 @@ import pytest
 import mjxgrad as mg
 from mjxgrad import cli
 from mjxgrad.identification import files
+from mjxgrad.identification.page import _titles
 from mjxgrad.identification.parameters import write_all
-from mjxgrad.verdict.identified import _titles
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
   <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>

@@ -1,6 +1,7 @@
 """A scene and a cost of a user's own, swept over contact stiffness by one line."""
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
-from mjxgrad.verdict.sweep import Knob, scene_task
+from mjxgrad.check.sweep import Knob, scene_task
 
 # A block is pushed against a wall; its time step holds neither 1e6 1/s² (h²k + 2hb = 8) nor more.
 BLOCK = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody>
@@ -83,15 +84,17 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
 
 def test_the_page_has_answer_picture_table_and_sentence(swept):
     page = swept.as_html()
-    assert f"<h1>{swept.headline}</h1>" in page
+    assert f"<h1>{swept.headline}</h1>" in re.sub("</?span.*?>", "", page)
     assert page.count("<svg role=") == 1
-    assert "2500 (file)" in page
-    assert "h²k" in page.partition("</pre>")[2]
+    assert '<td class="number">2500 (file)</td>' in page
+    assert "h²k" in page.partition("</table>")[2]
 
 
-def test_without_matplotlib_the_page_says_what_draws_it(swept, monkeypatch):
+def test_without_matplotlib_page_and_picture_say_what_brings_it(swept, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    assert "mjxgrad[render]" in swept.as_html()
+    with pytest.raises(ImportError, match="matplotlib, not installed: pip install 'mjxgrad\\[render\\]'"):
+        swept.as_html()
     with pytest.raises(ImportError, match="mjxgrad\\[render\\]"):
         swept.result.plot()
 

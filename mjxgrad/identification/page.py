@@ -1,13 +1,12 @@
 """What an identification says, for a page and for programs: the answer, signals, values, and the motion before and after."""
 
-import base64
-import html
+import functools
 import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -16,13 +15,13 @@ import numpy as np
 from mjxgrad.identification import Identification, Recording, Stopped
 from mjxgrad.identification.files import simulated
 from mjxgrad.identification.recording import stack
+from mjxgrad.report import INK, Block, Table, page, svg
 from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
-from mjxgrad.verdict.page import document
 
-_WIDTH, _HEIGHT, _LEFT, _TOP = 360.0, 130.0, 66.0, 18.0
 _MOST_SIGNALS, _MOST_DOTS = 8, 300
 _FRAME = (240, 320)
+_SIZE = (4.6, 2.1)  # inches
 
 
 @dataclass(frozen=True)
@@ -101,94 +100,93 @@ class Identified:
         return json.dumps(table, indent=2, ensure_ascii=False)
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it."""
-        figures = "".join(self._figures())
-        told = "".join(f"<li class=fault>{html.escape(text.strip())}</li>" for text in self.result.warnings())
-        caption = "Dots: measured. Dashed: at the start of the search. Line: with the values found. Grey: held out."
-        number = f"{self.result.condition_number:.2g}"
+        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        number, (head, *rows) = f"{self.result.condition_number:.2g}", self.result.rows()
         condition = (
             f"Condition number {number}: beyond 100 or so, single intervals are much wider than those of combinations."
         )
-        body = (
-            f"{self._video()}<figure>{figures}<figcaption>{caption}</figcaption></figure>"
-            f"<ul>{told}<li>{condition}</li></ul>{self._table()}"
-        )
-        return document(f"mjxgrad identify {self.name}", self.headline, body, {"In words": self.result.summary()})
-
-    def _table(self) -> str:
-        head, *rows = self.result.rows()
-        cells = lambda row, tag: "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)  # noqa: E731
-        lines = f"<tr>{cells(head, 'th')}</tr>" + "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-        return f"<div class=scroll><table>{lines}</table></div>"
+        faults = [text.strip() for text in self.result.warnings()]
+        numbers = Block(faults=faults, items=[condition], table=Table(head, rows))
+        blocks = [self._video(), self._figures(), numbers, Block(folded="In words", code=self.result.summary())]
+        return page(self.headline, f"mjxgrad identify {self.name}", blocks)
 
     @property
     def _shown(self) -> Recording:
         """One motion: what was held out where it is the end of it, else the first."""
         return (self.held_out if len(self.recordings) == 1 and self.held_out else self.recordings)[0]
 
-    @cached_property
+    @functools.cached_property
     def _courses(self) -> tuple[dict[str, np.ndarray], ...]:
         windows, found = stack(self.scene, [self._shown]), self.result
         run = jax.jit(lambda scene, delay: simulated(scene, windows, delay))
         courses = [run(s, v.get("delay", 0.0)) for s, v in ((self.scene, found.start), (found.scene, found.values))]
         return tuple(jax.tree.map(np.asarray, course) for course in courses)
 
-    def _figures(self) -> list[str]:
+    def _measured(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return times and values of a signal, of the motion that was fitted first and of the one that is shown."""
+        motions = list({id(one): one for one in (self.recordings[0], self._shown)}.values())
+        return np.concatenate([m.times for m in motions]), np.concatenate([m.measured[name] for m in motions])
+
+    def _figures(self) -> Block:
         """Draw signals, those first that the search changed most."""
         before, after = self._courses
-        timestep = float(self.scene.model.opt.timestep)
-        motions = [*self.recordings[:1], *([self._shown] if self._shown is not self.recordings[0] else [])]
         signals = []
         for name in self._shown.measured:
-            titles = _titles(self.scene, name, before[name].shape[1])
-            for i in range(before[name].shape[1]):
-                times = np.concatenate([np.asarray(one.times) for one in motions])
-                values = np.concatenate([one.measured[name][:, i] for one in motions])
-                known = np.isfinite(values)
-                if known.any():
-                    spread = max(float(np.ptp(values[known])), 1e-12)
-                    change = float(np.abs(after[name][:, i] - before[name][:, i]).max()) / spread
-                    signals.append(
-                        (change, titles[i], times[known], values[known], before[name][:, i], after[name][:, i])
-                    )
+            times, rows = self._measured(name)
+            titles = _titles(self.scene, name, rows.shape[1])
+            for title, values, old, new in zip(titles, rows.T, before[name].T, after[name].T, strict=True):
+                if (known := np.isfinite(values)).any():
+                    change = np.abs(new - old).max() / max(np.ptp(values[known]), 1e-12)
+                    signals.append((change, title, times[known], values[known], old, new))
         signals.sort(key=lambda one: -one[0])
-        split = float(motions[0].times[-1]) if len(motions) > 1 else None
-        shown = [_panel(timestep, split, *one[1:]) for one in signals[:_MOST_SIGNALS]]
-        more = len(signals) - len(shown)
-        return [*shown, *([f"<p>The {len(shown)} of {len(signals)} signals that changed most.</p>"] if more else [])]
+        drawings = [
+            svg(lambda one=one: self._panel(*one[1:]), f"{one[1]} over time") for one in signals[:_MOST_SIGNALS]
+        ]
+        caption = "Dots: measured. Dashed: at the start of the search. Line: with the values found. Grey: held out."
+        if len(signals) > len(drawings):
+            caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
+        return Block(drawings=drawings, caption=caption)
 
-    def _video(self) -> str:
+    def _panel(self, title: str, times: np.ndarray, values: np.ndarray, before: np.ndarray, after: np.ndarray) -> Any:
+        """Draw one signal over time: measured, at the start, found; the curve at the start may leave the picture."""
+        import matplotlib.pyplot as plt
+
+        figure, axis = plt.subplots(figsize=_SIZE)
+        at = float(self.scene.model.opt.timestep) * np.arange(len(before))
+        end = max(at[-1], times.max())
+        if self._shown is not self.recordings[0]:
+            axis.axvspan(float(self.recordings[0].times[-1]), end, color="#8b94a1", alpha=0.2, lw=0)
+        few = slice(None, None, max(1, len(times) // _MOST_DOTS))
+        axis.plot(times[few], values[few], "o", color=INK, ms=2.5, mew=0, alpha=0.6)
+        axis.plot(at, before, "--", color="#d55e00", lw=1.2)
+        axis.plot(at, after, "-", color="#0072b2", lw=1.4)
+        low, high = (float(pick([pick(values), pick(after)])) for pick in (np.min, np.max))
+        room = 0.15 * (high - low) or max(abs(low), 1e-9)
+        axis.set_title(title, parse_math=False)  # whatever dollars are in a name
+        axis.set(xlabel="time, s", xlim=(0, end), ylim=(low - room, high + room))
+        return figure
+
+    def _video(self) -> Block:
         """Film the motion before and after, side by side, what was measured drawn into both where all of it was."""
-        one = self._shown
         before, after = (course["qpos"] for course in self._courses)
-        timestep = float(self.scene.model.opt.timestep)
+        film = functools.partial(render.frames, height=_FRAME[0], width=_FRAME[1])
+        at = float(self.scene.model.opt.timestep) * np.arange(len(before))
         words = "Left: at the start of the search. Right: with the values found."
-        parts = [*self.recordings[:1], one]
-        wholes = [(np.asarray(p.times), p.measured["qpos"]) for p in parts if "qpos" in p.measured]
-        height, width = _FRAME
         try:
-            shots = [
-                render.frames(s, q, height=height, width=width)
-                for s, q in zip((self.scene, self.result.scene), (before, after), strict=True)
-            ]
-            times = np.concatenate([t for t, _ in wholes]) if wholes else np.zeros(0)
-            rows = np.concatenate([q for _, q in wholes]) if wholes else np.zeros((0, self.scene.model.nq))
-            times, rows = times[(known := np.isfinite(rows).all(axis=1))], rows[known]
-            if len(times) > 1 and times[-1] >= (len(before) - 1.5) * timestep:
-                order = np.argsort(times)
-                nearest = np.abs(times[order] - timestep * np.arange(len(before))[:, None]).argmin(axis=1)
-                real = render.frames(self.scene, rows[order][nearest], height=height, width=width)
-                shots = [((shot.astype(np.uint16) + real) // 2).astype(np.uint8) for shot in shots]
-                words += " Both with what was measured drawn into them."
+            shots = [film(self.scene, before), film(self.result.scene, after)]
+            if "qpos" in self._shown.measured:
+                times, rows = self._measured("qpos")
+                known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+                known = known[np.argsort(times[known])]
+                if len(known) > 1 and times[known[-1]] >= (at[-1] + at[-2]) / 2:
+                    real = film(self.scene, rows[known][np.abs(times[known] - at[:, None]).argmin(axis=1)])
+                    shots = [((shot.astype(np.uint16) + real) // 2).astype(np.uint8) for shot in shots]
+                    words += " Both with what was measured drawn into them."
             with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / "motion.mp4"
-                render.write_video(path, np.concatenate(shots, axis=2))
-                data = base64.b64encode(path.read_bytes()).decode()
+                render.write_video(path := Path(folder) / "motion.mp4", np.concatenate(shots, axis=2))
+                return Block(video=path.read_bytes(), caption=words)
         except (RuntimeError, ValueError) as error:
-            return f"<p>No video: {html.escape(str(error))}</p>"
-        source = f"data:video/mp4;base64,{data}"
-        video = f'<video controls loop muted autoplay playsinline src="{source}"></video>'
-        return f"<figure>{video}<figcaption>{words}</figcaption></figure>"
+            return Block(text=f"No video: {error}")
 
 
 def _titles(scene: Scene, name: str, width: int) -> list[str]:
@@ -212,47 +210,8 @@ def _titles(scene: Scene, name: str, width: int) -> list[str]:
     return found
 
 
-def _panel(
-    timestep: float,
-    split: float | None,
-    title: str,
-    times: np.ndarray,
-    values: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-) -> str:
-    """Draw one signal: measured, at the start, found."""
-    at = timestep * np.arange(len(before))
-    shown = np.concatenate([values, after])
-    low, high = float(shown.min()), float(shown.max())
-    room = 0.15 * (high - low) or max(abs(low), 1e-9)
-    low, high = low - room, high + room
-    across = lambda t: _LEFT + t / max(at[-1], times.max()) * (_WIDTH - _LEFT - 8)  # noqa: E731
-    up = lambda y: _TOP + (_HEIGHT - _TOP - 22) * (1 - (np.clip(y, low, high) - low) / (high - low))  # noqa: E731
-    marks = []
-    if split is not None:
-        x, height = across(split), _HEIGHT - _TOP - 22
-        size = f'width="{_WIDTH - 8 - x:.1f}" height="{height}"'
-        marks.append(f'<rect class="out" x="{x:.1f}" y="{_TOP}" {size}/>')
-    few = slice(None, None, max(1, len(times) // _MOST_DOTS))
-    marks += [
-        f'<circle class="measured" cx="{x:.1f}" cy="{y:.1f}" r="1.6"/>'
-        for x, y in zip(across(times[few]), up(values[few]), strict=True)
-    ]
-    few = slice(None, None, max(1, len(at) // _MOST_DOTS))
-    for style, curve in (("before", before), ("after", after)):
-        points = "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(across(at[few]), up(curve[few]), strict=True))
-        marks.append(f'<path class="{style}" d="M{points}"/>')
-    marks.append(f'<text x="{_LEFT}" y="12">{html.escape(title)}</text>')
-    marks += [
-        f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{v:.3g}</text>' for v in (low + room, high - room)
-    ]
-    marks.append(f'<text x="{_WIDTH - 8}" y="{_HEIGHT - 6}" text-anchor="end">{at[-1]:.3g} s</text>')
-    return f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img">{"".join(marks)}</svg>'
-
-
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def _plain(value: np.ndarray) -> float | list | None:

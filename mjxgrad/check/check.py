@@ -17,12 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
-from mjxgrad.diagnostics.contacts import contacts_needed
-from mjxgrad.diagnostics.stability import StabilityReport, check_stability
-from mjxgrad.rollouts import Engine, Trajectory
-from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.scene.load import count_pairs
-from mjxgrad.verdict.findings import (
+from mjxgrad.check.figure import telling
+from mjxgrad.check.findings import (
     MANY_PAIRS,
     Finding,
     Recommendation,
@@ -34,10 +30,15 @@ from mjxgrad.verdict.findings import (
     static_findings,
     touch_speed,
 )
-from mjxgrad.verdict.measure import Measured, measure
-from mjxgrad.verdict.motions import Motions, first_keyframe, half_range, random_motions
-from mjxgrad.verdict.moving import Mover, Outcomes
-from mjxgrad.verdict.page import page
+from mjxgrad.check.measure import Measured, measure
+from mjxgrad.check.motions import Motions, first_keyframe, half_range, random_motions
+from mjxgrad.check.moving import Mover, Outcomes
+from mjxgrad.diagnostics.contacts import contacts_needed
+from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.report import Block, page
+from mjxgrad.rollouts import Engine, Trajectory
+from mjxgrad.scene import Scene, SceneError, load_scene
+from mjxgrad.scene.load import count_pairs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -132,9 +133,13 @@ class Verdict:
         return json.dumps(table, indent=2, ensure_ascii=False, default=str)
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it."""
-        details = self._details()
-        return page(self.name, self.headline, self.findings, self.code, details, self.measured, self.outcomes)
+        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        figure = telling(self.measured, self.outcomes) if self.measured and self.measured.lines else Block()
+        faults = [one.text for one in self.findings if one.is_fault]
+        notes = [one.text for one in self.findings if not one.is_fault]
+        folded = [Block(folded=title, code=text) for title, text in self._details().items()]
+        blocks = [figure, Block(faults=faults, items=notes), Block(title="To paste", code=self.code), *folded]
+        return page(self.headline, f"mjxgrad check {self.name}", blocks)
 
 
 def check(

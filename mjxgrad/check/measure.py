@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
+from mjxgrad.check.motions import Motions, half_range, pairs_at, smooth
+from mjxgrad.check.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
@@ -21,8 +23,6 @@ from mjxgrad.estimators.samples import Plan, Samples
 from mjxgrad.objective.base import unchanged
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
-from mjxgrad.verdict.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.verdict.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 
 _TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
 _SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
+from mjxgrad.check.measure import STDDEVS, Measured
+from mjxgrad.check.motions import Motions
+from mjxgrad.check.moving import REFINED
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene
-from mjxgrad.verdict.measure import STDDEVS, Measured
-from mjxgrad.verdict.motions import Motions
-from mjxgrad.verdict.moving import REFINED
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",

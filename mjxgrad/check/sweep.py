@@ -1,9 +1,7 @@
 """Bias and variance of gradients in a scene of one's own, over contact stiffness; scene, cost and start are given by names."""
 
 import functools
-import html
 import importlib
-import io
 import runpy
 import sys
 import warnings
@@ -23,19 +21,19 @@ from jaxtyping import Array, Float, PyTree
 from mjxgrad._arrays import is_known
 from mjxgrad._text import format_number
 from mjxgrad.bodies.kinematics import kinematics
+from mjxgrad.check.check import Cost, Source, _outcomes
+from mjxgrad.check.motions import half_range
+from mjxgrad.check.moving import CONTACT_FIELDS, compiler_options
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
+from mjxgrad.report import Block, Table, page, svg
 from mjxgrad.rollouts import Engine, Trajectory, initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Gradient
-from mjxgrad.verdict.check import Cost, Source, _outcomes
-from mjxgrad.verdict.motions import half_range
-from mjxgrad.verdict.moving import CONTACT_FIELDS, compiler_options
-from mjxgrad.verdict.page import document
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # and how many bodies or sites each is of
@@ -244,19 +242,14 @@ class Sweep:
         return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it, with a picture where matplotlib is installed."""
-        try:
-            file = io.StringIO()
-            self.result.plot().savefig(file, format="svg")
-            picture = file.getvalue().partition("<svg")[2]
-            picture = f'<svg role="img" aria-label="Bias and variance over stiffness, as in the table"{picture}'
-        except ImportError as error:
-            picture = html.escape(str(error))
-        question, table = html.escape(self.question), html.escape(self.result.summary(self.labels))
-        table, _, notes = table.partition("\n\n")
-        notes = "".join(f"<li>{note}</li>" for note in notes.splitlines())
-        body = f"<p>{question}</p><figure>{picture}</figure><pre>{table}</pre><ul>{notes}</ul>"
-        return document(f"mjxgrad sweep {self.name}", self.headline, body, {})
+        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        picture, (head, *rows) = (
+            svg(self.result.plot, "Bias and variance over stiffness"),
+            self.result.rows(self.labels),
+        )
+        told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
+        blocks = [Block(text=self.question, drawings=[picture], caption=told), Block(table=Table(head, rows))]
+        return page(self.headline, f"mjxgrad sweep {self.name}", [*blocks, Block(items=self.result.notes())])
 
 
 def sweep(

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.check.figure import telling
+from mjxgrad.check.findings import left_out_findings, measured_findings, recommend, slopes
+from mjxgrad.check.measure import Line, Measured, _estimates, measure
+from mjxgrad.check.motions import random_motions
+from mjxgrad.check.moving import KINDS, REFINED, Direction, Moved, Mover, change_of_poses
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
 from mjxgrad.scene.load import count_pairs
-from mjxgrad.verdict.findings import left_out_findings, measured_findings, recommend, slopes
-from mjxgrad.verdict.measure import Line, Measured, _estimates, measure
-from mjxgrad.verdict.motions import random_motions
-from mjxgrad.verdict.moving import KINDS, REFINED, Direction, Moved, Mover, change_of_poses
-from mjxgrad.verdict.page import page
 
 BALL = """<mujoco><option timestep="{timestep}"/><default><geom {contact}/></default><worldbody>
   <geom name="floor" type="plane" size="5 5 .1"/>
@@ -169,8 +169,8 @@ def test_questions_that_there_is_no_time_for_are_left_out_by_name():
         assert words in told.text
     advice = recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None)
     assert advice.gradient == "discrete"  # both are the slope
-    drawn = page("scene", "headline", (), "", {}, measured, ("speed",))
-    assert drawn.count('class="plain"') == 33  # a dot for each motion, and a legend
+    _, derivatives = telling(measured, ("speed",)).drawings
+    assert derivatives.count('style="fill: #d55e00') == 33  # a dot for each motion, and a legend
 
 
 class Rounding(OutOfTime):
