@@ -11,7 +11,7 @@ import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.settings import OwnScene
 from mjxgrad._mjx import mjx
-from mjxgrad.check.sweep import scene_task
+from mjxgrad.checking.sweep import scene_task
 
 Read = Callable[[Float[Array, " nq"], Float[Array, " nv"]], Float[Array, "..."]]
 

@@ -26,7 +26,7 @@ from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, 
 from experiments.words import joined, percent
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
-from mjxgrad.check.sweep import Knob
+from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import Engine

@@ -4,7 +4,7 @@ from mjxgrad import baselines, diagnostics, envs, estimators, identification, le
 from mjxgrad._programs import keep_compiled
 from mjxgrad.batched import over_devices
 from mjxgrad.bodies import set_const
-from mjxgrad.check import Verdict, check, sweep
+from mjxgrad.checking import Verdict, check, sweep
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify

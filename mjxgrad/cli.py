@@ -131,7 +131,7 @@ def check(
     def log(text: str) -> None:
         _say(f"{time.monotonic() - started:4.0f} s  {text}")
 
-    function = None if cost is None else importlib.import_module("mjxgrad.check.sweep").load_function(cost)
+    function = None if cost is None else importlib.import_module("mjxgrad.checking.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict.as_json() if as_json else verdict.summary(), flush=True)
     if html is not None:
@@ -283,7 +283,7 @@ def new(
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
-    key = importlib.import_module("mjxgrad.check.motions").first_keyframe(verdict.scene.mj_model)
+    key = importlib.import_module("mjxgrad.checking.motions").first_keyframe(verdict.scene.mj_model)
     text = TEMPLATE.format(
         name=repr(Path(scene).name)[1:-1].replace('"', "'"),  # within a docstring
         path=str(Path(scene)),
@@ -314,7 +314,7 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
     mg = _library()
     loaded = mg.load_scene(_existing(scene))
     if qpos is None:
-        from mjxgrad.check.motions import random_motions
+        from mjxgrad.checking.motions import random_motions
 
         states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
     else:

@@ -25,7 +25,7 @@ ORDER = (
     ("baselines",),
     ("diagnostics", "identification", "planning"),
     ("tasks",),
-    ("check", "envs"),
+    ("checking", "envs"),
     ("learning",),
     ("cli",),
     ("__main__",),

@@ -20,8 +20,8 @@ from experiments.motion import own_task
 from experiments.theme import power
 from experiments.words import percent
 from experiments.workspace import Workspace
-from mjxgrad.check.moving import compiler_options
-from mjxgrad.check.sweep import Knob
+from mjxgrad.checking.moving import compiler_options
+from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import BiasVariance, bias_variance, mean_interval
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall

@@ -19,7 +19,7 @@ from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems import published_scenes
 from experiments.workspace import Workspace
-from mjxgrad.check.motions import half_range
+from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
 from mjxgrad.diagnostics.comparison import affordable
 from mjxgrad.estimators import GradientEstimate, Reason, rules

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
-from mjxgrad.check.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.check.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
+from mjxgrad.checking.motions import Motions, half_range, pairs_at, smooth
+from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along

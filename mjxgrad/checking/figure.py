@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxgrad.check.measure import Line, Measured
+from mjxgrad.checking.measure import Line, Measured
 from mjxgrad.report import INK, Block, svg
 
 _SIZE = (4.6, 2.9)  # inches

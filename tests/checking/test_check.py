@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.check.figure import telling
-from mjxgrad.check.findings import left_out_findings, measured_findings, recommend, slopes
-from mjxgrad.check.measure import Line, Measured, _estimates, measure
-from mjxgrad.check.motions import random_motions
-from mjxgrad.check.moving import KINDS, REFINED, Direction, Moved, Mover, change_of_poses
+from mjxgrad.checking.figure import telling
+from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
+from mjxgrad.checking.measure import Line, Measured, _estimates, measure
+from mjxgrad.checking.motions import random_motions
+from mjxgrad.checking.moving import KINDS, REFINED, Direction, Moved, Mover, change_of_poses
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases

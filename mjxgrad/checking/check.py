@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
-from mjxgrad.check.figure import telling
-from mjxgrad.check.findings import (
+from mjxgrad.checking.figure import telling
+from mjxgrad.checking.findings import (
     MANY_PAIRS,
     Finding,
     Recommendation,
@@ -30,9 +30,9 @@ from mjxgrad.check.findings import (
     static_findings,
     touch_speed,
 )
-from mjxgrad.check.measure import Measured, measure
-from mjxgrad.check.motions import Motions, first_keyframe, half_range, random_motions
-from mjxgrad.check.moving import Mover, Outcomes
+from mjxgrad.checking.measure import Measured, measure
+from mjxgrad.checking.motions import Motions, first_keyframe, half_range, random_motions
+from mjxgrad.checking.moving import Mover, Outcomes
 from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page

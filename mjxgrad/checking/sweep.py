@@ -21,9 +21,9 @@ from jaxtyping import Array, Float, PyTree
 from mjxgrad._arrays import is_known
 from mjxgrad._text import format_number
 from mjxgrad.bodies.kinematics import kinematics
-from mjxgrad.check.check import Cost, Source, _outcomes
-from mjxgrad.check.motions import half_range
-from mjxgrad.check.moving import CONTACT_FIELDS, compiler_options
+from mjxgrad.checking.check import Cost, Source, _outcomes
+from mjxgrad.checking.motions import half_range
+from mjxgrad.checking.moving import CONTACT_FIELDS, compiler_options
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES

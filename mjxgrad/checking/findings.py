@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.check.measure import STDDEVS, Measured
-from mjxgrad.check.motions import Motions
-from mjxgrad.check.moving import REFINED
+from mjxgrad.checking.measure import STDDEVS, Measured
+from mjxgrad.checking.motions import Motions
+from mjxgrad.checking.moving import REFINED
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene

@@ -14,7 +14,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
-from mjxgrad.check.sweep import Knob, scene_task
+from mjxgrad.checking.sweep import Knob, scene_task
 
 # A block is pushed against a wall; its time step holds neither 1e6 1/s² (h²k + 2hb = 8) nor more.
 BLOCK = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody>
