@@ -55,9 +55,9 @@ def _falls_and_swings(names):
 
 
 def _tells_which_gradient_holds(names):
-    """Its time step does not hold 1e6 1/s²; the smoothed cost of a block pushed to a wall rises with the push."""
+    """A block 2 mm before a wall gets farther with a push. The time step does not hold 1e6 1/s²: first order is biased there."""
     table = names["found"].result.table()
-    assert (table["truth"][:2] > 0).all()  # but for 1e6
+    assert (table["truth"][:3] > 0.2).all()
     assert "h²k" in str(names["found"])
     assert "<svg" in Path("sweep.html").read_text()
 

@@ -342,7 +342,7 @@ def test_a_throw_through_the_softened_wall_has_no_teeth():
         place = np.linspace(-1, 1, len(values))
         return (values - np.polyval(np.polyfit(place, values, 5), place)).std()
 
-    assert roughness(costs(task)) < 0.05 * roughness(costs(task.with_onset(None)))
+    assert roughness(costs(task.with_onset(mg.Onset()))) < 0.05 * roughness(costs(task))
 
 
 _PUSHED = """
@@ -432,19 +432,11 @@ def test_an_impedance_without_a_width_begins_where_mujocos_does():
 
 @pytest.mark.slow
 def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
-    """The same push at 4 ms with the slope at MuJoCo's motion, which chatter multiplies.
-
-    A free flight grows by its duration at most.
-    """
-    scene = mg.load_scene(_PUSHED.format(timestep=1e-3, kind="sphere", turning=""))
-    controls = jnp.linspace(0.7, 0.98, 32)[:, None, None] * jnp.ones((240, 1))
-
-    def pushed(force, **how):
-        start = mg.initial_state(scene)
-        return mg.rollout(scene, start, force, measure_growth=True, **how)
-
-    event = jax.jit(jax.vmap(lambda force: pushed(force, gradient="slope")))(controls)
-    assert event.explodes.any()
+    """A pendulum of 1 cm on its head falls away as exp(t √(3g/2l)), in 0.4 s by exp(15). A free flight grows by its duration."""
+    unstable = mg.load_scene("""<mujoco><worldbody><body><joint axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .01" size=".0001"/></body></worldbody></mujoco>""")
+    fall = mg.rollout(unstable, mg.initial_state(unstable), horizon=200, measure_growth=True)
+    assert fall.explodes
     free = mg.load_scene(
         _PUSHED.replace('type="plane"', 'type="plane" pos="0 0 -9"').format(timestep=1e-3, kind="sphere", turning="")
     )

@@ -53,9 +53,10 @@ def test_published_scenes_move_as_in_c(name, settle):
 def test_all_kinds_of_rows_move_as_in_c(cone, integrator):
     """Condim 1, 3, 4, 6, limits of hinge, ball, slide and tendon, friction loss, couplings, tumbling bodies held together.
 
-    C stops an elliptic solve at an improvement of 1e-13, that is at forces known to about its root; hence 1e-6.
+    C stops an elliptic solve at an improvement of 1e-13, that is at forces known to about its root; hence 1e-6. With
+    implicitfast C takes the gyroscopic force of tumbling free bodies implicitly and MJX does not, of which load_scene warns.
     """
-    assert _largest_difference(*zoo(cone, integrator, welded=True), steps=30) < 1e-6
+    assert _largest_difference(*zoo(cone, integrator, welded=integrator != "implicitfast"), steps=30) < 1e-6
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
