@@ -1,4 +1,4 @@
-"""How far gradients can be trusted, measured."""
+"""Measurements of how far gradients can be trusted."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
 from mjxgrad.diagnostics.comparison import Comparison, Rollouts, Seconds, compare

@@ -1,14 +1,14 @@
-r"""Bias and variance of both kinds of gradient, against contact softness.
+r"""Bias and variance of first, zeroth and α-order gradients, against contact softness.
 
-The bias is against the gradient of the smoothed objective, found without either estimator that is on trial.
-For noise on a single parameter it is an integral over a line,
+The bias is relative to the gradient of the smoothed objective, computed without the estimators under test.
+For noise on a single parameter this gradient is an integral over a line,
 
 $$F'(\theta) = \int (f(x) - f(\theta)) \frac{x - \theta}{\sigma^2}
    \varphi\!\left(\frac{x - \theta}{\sigma}\right) \frac{dx}{\sigma},$$
 
-so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and $f$ evaluated at a random place in each:
-unbiased for any $f$, jumps and the fine saw teeth of simulated impacts included, with an error that falls as 1/cells
-at a jump and faster elsewhere. A quadrature on regular points would need a smooth $f$ to know its own error.
+so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and $f$ evaluated at a random place in each
+(stratified sampling). This is unbiased for any $f$, including jumps and the fine saw teeth of simulated impacts. The
+error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular points could not know its error at jumps.
 """
 
 import dataclasses
@@ -46,11 +46,17 @@ _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
 _LOOKS = {"first": ("#d55e00", "o", "-"), "zeroth": ("#0072b2", "s", "--"), "alpha_order": ("#009e73", "D", ":")}
-_TOO_STIFF = "without gaining energy"  # in what a scene says of a contact that its time step cannot follow
+_TOO_STIFF = "without gaining energy"  # part of the warning about a contact that the time step cannot follow
 
 
 class Landscape(eqx.Module):
-    """A cost along one parameter, at one random place, ascending, in each of many cells of one length."""
+    """A cost along one parameter, sampled at one random point in each of many equal cells.
+
+    Attributes:
+        points: the sampled parameter values, ascending.
+        costs: the cost at each point.
+        cell: the length of a cell.
+    """
 
     points: Float[Array, " cells"]
     costs: Float[Array, "*batch cells"]
@@ -59,17 +65,23 @@ class Landscape(eqx.Module):
     def smoothed_gradient(
         self, params: Float[Array, ""], stddev: Float[Array, ""], centre: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Give the gradient of the smoothed cost, at least `REACH` standard deviations inside the landscape.
+        """Return the gradient of the smoothed cost, and its standard error.
 
-        With it a standard error that is rather too large than too small; both NaN if a cost that carries weight is not
-        finite. The centre is a cost to compare with, such as that at `params` itself, not taken from these costs.
+        The point `params` must lie at least `REACH` standard deviations inside the landscape. The standard error errs on the
+        large
+        side. Both are NaN if a cost with weight is not finite.
+
+        Args:
+            params: the parameter at which the gradient is taken.
+            stddev: standard deviation of the noise.
+            centre: the baseline cost, such as the cost at `params`; it must not be one of these costs.
         """
         offset = (self.points - params) / stddev
         weight = offset / stddev * jax.scipy.stats.norm.pdf(offset) / stddev
         # Outside the reach a cost may be anything, also not finite.
         terms = jnp.where(jnp.abs(offset) <= REACH, (self.costs - centre) * weight, 0) * self.cell
-        # Neighbouring cells differ by the variance within them and by their means, so this is on the safe side. Two
-        # points per cell would give an unbiased one that mostly misses the only cell that matters: that of the jump.
+        # Neighbouring cells differ by their variances and their means, so this errs on the large side. Two points per cell
+        # would be unbiased, but mostly miss the only cell that matters: the one with the jump.
         variance = (jnp.diff(terms) ** 2).sum(axis=-1) / 2
         return terms.sum(axis=-1), jnp.sqrt(variance)
 
@@ -77,20 +89,20 @@ class Landscape(eqx.Module):
 def cell_points(
     key: PRNGKeyArray, low: Float[Array, ""], high: Float[Array, ""], num_cells: int
 ) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
-    """Draw one point in each of the equal cells of a line, ascending, and give the length of a cell."""
+    """Return one random point in each of the equal cells of a line, ascending, and the length of a cell."""
     cell = (high - low) / num_cells
     return low + cell * (jnp.arange(num_cells) + jax.random.uniform(key, (num_cells,), cell.dtype)), cell
 
 
 def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree:
-    """Apply a function under `jax.vmap` to points with a leading axis, some at a time.
+    """Apply a function under `jax.vmap` to points with a leading axis, one chunk at a time.
 
-    `jax.lax.map` with a batch size would compile the function a second time for what remains over.
+    `jax.lax.map` with a batch size would compile the function a second time for the remainder.
     """
     count = jax.tree.leaves(points)[0].shape[0]
     num_chunks = -(-count // chunk_size)
     size = -(-count // num_chunks)
-    # The last chunk is filled up with points that there are already.
+    # The last point fills up the last chunk.
     indices = jnp.minimum(jnp.arange(num_chunks * size), count - 1)
 
     def one_chunk(indices: Array) -> PyTree:
@@ -101,33 +113,36 @@ def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree
 
 
 class BiasVariance(eqx.Module):
-    """What `bias_variance` measured; `softness` × `points` are the leading axes.
+    """The measurements of `bias_variance`; the leading axes are `softness` × `points`.
 
-    An interval has its lower and upper ends on the very first axis and covers with chance `confidence`: Student's t for
+    The first axis of an interval holds its lower and upper end. Each interval has the coverage `confidence`: Student's t for
     means and biases, percentile bootstrap for variances.
 
     Attributes:
-        softness: what was swept, stacked.
+        softness: the contact softnesses, stacked.
         params: the points.
         first: the first-order estimates.
-        zeroth: the zeroth-order estimates, of the same rollouts.
-        alpha_order: the mean of α-order estimates from `alpha_samples` rollouts each, the same ones in batches, their variance
-            per rollout and their mean α; None for fewer than two batches, random starts, or an objective that does not know
-            its noise.
-        cost: without noise.
-        reference: the gradient of the smoothed cost, from rollouts of its own.
-        reference_error: its standard error.
-        reference_method: "landscape" (see `Landscape`), or a long run of what is unbiased however wrong derivatives are:
-            "control_variate" or, for random starts and where the noise is not known, "zeroth_order".
+        zeroth: the zeroth-order estimates, from the same rollouts.
+        alpha_order: the mean of the α-order estimates, each from one batch of `alpha_samples` of the same rollouts, with
+            their variance per rollout and their mean α. None for fewer than two batches, random starts, or an objective whose
+            noise is unknown.
+        cost: the cost without noise.
+        reference: the gradient of the smoothed cost, from separate rollouts.
+        reference_error: standard error of the reference.
+        reference_method: "landscape" (see `Landscape`), or the mean of many rollouts by an estimator that stays unbiased with
+            wrong derivatives: "control_variate", or "zeroth_order" for random starts and unknown noise.
         bias: first order less reference.
-        bias_error: its standard error, from both.
-        first_interval: of the mean of the first-order estimate; the other intervals likewise of what they are named for.
-        first_variance_interval: of the variance of one first-order sample.
-        zeroth_variance_interval: of the variance of one zeroth-order sample.
-        alpha_order_variance_interval: of the variance of α-order, per rollout.
-        landscape: the cost along the parameter at every softness, if there is only one parameter, with noise on it.
-        warnings: what the scene says of each softness, such as that the time step cannot follow it; often nothing.
-        confidence: of every interval.
+        bias_error: standard error of the bias, from both parts.
+        first_interval: interval of the mean first-order estimate; the intervals below are named alike.
+        zeroth_interval: interval of the mean zeroth-order estimate.
+        reference_interval: interval of the reference.
+        bias_interval: interval of the bias.
+        first_variance_interval: interval of the variance of one first-order sample.
+        zeroth_variance_interval: interval of the variance of one zeroth-order sample.
+        alpha_order_variance_interval: interval of the α-order variance per rollout.
+        landscape: the cost along the parameter at every softness; None unless there is a single parameter with noise.
+        warnings: the warnings of the scene at each softness, such as a time step that is too long; often empty.
+        confidence: coverage of every interval.
     """
 
     softness: PyTree
@@ -154,17 +169,18 @@ class BiasVariance(eqx.Module):
 
     @property
     def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
-        """What was swept, by name and value: stiffness, a plain array, or else the places in the list."""
+        """Name and values of the swept quantity: the stiffness, a plain array, or else the numbers 1, 2, ... of the list."""
         given = self.softness.stiffness if isinstance(self.softness, Softness) else self.softness
         if eqx.is_array(given) and given.ndim == 1:  # pyright: ignore[reportOptionalMemberAccess]
             return "softness" if given is self.softness else "stiffness, 1/s²", np.asarray(given, float)
         return "number", np.arange(1.0, len(self.cost) + 1)
 
     def table(self) -> dict[str, Shaped[np.ndarray, "softness points"]]:
-        """Return `truth` and of each estimate, such as `first`, `_bias` and `_variance`, with the ends `_low` and `_high`.
+        """Return `truth` and each estimate's bias and variance, such as `first_bias`, with ends `_low` and `_high`.
 
-        Of several parameters they are norms, with intervals on the safe side (see `BiasConstrained`). What `_is_biased` is so
-        beyond chance over the whole table.
+        For several parameters these are norms, with conservative intervals (see `BiasConstrained`). `_is_biased` says where a
+        bias
+        is significant over the whole table.
         """
         is_one = self.params.shape[1] == 1
         found: dict[str, Any] = {"finite_share": self.first.finite_fraction}
@@ -188,7 +204,7 @@ class BiasVariance(eqx.Module):
         return {name: np.asarray(value) for name, value in found.items() if name != "truth_is_biased"}
 
     def rows(self, labels: Sequence[str] | None = None) -> list[list[str]]:
-        """Return the table as text, its head first; labels name the softnesses in place of their numbers."""
+        """Return the table as text, header first; labels name the softnesses in place of their numbers."""
         (title, swept), table = self.knob, self.table()
         names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
         has_alpha = "alpha_order" in names
@@ -209,13 +225,13 @@ class BiasVariance(eqx.Module):
         ]
 
     def notes(self) -> list[str]:
-        """Say how the table is to be read, and what its time step is too long for."""
+        """Return sentences that explain the table, and a warning where the time step is too long."""
         what = "gradient" if self.params.shape[1] == 1 else "norm of the gradient"
         told = (
-            f"Truth: {what} of the cost under noise, from rollouts of its own; ± is half a {self.confidence:.0%} interval. "
-            "Variance: of one rollout. *: a bias beyond chance over the whole table."
+            f"Truth: {what} of the cost under noise, from separate rollouts; ± is half a {self.confidence:.0%} interval. "
+            "Variance: of one rollout. *: a bias that is significant over the whole table."
         )
-        return [told, *[f"!: the time step does not hold it. {text}." for text in self._too_stiff if text][:1]]
+        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1]]
 
     @property
     def _too_stiff(self) -> list[str]:
@@ -231,7 +247,7 @@ class BiasVariance(eqx.Module):
         return self.summary()
 
     def plot(self) -> Any:
-        """Draw bias and variance against softness by matplotlib, a column per point, and return the figure."""
+        """Draw bias and variance against softness by matplotlib, one column per point, and return the figure."""
         try:
             import matplotlib.pyplot as plt
         except ImportError as error:
@@ -271,31 +287,31 @@ def bias_variance(
     compiler_options: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BiasVariance:
-    r"""Measure estimates of the gradient of a smoothed cost, first, zeroth and α-order, at every softness and point.
+    r"""Measure bias and variance of first, zeroth and α-order gradient estimates at every softness and point.
 
-    The noise is the same at every softness, so that differences between them are not luck. Everything is compiled
-    once, in the first softness; the loop over the others is on the host, where progress can be shown. Samples are kept
-    for the bootstrap: memory grows with points × `num_samples` × dim.
+    All softnesses share the same noise, which makes differences between them visible. One program is compiled, at the first
+    softness. The loop over softnesses runs on the host, where it can report progress. Samples are kept for the bootstrap:
+    memory grows with points × `num_samples` × dim.
 
     Args:
-        objective_of_softness: gives the objective at one softness; traceable.
-        params: points to measure at, one per row, in the parameters' units; or a pytree whose floating-point arrays have
-            an axis of points first. The result has them as vectors.
+        objective_of_softness: function from one softness to the objective; traceable.
+        params: points to measure at, one per row, in the parameters' units; or a pytree whose floating-point arrays have a
+            leading axis of points. The result has them as vectors.
         key: consumed here.
         softness: any pytree whose leaves have a leading axis (`Softness.sweep`), or a sequence of pytrees.
         num_samples: differentiated rollouts per softness and point. At least 2.
-        num_reference: rollouts for the reference, per softness if the cost is of one parameter with noise on it (one
-            landscape serves all points), otherwise per softness and point.
-        alpha_samples: rollouts of one α-order estimate, which it chooses α by. At least 4.
-        baseline: of the zeroth-order estimate.
-        confidence: of the intervals.
-        num_resamples: of the bootstrap.
-        chunk_size: rollouts at a time.
-        compiler_options: of XLA.
-        progress: called after every softness with how many are done and how many there are.
+        num_reference: rollouts for the reference. They count per softness for a single parameter with noise (one landscape
+            serves all points), otherwise per softness and point. At least 4.
+        alpha_samples: rollouts of one α-order estimate, from which it also chooses α. At least 4.
+        baseline: the baseline of the zeroth-order estimate.
+        confidence: coverage of the intervals.
+        num_resamples: number of bootstrap resamples.
+        chunk_size: number of rollouts at a time.
+        compiler_options: options for XLA.
+        progress: called after every softness with the number done and the total.
 
     Returns:
-        The measurement.
+        The measurements.
 
     Raises:
         ValueError: if `params` is not a matrix, `softness` has no or unequal leading axes, or a number is out of range.
@@ -310,42 +326,17 @@ def bias_variance(
     whole("alpha_samples", alpha_samples, 4)
     stacked, count = _stacked(softness)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
-    told = []
-    for one in each:  # outside of a trace, where a scene knows its values
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            objective = objective_of_softness(one)
-        messages = [str(warning.message) for warning in caught if issubclass(warning.category, SceneWarning)]
-        told.append(tuple(dict.fromkeys(messages)))
-    # By the noise where it is known: the derivatives by the parameters follow from it, and α-order asks for it.
-    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances  # pyright: ignore[reportPossiblyUnboundVariable]
+    objective, told = _warned(objective_of_softness, each)
+    # Derivatives by the noise where it is known: α-order needs them, and those by the parameters follow.
+    knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
     wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
-    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1  # pyright: ignore[reportPossiblyUnboundVariable]
-    # But on a line the reference comes from more runs of the same program: there is nothing else to compile.
+    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
+    # Except on a line the reference comes from more runs of the same program, which saves a compilation.
     plan = Plan(num_samples, chunk_size, with_zero_noise=not is_line or baseline == "zero_noise", **wanted)
     batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
 
-    @jax.jit
-    def measure(
-        softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
-    ) -> tuple[dict[str, Any], Samples, Array | None]:
-        objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
-        samples_key, reference_key = jax.random.split(key)
-        by_noise = _sampled(objective, params, samples_key, plan)
-        samples = jax.vmap(_by_parameters)(by_noise) if knows_noise else by_noise
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
-        mixed = (None, None)
-        if batch is not None:
-            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)  # pyright: ignore[reportArgumentType]
-        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
-        if is_line:
-            size = max(2, chunk_size or DEFAULT_CHUNK_SIZE)
-            return found | _by_landscape(objective, params, reference_key, num_reference, size), samples, mixed[1]
-        unbiased = jax.vmap(_unbiased)(by_noise) if knows_noise else (zeroth.value, zeroth.standard_error)
-        found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
-        return found, samples, mixed[1]
-
-    # Compiled here, for a thread does not see what a `with` has set, such as the precision.
+    measure = _program(objective_of_softness, restore, plan, baseline, batch, num_reference if is_line else None)
+    # Compiled here, since a thread does not see settings made by `with`, such as the precision.
     compiled = compile_once(measure.lower(each[0], params, key), compiler_options)
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
@@ -366,7 +357,7 @@ def bias_variance(
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     variances = np.stack([row[1] for row in rows], axis=2)
     first, zeroth, reference, error = (found[name] for name in ("first", "zeroth", "reference", "reference_error"))
-    # Independent: the reference has rollouts of its own.
+    # Independent errors: the reference has separate rollouts.
     bias, bias_error = first.value - reference, jnp.hypot(first.standard_error, error)
     count_first, count_zeroth = first.num_finite[..., None], zeroth.num_finite[..., None]
     return BiasVariance(
@@ -377,20 +368,67 @@ def bias_variance(
         bias_error=bias_error,
         first_interval=mean_interval(first.value, first.standard_error, count_first, confidence),
         zeroth_interval=mean_interval(zeroth.value, zeroth.standard_error, count_zeroth, confidence),
-        # The reference averages over so many cells, or samples, that its t is a normal distribution.
+        # The reference averages so many cells or samples that its t distribution is normal.
         reference_interval=mean_interval(reference, error, 10**6, confidence),
         bias_interval=mean_interval(bias, bias_error, count_first, confidence),
         first_variance_interval=variances[0],
         zeroth_variance_interval=variances[1],
         alpha_order_variance_interval=None if batch is None else variances[2],
-        warnings=tuple(told),
+        warnings=told,
         reference_method="landscape" if is_line else "control_variate" if knows_noise else "zeroth_order",
         confidence=confidence,
     )
 
 
+def _warned(
+    objective_of_softness: Callable[[PyTree], Objective], each: Sequence[PyTree]
+) -> tuple[Objective, tuple[tuple[str, ...], ...]]:
+    """Return the objective at the last softness, and the scene's warnings at each."""
+    objectives, told = [], []
+    for one in each:  # outside of a trace, where a scene knows its values
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            objectives.append(objective_of_softness(one))
+        messages = [str(warning.message) for warning in caught if issubclass(warning.category, SceneWarning)]
+        told.append(tuple(dict.fromkeys(messages)))
+    return objectives[-1], tuple(told)
+
+
+def _program(
+    objective_of_softness: Callable[[PyTree], Objective],
+    restore: Callable | None,
+    plan: Plan,
+    baseline: str,
+    batch: int | None,
+    num_cells: int | None,
+) -> Any:
+    """Return the jitted measurement at one softness: estimates, samples, and α-order estimates in batches."""
+
+    @jax.jit
+    def measure(
+        softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
+    ) -> tuple[dict[str, Any], Samples, Array | None]:
+        objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
+        samples_key, reference_key = jax.random.split(key)
+        by_noise = _sampled(objective, params, samples_key, plan)
+        samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
+        mixed = (None, None)
+        if batch is not None:
+            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)  # pyright: ignore[reportArgumentType]
+        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
+        if num_cells is not None:
+            size = max(2, plan.chunk_size or DEFAULT_CHUNK_SIZE)
+            return found | _by_landscape(objective, params, reference_key, num_cells, size), samples, mixed[1]
+        unbiased = jax.vmap(_unbiased)(by_noise) if plan.by_noise else (zeroth.value, zeroth.standard_error)
+        found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
+        return found, samples, mixed[1]
+
+    return measure
+
+
 def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, plan: Plan) -> Samples:
-    """Roll out for both estimates, all points through one compiled body."""
+    """Roll out samples for both estimates; all points share one compiled body."""
     num_chunks, size = plan.chunks()
     points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
 
@@ -403,10 +441,10 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 
 
 def _by_parameters(samples: Samples) -> Samples:
-    """Pull derivatives and scores by the noise back to the parameters, for each unit and rollout."""
-    pull = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
-    gradients, scores = (pull(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
-    # Standard deviations are of the noise, and not known of the parameters.
+    """Apply the chain rule from the noise to the parameters, for the gradient and score of each unit and rollout."""
+    vjp = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
+    gradients, scores = (vjp(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
+    # These standard deviations belong to the noise; the parameters have none.
     known = {"gradients": gradients, "scores": scores, "stddevs": jnp.full_like(scores, jnp.nan)}
     return dataclasses.replace(samples, **known, pull_backs=Partial(unchanged))
 
@@ -414,7 +452,7 @@ def _by_parameters(samples: Samples) -> Samples:
 def _in_batches(
     samples: Samples, plan: Plan, size: int, zeroth: GradientEstimate
 ) -> tuple[GradientEstimate, Float[Array, "batches dim"]]:
-    """Make α-order estimates of so many samples each, as a descent would: their mean, and each of them."""
+    """Return the mean of the α-order estimates, one for each batch of `size` samples, and all of them."""
     count = plan.num_samples // size
     batches = jax.tree.map(lambda leaf: leaf[: count * size].reshape(count, size, *leaf.shape[1:]), samples)
 
@@ -438,7 +476,7 @@ def _in_batches(
 
 
 def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    """Give the unbiased part of α-order with its error; see `control_variate`."""
+    """Return the unbiased part of α-order and its standard error; see `control_variate`."""
     (parts,) = both_parts(samples, control_variate=True)
     value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
     return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
@@ -451,12 +489,12 @@ def _by_landscape(
     num_reference: int,
     chunk_size: int,
 ) -> dict[str, Any]:
-    """Take the cost and the reference from one landscape."""
+    """Compute the cost and the reference from one landscape."""
     stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
     low, high = params.min() - REACH * stddev, params.max() + REACH * stddev
     points, cell = cell_points(key, low, high, num_reference)
     everywhere = jnp.concatenate([points, params[:, 0]])
-    # One body for the landscape and for the points themselves: compiling it takes longer than running it.
+    # One body for the landscape and the points: compiling takes longer than running.
     costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, chunk_size)
     landscape, cost = Landscape(points, costs[:num_reference], cell), costs[num_reference:]
     gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
@@ -466,7 +504,7 @@ def _by_landscape(
 def _variance_intervals(
     samples: Samples, batches: Array | None, size: int, baseline: str, confidence: float, num_resamples: int
 ) -> Float[np.ndarray, "estimates 2 points"]:
-    """Bootstrap all variances at each point, per rollout: estimate, end of interval, point."""
+    """Bootstrap the variance per rollout of each estimate at each point; axes: estimate, interval end, point."""
     intervals = []
     for i in range(len(samples.costs)):
         terms = _terms(jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples), baseline)
@@ -476,7 +514,7 @@ def _variance_intervals(
 
 
 def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
-    """Give the samples of both estimates at one point; the leave-one-out baseline as the mean that it is up to 1/N."""
+    """Return the samples of both estimates at one point; leave-one-out is replaced by the mean, equal up to 1/N."""
     is_noisy = samples.is_noisy > 0
     costs, scores = samples.costs[is_noisy, 0], samples.scores[is_noisy, 0]
     finite = costs[np.isfinite(costs)]
@@ -490,7 +528,7 @@ def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points(params: PyTree) -> tuple[Float[Array, "points dim"], Callable | None]:
-    """Give the points as rows, and the way from a row to their form; None if they are rows."""
+    """Return the points as rows, and the function from a row back to the pytree; None if they are rows already."""
     if eqx.is_array_like(params):
         if jnp.ndim(params) != 2:
             raise ValueError(
@@ -503,7 +541,7 @@ def _points(params: PyTree) -> tuple[Float[Array, "points dim"], Callable | None
 
 
 def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:
-    """Give one pytree with a leading axis, and its length."""
+    """Return one pytree with a leading axis, and its length."""
     if isinstance(softness, list | tuple):
         if not softness:
             raise ValueError("softness must have at least one value, got none")

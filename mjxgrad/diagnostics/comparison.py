@@ -1,4 +1,4 @@
-"""Estimators side by side, at equal rollouts or at equal time."""
+"""Comparison of estimators at an equal number of rollouts or equal time."""
 
 import dataclasses
 import functools
@@ -20,17 +20,17 @@ from mjxgrad.objective import Objective, as_vector, flattened
 
 # Rollouts at a time over all repetitions that run together: enough to fill a CPU's vector units.
 _ROLLOUTS_AT_A_TIME = 4096
-# Numbers of samples that an estimator refuses (odd ones, say) lie between ones that it takes.
+# An estimator may refuse a number of samples (odd ones, say) and take the next smaller one.
 _NEIGHBOURS = 3
 # Time grows nearly linearly, so a line through two measurements hits at the second or third try.
 _CORRECTIONS = 4
 _FEWEST_TIMED = 4
-_MOST_SAMPLES = 1_000_000  # where the search ends, however cheap samples are
+_MOST_SAMPLES = 1_000_000  # upper end of the search, for very cheap samples
 
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
-    """A budget of rollouts per estimate, of those that the estimate itself reports; at least 2."""
+    """A budget of rollouts per estimate, as the estimate itself counts them; at least 2."""
 
     count: int
 
@@ -41,7 +41,7 @@ class Rollouts:
 
 @dataclasses.dataclass(frozen=True)
 class Seconds:
-    """A budget of wall time per estimate, compiled and warm: the median of the runs at each number of samples tried."""
+    """A budget of wall time per compiled estimate: the median over repeated runs at each number of samples."""
 
     seconds: float
     num_runs: int = 7
@@ -54,40 +54,39 @@ class Seconds:
 
 
 class Affordable(NamedTuple):
-    """What a budget buys: samples to ask for, and the median time of one such estimate; NaN if it was not measured."""
+    """The number of samples that a budget allows, and the median time of one such estimate; NaN if it was not measured."""
 
     num_samples: int
     seconds: float
 
 
 class Comparison(eqx.Module):
-    r"""What `compare` measured, one row per estimator in the order of `names`.
+    r"""The results of `compare`, one row per estimator in the order of `names`.
 
-    Everything is about the estimate as a whole, not about one sample of it. Intervals have their lower and upper ends
-    on the first axis.
+    All numbers concern the whole estimate, not a single sample. The first axis of an interval holds its lower and upper end.
 
     Attributes:
-        names: of the estimators.
-        num_samples: that each was asked for.
-        num_rollouts: that one estimate reports to have spent, at most the budget.
-        num_gradient_rollouts: of those, the ones that were differentiated.
-        seconds: median time of one estimate, compiled and warm; NaN for a budget of rollouts.
-        num_repeats: estimates of each.
-        num_finite: of those, the finite ones, which all that follows is taken from.
-        finite_fraction: mean share of finite samples within those.
-        mean: of the estimates.
+        names: names of the estimators.
+        num_samples: number of samples requested from each estimator.
+        num_rollouts: number of rollouts that one estimate reports, at most the budget.
+        num_gradient_rollouts: number of differentiated rollouts among them.
+        seconds: median time of one compiled estimate; NaN for a budget of rollouts.
+        num_repeats: number of estimates per estimator.
+        num_finite: number of finite estimates; all fields below use these alone.
+        finite_fraction: mean share of finite samples within the finite estimates.
+        mean: mean estimate.
         bias: mean less reference.
-        bias_interval: Welch's, with the reference's own error.
-        rmse: root-mean-square distance to the truth, the reference's variance taken off.
-        rmse_interval: see `root_mean_square_interval`.
+        bias_interval: Welch's interval, with the reference's own error.
+        rmse: root-mean-square distance to the truth, corrected for the reference's variance.
+        rmse_interval: interval of `rmse`, see `root_mean_square_interval`.
         variance: trace of the covariance of the estimates.
-        variance_interval: of it.
-        variance_methods: how each of those intervals was found, "chi_square" or "bootstrap".
-        claimed_variance: mean of what the estimates say of themselves, the sum of their squared standard errors; for an
-            honest estimator the same as `variance`.
-        reference: what was compared with.
-        reference_error: its standard error.
-        confidence: of every interval.
+        variance_interval: interval of the variance.
+        variance_methods: method of each variance interval, "chi_square" or "bootstrap".
+        claimed_variance: mean variance claimed by the estimates, the sum of their squared standard errors; an honest
+            estimator has it equal to `variance`.
+        reference: the true gradient.
+        reference_error: standard error of the reference.
+        confidence: coverage of every interval.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -113,7 +112,7 @@ class Comparison(eqx.Module):
 
     @property
     def is_biased(self) -> Bool[np.ndarray, " estimators"]:
-        """Whether some coordinate's interval of the bias leaves zero out; with many coordinates some do by chance."""
+        """Whether the bias interval of some coordinate excludes zero; with many coordinates some do by chance."""
         low, high = self.bias_interval
         return ((low > 0) | (high < 0)).any(axis=-1)
 
@@ -130,27 +129,27 @@ def compare(
     confidence: float = 0.95,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Measure root-mean-square error, bias and variance of estimators that may spend the same.
+    """Measure root-mean-square error, bias and variance of estimators under an equal budget.
 
-    Each estimator gets the largest `num_samples` for which the rollouts that it reports, or the time that it takes,
-    stay within the budget. Its repetitions are independent and run in one compiled program, which serves the next call
-    with the same estimator and shapes, too. All estimators have the same keys, so that differences are less luck.
+    Each estimator gets the largest `num_samples` whose reported rollouts, or measured time, stay within the budget. Its
+    repetitions are independent and run in one compiled program. A later call with the same estimator and shapes reuses that
+    program. All estimators share the same keys, which reduces chance differences.
 
     Args:
-        estimators: by name; each is called as `mjxgrad.estimators.zeroth_order` is. Settings are bound by
+        estimators: estimators by name; each is called like `mjxgrad.estimators.zeroth_order`. Bind settings by
             `functools.partial`.
-        objective: to estimate the gradient of.
-        params: where: a vector, or a pytree whose floating-point arrays the comparison then has as one vector.
+        objective: the objective to differentiate.
+        params: the point: a vector, or a pytree whose floating-point arrays the comparison then has as one vector.
         key: consumed here.
         budget: `Rollouts(count)` or `Seconds(seconds)` for one estimate.
-        reference: the true gradient, in the form of `params`, and its standard error; or the gradient alone if it is
-            exact (a closed form). The error is taken as known well: it comes from many more samples than an estimate has.
-        num_repeats: estimates of each. At least 2.
-        confidence: of the intervals.
-        progress: called after every estimator with how many are done and how many there are.
+        reference: the true gradient, in the form of `params`, and its standard error; or the gradient alone if it is exact (a
+            closed form). The error must be well known, from many more samples than an estimate has.
+        num_repeats: number of estimates per estimator. At least 2.
+        confidence: coverage of the intervals.
+        progress: called after every estimator with the number done and the total.
 
     Returns:
-        The comparison. Estimates that are not finite are counted, and left out.
+        The comparison. Estimates that are not finite are counted and left out.
 
     Raises:
         ValueError: if there is no estimator, the budget buys no estimate of one, fewer than two of its estimates are
@@ -218,7 +217,7 @@ def _row(
     error: Float[np.ndarray, " dim"],
     confidence: float,
 ) -> dict[str, object]:
-    """Work out all columns of one estimator."""
+    """Compute all columns for one estimator."""
     is_finite = np.isfinite(estimates.value).all(axis=-1)
     count = int(is_finite.sum())
     if count < 2:
@@ -280,7 +279,7 @@ def affordable(
     key: PRNGKeyArray,
     budget: Rollouts | Seconds,
 ) -> Affordable:
-    """Find the largest number of samples within a budget: of rollouts by tracing alone, of seconds by running."""
+    """Return the largest number of samples within a budget: rollouts are counted by tracing, seconds measured by running."""
     run = functools.partial(_estimate, estimator, objective, params, key)
     if isinstance(budget, Rollouts):
         return Affordable(_within_rollouts(run, budget.count), math.nan)
@@ -288,12 +287,12 @@ def affordable(
 
 
 def _within_rollouts(run: Callable[..., Any], count: int) -> int:
-    def reported(num_samples: int) -> int:  # all but the count is dead code, dropped before anything is compiled
+    def reported(num_samples: int) -> int:  # XLA drops all but the count as dead code
         return int(run(num_samples, True))
 
     num_samples, rollouts = _accepted(reported, count)
     while rollouts > count:
-        # In proportion, for an estimator may roll out several times per sample.
+        # Proportional, since an estimator may roll out several times per sample.
         fewer = min(num_samples - 1, num_samples * count // rollouts)
         num_samples, rollouts = _accepted(reported, fewer, f"budget of {count} rollouts buys no estimate; ")
     return num_samples
@@ -324,7 +323,7 @@ def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
         slope = max((high_time - low_time) / (high - low), 1e-12)
         guess = int(low + (budget.seconds - low_time) / slope)
         guess = min(max(guess, low + 1), high - 1)
-        if guess - low <= low // 50:  # nearer than a clock can tell
+        if guess - low <= low // 50:  # within the accuracy of the clock
             break
         tried, seconds = _accepted(timed, guess)
         if seconds <= budget.seconds:
@@ -343,7 +342,7 @@ def _estimate(
 
 
 def _accepted(measure: Callable[[int], Any], num_samples: int, context: str = "") -> tuple[int, Any]:
-    """Measure at a number of samples, or at the next smaller one that the estimator takes."""
+    """Measure at a number of samples, or at the next smaller one that the estimator accepts."""
     refusal = ValueError(f"num_samples must be positive, got {num_samples}")
     for candidate in range(num_samples, max(num_samples - _NEIGHBOURS, 0), -1):
         try:

@@ -1,4 +1,4 @@
-"""How many contacts recorded motions need room for, asked of C MuJoCo."""
+"""Number of contact slots that recorded motions need, as C MuJoCo counts them."""
 
 import mujoco
 import numpy as np
@@ -8,17 +8,17 @@ from mjxgrad.scene import Scene
 
 
 def contacts_needed(scene: Scene, trajectory: Trajectory, *, clearance: float = 0.01) -> int:
-    """Count the contacts that recorded motions came near at once, for `max_contacts` of `load_scene`.
+    """Count the simultaneous near contacts of recorded motions, for `max_contacts` of `load_scene`.
 
-    It is a guess about other motions, and `Trajectory.crowded` tells where it was too few. Call it on the host.
+    Other motions may need more; `Trajectory.crowded` tells where slots were too few. Call it on the host.
 
     Args:
-        scene: that the rollouts are of; one, not a batch.
-        trajectory: from `rollout`, batched or not; of motions like those to come.
-        clearance: a pair counts as near within this distance beyond its margin (m).
+        scene: the scene of the rollouts; one, not a batch.
+        trajectory: a result of `rollout`, batched or not, whose motions are typical.
+        clearance: distance beyond its margin within which a pair counts as near (m).
 
     Returns:
-        The largest number in any state, of those of one friction dimension; at least 1.
+        The largest number in any state among contacts of one friction dimension; at least 1.
 
     Raises:
         ValueError: if the positions are not finite or do not fit the scene, or the scene is batched or traced.
@@ -29,7 +29,7 @@ def contacts_needed(scene: Scene, trajectory: Trajectory, *, clearance: float = 
         raise ValueError(f"trajectory.qpos must have {full.nq} columns in this scene, got {qpos.shape[-1]}")
     if not np.isfinite(qpos).all():
         raise ValueError("trajectory.qpos must be finite, got numbers that are not")
-    full.geom_margin[:] += clearance / 2  # margins of a pair are added
+    full.geom_margin[:] += clearance / 2  # the margins of both geoms add up
     data, most = mujoco.MjData(full), 1
     for position in qpos.reshape(-1, full.nq):
         data.qpos[:] = position

@@ -1,8 +1,9 @@
-r"""What a horizon does to gradients: how fast derivatives grow, and from where on zeroth order is as good as first.
+r"""Effect of the horizon on gradients: growth of derivatives, and the horizon beyond which zeroth order is as good as first.
 
-The derivative of a state by an earlier one is the product of the Jacobians of the steps between. Its largest singular
-value $s_t$ bounds every derivative of an outcome at $t$; where motions part exponentially it grows as $e^{\lambda t}$, and
-the variance of a first-order estimate with $e^{2 \lambda t}$, while that of a zeroth-order one is bounded by the cost's.
+The derivative of a state with respect to an earlier one is the product of the step Jacobians between them. Its largest
+singular value $s_t$ bounds every derivative of an outcome at $t$. Where motions diverge exponentially it grows as
+$e^{\lambda t}$, and the variance of a first-order estimate as $e^{2 \lambda t}$. The cost bounds the variance of a
+zeroth-order estimate.
 
 References:
     Metz, Freeman, Schoenholz, Kachman. Gradients are Not All You Need. arXiv:2111.05803.
@@ -20,24 +21,24 @@ from mjxgrad.diagnostics.statistics import checked
 
 
 class Growth(eqx.Module):
-    """How a product of Jacobians grows with their number.
+    """The growth of a product of Jacobians with the number of factors.
 
     Attributes:
         log_largest: logarithm of the product's largest singular value, after each factor.
-        log_stretches: logarithms of how much the product stretches along orthogonal directions, the largest first in the
-            limit of many factors; over the time they tend to all Lyapunov exponents. Their sum is that of the determinant.
+        log_stretches: logarithms of the stretches along orthogonal directions, in the limit of many factors the largest
+            first. Divided by time they tend to the Lyapunov exponents. Their sum is the logarithm of the determinant.
     """
 
     log_largest: Float[Array, "*batch horizon"]
     log_stretches: Float[Array, "*batch horizon n"]
 
     def exponents(self, times: Float[Array, " horizon"]) -> Float[Array, "*batch horizon n"]:
-        """Give the finite-time Lyapunov exponents, in 1/s, from the times after each factor, in s."""
+        """Return the finite-time Lyapunov exponents (1/s) from the times after each factor (s)."""
         return self.log_stretches / times[:, None]
 
 
 def growth(jacobians: Float[Array, "*batch horizon n n"]) -> Growth:
-    """Multiply Jacobians of consecutive steps, the first one first, without overflow whatever their number."""
+    """Multiply Jacobians of consecutive steps, the first one first; any number of factors without overflow."""
     if jacobians.ndim > 3:
         return jax.vmap(growth)(jacobians)
     identity = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype)
@@ -46,7 +47,7 @@ def growth(jacobians: Float[Array, "*batch horizon n n"]) -> Growth:
         product, log_size, frame, log_stretch = carry
         product = factor @ product
         size = jnp.linalg.norm(product)
-        # A product that vanishes has no direction; its logarithm is minus infinity, and stays so.
+        # A vanishing product has no direction; its logarithm stays minus infinity.
         product, log_size = product / jnp.where(size > 0, size, 1.0), log_size + jnp.log(size)
         frame, triangle = jnp.linalg.qr(factor @ frame)
         log_stretch = log_stretch + jnp.log(jnp.abs(jnp.diagonal(triangle)))
@@ -60,10 +61,10 @@ def growth(jacobians: Float[Array, "*batch horizon n n"]) -> Growth:
 
 
 class Crossover(eqx.Module):
-    """The horizon from which on the second estimator is at least as good as the first.
+    """The horizon from which the second estimator is at least as good as the first.
 
     Attributes:
-        horizon: interpolated; infinite if it is not reached, the first horizon if it is so from the beginning.
+        horizon: interpolated horizon; infinite if there is no crossing, the first horizon if it is so from the beginning.
         low: lower end of its interval.
         high: upper end, infinite if resamples do not reach it.
         log_ratio: logarithm of the first estimator's mean squared error over the second's.
@@ -83,17 +84,18 @@ def crossover(
     confidence: float = 0.95,
     num_resamples: int = 1000,
 ) -> Crossover:
-    """Find where two estimators' mean squared errors cross for good, with a bootstrap interval over repeats.
+    """Find the last crossing of two estimators' mean squared errors, with a bootstrap interval over repeats.
 
-    For good: the last horizon at which the first one is better is followed by the crossing, so that a passing draw near the
-    beginning is none. Between horizons the logarithm of the ratio is interpolated.
+    The crossing follows the last horizon at which the first estimator is better, so brief draws before it do not count. The
+    logarithm of the error ratio is interpolated between horizons.
 
     Args:
-        horizons: increasing, in any unit.
+        horizons: the horizons, increasing, in any unit.
         first: squared errors of repeated estimates by the first estimator.
-        second: by the second, as often; repeats of both are drawn alike, for they may share rollouts.
-        confidence: of the interval.
-        num_resamples: of the bootstrap.
+        second: squared errors by the second estimator, as many; repeats of both are resampled together, since they may share
+            rollouts.
+        confidence: coverage of the interval.
+        num_resamples: number of bootstrap resamples.
 
     Returns:
         The horizon and its interval.
@@ -113,13 +115,13 @@ def crossover(
     log_ratio = _log_ratio(first.mean(axis=0), second.mean(axis=0))
     draws = np.random.default_rng(0).integers(len(first), size=(num_resamples, len(first)))
     found = [_last_crossing(horizons, _log_ratio(first[one].mean(axis=0), second[one].mean(axis=0))) for one in draws]
-    # The nearest ones, not between: infinity minus infinity is no number.
+    # Without interpolation, since infinity minus infinity is NaN.
     low, high = np.quantile(found, [tail, 1 - tail], method="nearest")
     return Crossover(_last_crossing(horizons, log_ratio), float(low), float(high), log_ratio)
 
 
 def _log_ratio(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    # Two errors of zero are alike.
+    # Two errors of zero are equal.
     tiny = np.finfo(float).tiny
     return np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
 

@@ -1,8 +1,8 @@
-r"""Where along a path a quantity jumps, told from where it is merely steep.
+r"""Jumps of a quantity along a path, distinguished from steep slopes.
 
-On a grid a jump and a steep slope look alike. They differ under refinement: within ever shorter intervals the change of a
-slope shrinks with the length, that of a jump stays. So the intervals with the largest changes are divided, the part that
-holds the most of the change is divided again, and what still stands after some rounds is a jump.
+On a grid a jump and a steep slope look alike, but they differ under refinement. The change of a slope shrinks with the
+interval, the change of a jump does not. So the intervals with the largest changes are divided, and within each the part
+with the largest change is divided again. A change that remains after some rounds is a jump.
 """
 
 from collections.abc import Callable
@@ -11,23 +11,23 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-# What a division may leave of a change that is a jump; a slope keeps one part in many, a square root the root of that.
+# A jump keeps at least this share of its change in a division. A slope keeps one part in many, a square root its root.
 _KEPT = 0.5
 
 
 class Jumps(eqx.Module):
-    """The jumps of a quantity along a path, in their order; sizes are Euclidean norms over the outcome.
+    """The jumps of a quantity along a path, in order; sizes are Euclidean norms over the outcome.
 
     Attributes:
-        parameters: of the grid.
-        values: there.
-        places: of the jumps.
+        parameters: parameters of the grid.
+        values: values on the grid.
+        places: parameters at which the jumps are.
         before: the value just before each.
         after: the value just after each.
-        steepest: the largest change per parameter of the intervals that were divided and hold no jump; zero without any.
+        steepest: the largest change per parameter among divided intervals without a jump; zero if there are none.
         scale: largest size of a value on the grid.
-        resolution: length to which intervals were divided: a slope over less than this counts as a jump.
-        num_finite: grid points whose value is finite; beside others no jump is looked for.
+        resolution: length of the finest intervals: a slope over less than this counts as a jump.
+        num_finite: number of grid points whose value is finite; jumps are found between such points only.
     """
 
     parameters: Float[np.ndarray, " points"]
@@ -42,23 +42,23 @@ class Jumps(eqx.Module):
 
     @property
     def sizes(self) -> Float[np.ndarray, " jumps"]:
-        """Of the jumps, in the quantity's units."""
+        """The sizes of the jumps, in the quantity's units."""
         return _norm(self.after - self.before)
 
     @property
     def relative(self) -> Float[np.ndarray, " jumps"]:
-        """Sizes over the larger of the values before and after: 1 where it falls to zero, √2 where it turns by a right angle."""
+        """Sizes over the larger of the values before and after: 1 for a fall to zero, √2 for a turn by a right angle."""
         larger = np.maximum(_norm(self.before), _norm(self.after))
         return self.sizes / np.where(larger > 0, larger, 1.0)
 
     @property
     def largest(self) -> int:
-        """Which jump is the largest in size; −1 without any."""
+        """The index of the largest jump; −1 if there is none."""
         return int(np.argmax(self.sizes)) if len(self.places) else -1
 
     @property
     def share(self) -> float:
-        """Part of the quantity's total variation that is jumps; zero if it does not vary."""
+        """The share of the quantity's total variation that is jumps; zero if it does not vary."""
         steps = _norm(np.diff(self.values, axis=0))
         total = float(steps[np.isfinite(steps)].sum())
         return min(1.0, float(self.sizes.sum()) / total) if total > 0 else 0.0
@@ -75,23 +75,24 @@ def jumps_along(
 ) -> Jumps:
     """Find the jumps of a quantity along a one-parameter path.
 
-    Of two jumps between neighbouring points of the grid the larger one is found.
+    Between two neighbouring points of the grid only the largest jump is found.
 
     Args:
-        function: from many parameters at once to their values, such as `jax.jit(jax.vmap(f))` or a loop over C MuJoCo. Called
-            with `num_points` parameters each time, so that it is compiled once.
-        interval: of the parameter.
-        num_points: of the grid, and of each refinement; a multiple of `num_candidates`.
-        num_candidates: intervals that are refined, those with the largest changes: the most jumps that can be found.
-        num_refinements: rounds, each of which divides the intervals into `num_points / num_candidates + 1` parts.
-        smallest: jump that counts, as a share of the largest value on the grid.
+        function: from many parameters at once to their values, such as `jax.jit(jax.vmap(f))` or a loop over C MuJoCo. Every
+            call has `num_points` parameters, so that one compilation suffices.
+        interval: first and last parameter.
+        num_points: number of points of the grid and of each refinement; a multiple of `num_candidates`.
+        num_candidates: number of intervals to refine, those with the largest changes; also the largest number of jumps.
+        num_refinements: number of rounds; each divides the intervals into `num_points / num_candidates + 1` parts.
+        smallest: smallest jump that counts, as a share of the largest value on the grid.
 
     Returns:
         The jumps, and the grid.
 
     Raises:
-        ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` of at least that many and two,
-            there is no round, or the function does not return one value per parameter.
+        ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least that many and
+            two,
+            `num_refinements` is below 1, or the function does not return one value per parameter.
     """
     low, high = interval
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
@@ -128,7 +129,7 @@ def jumps_along(
 def _refine(
     function: Callable, grid: np.ndarray, values: np.ndarray, num_candidates: int, num_refinements: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bool[np.ndarray, " candidates"]]:
-    """Return the intervals that were divided, the values at their ends, their last changes, and which of these stayed."""
+    """Return the divided intervals, the values at their ends, their last changes, and whether each change remained."""
     steps = _changes(values)
     chosen = np.argsort(-steps, kind="stable")[:num_candidates]
     ends = np.stack([grid[chosen], grid[chosen + 1]], axis=1)
@@ -139,7 +140,7 @@ def _refine(
     rows = np.arange(len(chosen))
     for _ in range(num_refinements):
         between = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * inner
-        # The grid has one interval less than points, so a last row may be missing; the batch keeps its length all the same.
+        # The grid has one interval less than points, so a last row may be missing; the batch keeps its length.
         batch = np.resize(between.ravel(), len(grid))
         found = _evaluate(function, batch)[: between.size].reshape(*between.shape, *values.shape[1:])
         places = np.concatenate([ends[:, :1], between, ends[:, 1:]], axis=1)

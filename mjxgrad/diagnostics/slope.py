@@ -1,19 +1,18 @@
-r"""Is a derivative the slope? Derivatives of an outcome against the slope of the simulated outcome itself.
+r"""Comparison of derivatives of a simulated outcome with the slope of the outcome itself.
 
-A simulated outcome depends on where within a time step each contact begins. Along a parameter it is therefore a smooth
-trend plus a sawtooth: a short difference quotient meets a tooth's flank, which is what the derivative of the discrete
-map gives, while the motion, and every cost averaged over a little noise, follows the trend. Here the outcome is
-simulated at many parameters over an interval that holds many teeth, and the trend's slope is compared with the mean of
-derivatives over the same interval.
+A simulated outcome depends on the phase of each contact within its time step. Along a parameter it is therefore a smooth
+trend plus a sawtooth. A short difference quotient measures a tooth's flank, and so does the derivative of the discrete map.
+The motion, and every cost averaged over a little noise, follows the trend. Here the outcome is simulated at many parameters
+over an interval with many teeth, and the trend's slope is compared with the mean derivative over the same interval.
 
 Both are averages with the same weight. A straight line fitted with weights $W(u) = 1 - u^2$, $u \in (-1, 1)$ being the
 place in the interval, has the slope
 
 $$\frac{\int u W f}{\int u^2 W} = \int k f', \qquad k(u) = \tfrac{15}{16} (1 - u^2)^2,$$
 
-by parts, since $k' = -\tfrac{15}{4} u W$ and $k$ vanishes at the ends. So wherever the outcome is smooth the slope equals
-the mean of its derivative with weight $k$, whatever the curvature; they differ by what derivatives do not see, the
-jumps. The same smooth weight averages over teeth: a cut tooth at an end counts for nothing.
+integrating by parts, since $k' = -\tfrac{15}{4} u W$ and $k$ vanishes at the ends. Wherever the outcome is smooth, the slope
+equals its mean derivative with weight $k$ for any curvature. They differ by the jumps, which derivatives do not see. The
+smooth weight also averages over teeth: it vanishes at the ends, where teeth are cut.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,33 +25,33 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 Simulate = Callable[[Float[Array, ""], str], Float[Array, "*outcome"]]
 
-# Fewest phases from which four local slopes and eight blocks for the error bar can be had, with four points each.
+# Fewest phases for four local slopes and eight blocks of the error bar, with four points each.
 _FEWEST_PHASES = 32
 _NUM_WINDOWS = 4
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
-_ROUNDINGS = 1e3  # of the outcome's precision, that many steps may add up
+_ROUNDINGS = 1e3  # rounding errors of the outcome that many steps may add up
 
 
 class SlopeComparison(eqx.Module):
-    """Derivatives beside the slope; units are those of the outcome over those of the parameter.
+    """Derivatives beside the slope, in units of the outcome over those of the parameter.
 
-    Where fewer than 32 phases are finite, numbers are NaN, and judgements (`is_close`, `is_off`, `is_resolved`) are False.
+    With fewer than 32 finite phases, numbers are NaN and judgements (`is_close`, `is_off`, `is_resolved`) are False.
 
     Attributes:
         gradients: names of the derivatives, in the order of their axis.
-        parameters: at which the outcome was simulated, increasing.
-        outcomes: simulated.
-        derivatives: at each phase.
-        slope: of the simulated outcome, fitted over the interval.
-        slope_error: its standard error. Conservative where many phases share a tooth, for their errors then cancel.
-        mean: of each derivative over the interval, weighted as the slope is.
-        mean_error: its standard error.
+        parameters: parameters of the simulated outcomes, increasing.
+        outcomes: the simulated outcomes.
+        derivatives: the derivatives at each phase.
+        slope: slope of the simulated outcome, fitted over the interval.
+        slope_error: standard error of the slope. Conservative where many phases share a tooth, for their errors then cancel.
+        mean: mean of each derivative over the interval, weighted like the slope.
+        mean_error: standard error of the mean.
         spread: standard deviation of each derivative over the phases.
-        local_slopes: of the outcome over each quarter of the interval.
-        num_teeth: how often the outcome crosses its own trend, halved: about the number of teeth in the interval.
-        num_finite: phases at which outcome and derivatives are finite; only these count.
-        resolution: what rounding of the outcome leaves of a slope; smaller errors are none.
+        local_slopes: slope of the outcome over each quarter of the interval.
+        num_teeth: half the number of crossings of the outcome with its trend: about the number of teeth in the interval.
+        num_finite: number of phases with finite outcome and derivatives; only these count.
+        resolution: error of the slope by rounding of the outcome; smaller errors mean nothing.
     """
 
     gradients: tuple[str, ...] = eqx.field(static=True)
@@ -71,14 +70,14 @@ class SlopeComparison(eqx.Module):
 
     @property
     def standard_error(self) -> Float[np.ndarray, "gradients *outcome"]:
-        """Of `error`: both parts as if independent, which they nearly are, one being about jumps and one about flanks."""
+        """Standard error of `error`, both parts taken as independent: one concerns mainly jumps, the other flanks."""
         return np.hypot(self.mean_error, self.slope_error)
 
     @property
     def irregularity(self) -> Float[np.ndarray, "*outcome"]:
-        """How far the slopes of the quarters are off a straight line through them, over `scale`.
+        """Deviation of the quarters' slopes from a straight line through them, over `scale`.
 
-        Small where a slope exists to be compared with; of order one where the outcome is torn, by chaos or by real
+        Small where a slope exists to compare with. It is of order one where the outcome is torn, by chaos or real
         discontinuities, or where a quarter holds too few teeth.
         """
         place = np.arange(_NUM_WINDOWS) - (_NUM_WINDOWS - 1) / 2
@@ -95,8 +94,8 @@ class SlopeComparison(eqx.Module):
 
     @property
     def scale(self) -> Float[np.ndarray, "*outcome"]:
-        """What errors are measured by: the larger of the slope and the error of the first derivative named."""
-        # Where both are nothing but rounding, no error is to look large beside it.
+        """The unit of errors: the larger of the slope and the error of the first derivative named."""
+        # Where both are mere rounding, no error must look large relative to it.
         return np.asarray(np.maximum(np.maximum(np.abs(self.slope), np.abs(self.error[0])), self.resolution))
 
     @property
@@ -106,15 +105,18 @@ class SlopeComparison(eqx.Module):
         return np.where(size > self.resolution, size, 0 * size) / self.scale
 
     def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
-        """Say where the mean of a derivative is the slope to within `tolerance` times `scale`."""
+        """Return whether each mean derivative equals the slope to within `tolerance` times `scale`."""
         return self.relative_error <= tolerance
 
     def is_off(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
-        """Say where it is not, beyond two standard errors. What is neither close nor off needs more rollouts."""
+        """Return whether each mean derivative is off by more than that, beyond two standard errors.
+
+        If it is neither close nor off, add rollouts.
+        """
         return np.abs(self.error) - 2 * self.standard_error > np.maximum(tolerance * self.scale, self.resolution)
 
     def is_resolved(self, tolerance: float = 0.05) -> Bool[np.ndarray, "*outcome"]:
-        """Say where the slope is known well enough to judge by: its standard error is below `tolerance` times `scale`."""
+        """Return whether the slope is known well enough: its standard error is below `tolerance` times `scale`."""
         return np.asarray(self.slope_error <= np.maximum(tolerance * self.scale, self.resolution))
 
 
@@ -128,14 +130,14 @@ def derivative_against_slope(
     """Compare derivatives of a simulated outcome with the slope of the outcome itself.
 
     Args:
-        simulate: from a parameter and the name of a gradient to the outcome, of any shape; for instance positions at
+        simulate: function from a parameter and the name of a gradient to the outcome, of any shape. For instance positions at
             several times of `mg.rollout(..., gradient=gradient)` from a start that depends on the parameter. Its value must
-            not depend on the name. Compiled once per name for all phases; it is compiled anew for each function object,
-            unless it is a pytree (`jax.tree_util.Partial`, `eqx.Module`) whose arrays alone differ.
-        interval: of the parameter. Long enough that the first contact moves through ten time steps or more, and short
+            not depend on the name. It is compiled once per name and function object; a pytree (`jax.tree_util.Partial`,
+            `eqx.Module`) is reused where only its arrays differ.
+        interval: first and last parameter. Long enough that the first contact moves through ten time steps or more, and short
             enough that the motion stays of one kind.
-        num_phases: simulated rollouts, spread evenly but for a jitter that keeps them from falling in step with the teeth.
-        gradients: names to hand to `simulate`. The first is what errors of the others are measured beside.
+        num_phases: number of simulated rollouts, evenly spread with a jitter that avoids resonance with the teeth.
+        gradients: names to hand to `simulate`. Errors of the others are measured relative to the first.
 
     Returns:
         Slope, means and their errors.
@@ -152,10 +154,10 @@ def derivative_against_slope(
 
 
 def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, " phases"]:
-    """Give parameters spread over an interval, one in each of equal parts, at a random place in it.
+    """Return parameters spread over an interval, one at a random place in each of equal parts.
 
-    Evenly spaced ones might all meet the same phase of the time step, and so do regular displacements (multiples of the
-    golden ratio) for some lengths of tooth. The places are the same in every call, and increase.
+    Evenly spaced ones might all have the same phase within the time step. For some lengths of tooth so might regular
+    displacements (multiples of the golden ratio). The places are the same in every call, and increase.
 
     Raises:
         ValueError: if the interval is empty or `num_phases` is below 32.
@@ -175,13 +177,13 @@ def compare_to_slope(
     derivatives: Sequence[ArrayLike],
     gradients: Sequence[str] = ("discrete", "slope"),
 ) -> SlopeComparison:
-    """Compare derivatives with the slope, from what was simulated elsewhere.
+    """Compare given derivatives with the slope of given outcomes.
 
     Args:
-        parameters: increasing; about evenly spaced, as `phases` gives them.
-        outcomes: at each parameter.
+        parameters: the parameters, increasing and about evenly spaced, as `phases` returns them.
+        outcomes: the outcome at each parameter.
         derivatives: for each gradient, one per outcome.
-        gradients: their names.
+        gradients: names of the gradients.
 
     Returns:
         Slope, means and their errors.
@@ -207,7 +209,7 @@ def compare_to_slope(
     slope, slope_error, local_slopes, num_teeth, mean, mean_error, spread, num_finite = (
         np.moveaxis(part, 0, -1).reshape((*part.shape[1:], *y.shape[1:])) for part in parts
     )
-    # Of an outcome that is zero throughout: not zero, for errors are divided by it.
+    # Positive even for an outcome of zeros, since errors are divided by it.
     size = np.maximum(np.nanmax(np.abs(y), axis=0, initial=0), np.finfo(float).tiny)
     return SlopeComparison(
         gradients=tuple(gradients),
@@ -236,7 +238,7 @@ def _sample(simulate: Simulate, parameters: Float[Array, " phases"], gradient: s
 
 
 def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients phases"]) -> tuple:
-    """Compare for a single outcome, the interval being (-1, 1)."""
+    """Compare a single outcome over the interval (-1, 1)."""
     is_finite = np.isfinite(y) & np.isfinite(slopes).all(axis=0)
     count = int(is_finite.sum())
     if count < _FEWEST_PHASES:
@@ -245,7 +247,7 @@ def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients p
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
     lever = _lever(u, weight)
-    # A trend of degree 3, for curvature is no error of the slope.
+    # A trend of degree 3, since curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
     slope_error = _clustered(lever * rest)
     kernel = weight**2 / (weight**2).sum()
@@ -264,13 +266,13 @@ def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients p
 
 
 def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Give the numbers whose product with an outcome is the slope of the weighted straight line."""
+    """Return the weights whose product with an outcome is the slope of the weighted straight line."""
     centred = u - (weight @ u) / weight.sum()
     return weight * centred / (weight @ centred**2)
 
 
 def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
-    """Return what a polynomial trend leaves, each as if its own point had not been fitted."""
+    """Return the leave-one-out residuals of a polynomial trend."""
     root = np.sqrt(np.maximum(weight, 0))
     basis, _ = np.linalg.qr(root[:, None] * np.polynomial.legendre.legvander(u, degree))
     leverage = (basis**2).sum(axis=1)
@@ -279,9 +281,9 @@ def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) ->
 
 
 def _clustered(terms: np.ndarray) -> float:
-    """Give the standard error of a sum of weighted residuals, those of a block of neighbours taken as one.
+    """Return the standard error of a sum of weighted residuals, clustered in blocks of neighbours.
 
-    Neighbours on one tooth err together, so single residuals would understate the error.
+    Neighbours on one tooth have correlated errors, so single residuals would understate it.
 
     References:
         Bell, McCaffrey. Bias reduction in standard errors for linear regression with multi-stage samples. Survey

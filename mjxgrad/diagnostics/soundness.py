@@ -1,8 +1,8 @@
-"""Whether a gradient is one: finite, of a rollout that did not diverge, and not exploding.
+"""Checks that a gradient is usable: finite, from a rollout that did not diverge, and not exploding.
 
-`Trajectory.diverged` speaks of the motion. A derivative can overflow while the motion is fine, and it is zero or stale
-where a rollout diverged and its state was held. Estimators leave such samples out and count them; whoever calls
-`jax.grad` on a rollout can ask here.
+`Trajectory.diverged` concerns the motion only. A derivative can overflow although the motion is fine. It is zero or stale
+where a rollout diverged and its state was held. Estimators leave out and count such samples; direct users of `jax.grad`
+on a rollout can check here.
 """
 
 import equinox as eqx
@@ -17,14 +17,14 @@ class UnsoundGradientError(FloatingPointError):
 
 
 class Soundness(eqx.Module):
-    """What there is to say of a gradient; under `jax.vmap` every field gains leading axes.
+    """The state of a gradient; under `jax.vmap` every field gains leading axes.
 
     Attributes:
-        is_sound: whether it can be used: all that follows is well.
-        num_nonfinite: of its numbers.
+        is_sound: whether the gradient can be used: no fault below occurs.
+        num_nonfinite: number of entries that are not finite.
         largest: largest finite magnitude in it.
-        explodes: whether that exceeds the bound.
-        diverged: whether the rollout did.
+        explodes: whether the largest magnitude exceeds the bound.
+        diverged: whether the rollout diverged.
     """
 
     is_sound: Bool[Array, ""]
@@ -35,15 +35,15 @@ class Soundness(eqx.Module):
 
 
 def soundness(gradient: PyTree, diverged: Bool[ArrayLike, ""] = False, *, bound: float | None = None) -> Soundness:
-    """Look at a gradient of a rollout, inside or outside of `jax.jit`.
+    """Check a gradient of a rollout, inside or outside of `jax.jit`.
 
     Args:
         gradient: any pytree of floating-point arrays, as `jax.grad` returns it.
-        diverged: of the trajectory that it belongs to.
-        bound: beyond which a magnitude counts as exploding; None asks for finite numbers only.
+        diverged: the flag `diverged` of its trajectory.
+        bound: largest magnitude that does not count as exploding; None asks for finite numbers only.
 
     Returns:
-        What was found.
+        The state of the gradient.
 
     Raises:
         ValueError: if the gradient has no floating-point numbers.
@@ -61,10 +61,10 @@ def soundness(gradient: PyTree, diverged: Bool[ArrayLike, ""] = False, *, bound:
 
 
 def check_soundness(found: Soundness) -> None:
-    """Raise if any gradient that `soundness` looked at, batched or not, is unsound. Call it on the host.
+    """Raise if any gradient that `soundness` checked, batched or not, is unsound. Call it on the host.
 
     Raises:
-        UnsoundGradientError: naming how many are unsound, and why.
+        UnsoundGradientError: with the number of unsound gradients and the reasons.
     """
     unsound = ~np.atleast_1d(found.is_sound)
     if not unsound.any():

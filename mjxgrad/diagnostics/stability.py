@@ -1,13 +1,13 @@
-r"""What a scene's time step makes of its contacts, limits and equalities, each seen as a spring and damper.
+r"""Stability of a scene's contacts, limits and equalities at its time step, each seen as a spring and damper.
 
-Contacts, limits and equalities have one law: at full impedance $\ddot r = -k r - b \dot r$, $k$ and $b$ per unit of the
-row's effective mass. Semi-implicit Euler follows it without gaining energy while $h^2 k + 2 h b < 4$, which in MuJoCo's
-standard format is $h / t_c < 2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$, $t_c = 2 / b$.
+Contacts, limits and equalities follow one law: at full impedance $\ddot r = -k r - b \dot r$, with $k$ and $b$ per unit of
+the row's effective mass. Semi-implicit Euler gains no energy while $h^2 k + 2 h b < 4$. In MuJoCo's standard format this is
+$h / t_c < 2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$, $t_c = 2 / b$.
 
-That is one row alone, at the impedance $d_w$; where the impedance falls with depth, stiffness and damping are largest at
-first touch. The n contacts of a box that lands flat add up to the impedance
-$n d / (1 + (n - 1) d)$, and pull with $n / (1 + (n - 1) d_w)$ times $k$ and $b$; contacts with other bodies add to it, up to
-$1 / d_w$ times, where a row gets the whole of the acceleration that it asks for.
+This holds for one row alone, at the impedance $d_w$. Where the impedance falls with depth, stiffness and damping are largest
+at first touch. The n contacts of a box that lands flat have the joint impedance
+$n d / (1 + (n - 1) d)$, and act with $n / (1 + (n - 1) d_w)$ times $k$ and $b$. Contacts with other bodies add up to
+$1 / d_w$ times these, where a row gets the whole acceleration that it asks for.
 """
 
 import math
@@ -29,17 +29,17 @@ from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, large
 from mjxgrad.scene import Scene
 
 LEAST_FRICTION = 0.01
-"""Of pyramids, in single precision."""
+"""Least friction of pyramids in single precision."""
 STEPS_IN_CONTACT = 6.0
-"""Time steps below which a bounce is too short for the slope at MuJoCo's motion, by the experiment `bounce`."""
-_WIDTH = 118  # characters; what a laptop's terminal shows
+"""Fewest time steps in a bounce for the slope at MuJoCo's motion, by the experiment `bounce`."""
+_WIDTH = 118  # characters in a laptop's terminal
 _COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
 _LEGEND = (
     "load: time step over the largest that gains no energy, unstable from 1 on. coupled: the same where all contacts "
-    "of the pair act at once. steps: that a bounce lasts. asked: time constant in the file, where refsafe replaces it."
+    "of the pair act at once. steps: duration of a bounce. asked: time constant in the file, where refsafe replaces it."
 )
 _SPEED_COLUMNS = ("depth", "rise, steps")
-# Steps across the rise of the impedance from which its force is resolved, and the impedance up to which it begins continuously.
+# Fewest steps that resolve the rise of the impedance, and the largest first impedance that counts as continuous.
 STEPS_NEEDED, LARGEST_JUMP = 2.0, 0.01
 
 
@@ -49,17 +49,17 @@ class Spring:
 
     Attributes:
         kind: "contact", "joint limit", "tendon limit" or "equality".
-        name: of the pair, joint, tendon or equality.
-        stiffness: $k$ in effect, in 1/s².
-        damping: $b$ in effect, in 1/s.
+        name: name of the pair, joint, tendon or equality.
+        stiffness: effective $k$, in 1/s².
+        damping: effective $b$, in 1/s.
         impedance: $d_0$ and $d_w$.
-        width: over which the impedance rises, in m (rad for hinges).
-        given: the time constant that the file asks for, in s; None in the direct format.
+        width: depth over which the impedance rises, in m (rad for hinges).
+        given: time constant in the file, in s; None in the direct format.
         timestep: $h$, in s.
-        integrator: of the model.
-        size: by how much it may be passed in one step and still be found: what a ball may move through another body, or
-            the range of a limit, in m (rad); infinite for planes and equalities.
-        num_rows: contacts that the pair can make at once.
+        integrator: integrator of the model.
+        size: largest travel in one step that is still detected: the thickness of the bodies, or the range of a limit, in m
+            (rad); infinite for planes and equalities.
+        num_rows: largest number of contacts of the pair at once.
         pyramid: sliding friction μ of a pyramidal contact; None for all others.
     """
 
@@ -96,7 +96,7 @@ class Spring:
 
     @property
     def coupled_load(self) -> float:
-        """The same where all contacts of the pair hold the body at once; never below `load`."""
+        """The load where all contacts of the pair hold the body at once; never below `load`."""
         return self._load(self.num_rows / (1 + (self.num_rows - 1) * max(self.impedance)))
 
     @property
@@ -115,26 +115,26 @@ class Spring:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether `refsafe` replaces the time constant that was asked for."""
+        """Whether `refsafe` replaces the given time constant."""
         # A relative margin, because float32 rounds a time constant of exactly two steps.
         return self.given is not None and self.time_constant > self.given * (1 + 1e-5)
 
     @property
     def num_steps(self) -> float:
-        """Time steps that a single bounce off it lasts, at any speed; infinite without stiffness."""
+        """Number of time steps in a single bounce, at any speed; infinite without stiffness."""
         if self.stiffness <= 0 or self.damping <= 0:
             return np.pi / np.sqrt(self.stiffness) / self.timestep if self.stiffness > 0 else np.inf
         return float(self._bounce.duration) / self.timestep
 
     def depth(self, speed: float) -> float:
-        r"""Give how deep a bounce at a speed of approach goes, $v \sqrt e / \omega_0$, $e$ the restitution (m, or rad)."""
+        r"""Return the depth of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$ (m, or rad)."""
         if self.stiffness <= 0:
             return np.inf
         restitution = 1.0 if self.damping <= 0 else float(self._bounce.restitution)
         return speed * np.sqrt(restitution / self.stiffness)
 
     def rise_steps(self, speed: float) -> float:
-        """Give the time steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
+        """Return the number of steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
         first, last = self.impedance
         return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
 
@@ -146,14 +146,14 @@ class Spring:
 
 @dataclass(frozen=True)
 class StabilityReport:
-    """Every spring of a scene beside its time step.
+    """The springs of a scene, judged at its time step.
 
     Attributes:
-        name: of the scene.
+        name: name of the scene.
         springs: contact pairs, then joint limits, tendon limits and equalities.
-        timestep: in s.
-        speed: of approach that was asked about, in m/s, or None.
-        joint_speed: the same for joints and tendons, in rad/s or m/s.
+        timestep: time step, in s.
+        speed: assumed speed of approach, in m/s, or None.
+        joint_speed: assumed speed of joints and tendons, in rad/s or m/s, or None.
         precision: "float32" or "float64".
     """
 
@@ -171,7 +171,7 @@ class StabilityReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One sentence per finding, for all springs alike; none if the time step follows everything."""
+        """One sentence per finding, shared by equal springs; empty if the time step resolves every spring."""
         rules = (_hidden, _unstable, _unstable_together, _short)
         rules += (self._passed, self._deep, self._unresolved, self._steep)
         found: dict[tuple[str, str], list[Spring]] = {}
@@ -181,7 +181,7 @@ class StabilityReport:
         return tuple(f"{kind} of {name_pairs(same)}: {text}" for (kind, text), same in found.items())
 
     def summary(self) -> str:
-        """Describe it for a human, in some 120 columns: a line for all springs alike, then the warnings."""
+        """Return a report for a terminal of 120 columns: one line per group of equal springs, then the warnings."""
         speeds = "".join(
             f", at {format_number(value)} {unit}"
             for value, unit in ((self.speed, "m/s"), (self.joint_speed, "rad/s at limits"))
@@ -189,10 +189,10 @@ class StabilityReport:
         )
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speeds}"]
         if not self.springs:
-            return "\n".join([*lines, "  nothing to be followed: no contact, limit or equality"])
+            return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
         lines += _aligned([self._columns, *self._rows()])
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
-        sentences = self.warnings or ("the time step follows every spring",)
+        sentences = self.warnings or ("the time step resolves every spring",)
         return "\n".join(
             lines + [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
         )
@@ -236,7 +236,7 @@ class StabilityReport:
 
     @staticmethod
     def _written(spring: Spring, speed: float) -> tuple[str, str]:
-        """Write a speed, and the depth from which on a bounce goes through: of a joint limit the unit is the joint's."""
+        """Return a speed and the depth beyond which a bounce passes through, as text; a joint limit has the joint's unit."""
         is_length = spring.kind == "contact"
         return format_number(speed) + " m/s" * is_length, f"{spring.size:.3g}" + " m" * is_length
 
@@ -254,7 +254,7 @@ class StabilityReport:
         speed = self._speed_of(spring)
         if speed is None or spring.depth(speed) < spring.size or speed * self.timestep >= spring.size:
             return None
-        # At the same damping ratio the depth goes as one over the root of the stiffness.
+        # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
         needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
         at, size = self._written(spring, speed)
         return (
@@ -331,31 +331,31 @@ def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
 
 
 def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: float | None = None) -> StabilityReport:
-    """Compare the contacts, limits and equalities of a scene with what its time step can follow.
+    """Check whether the time step of a scene resolves its contacts, limits and equalities.
 
-    Nothing is simulated. The limits are those of one spring and damper, see this module.
+    Nothing is simulated. The limits are those of a single spring and damper, see this module.
 
     Args:
-        scene: with known values.
-        speed: at which geoms approach each other, in m/s; without it nothing is said about what only a speed decides:
-            passing through, depth, and onsets.
-        joint_speed: the same for joints and tendons at their limits, in rad/s or m/s.
+        scene: a scene with known values.
+        speed: speed at which geoms approach each other, in m/s. Passing through, depth and onsets depend on it and are
+            checked only where it is given.
+        joint_speed: speed of joints and tendons at their limits, in rad/s or m/s.
 
     Returns:
-        The report: `print` it, or take its `warnings`.
+        The report: `print` it, or read its `warnings`.
 
     Raises:
         ValueError: if a speed is not positive, or the scene is batched or traced.
     """
     for name, value in (("speed", speed), ("joint_speed", joint_speed)):
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive, got {value}; leave it out to ask about no speed")
+            raise ValueError(f"{name} must be positive, got {value}; leave it out to skip these checks")
     model = scene.model
     leaves = (model.geom_solref, model.jnt_solref, model.opt.timestep)
     is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
     if is_traced or np.ndim(model.geom_solref) != 2 or np.ndim(model.opt.timestep) != 0:
         raise ValueError("check_stability needs one scene with known values, got a batched or traced one")
-    # Inside jit, operations on known values would be traced, too.
+    # Inside jit, even operations on known values would be traced.
     with jax.ensure_compile_time_eval():
         springs = (*_contacts(scene), *_others(scene))
     return StabilityReport(
@@ -387,7 +387,7 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
 
 
 def _others(scene: Scene) -> Iterator[Spring]:
-    """Return joint limits, tendon limits and equalities that are switched on."""
+    """Return the active joint limits, tendon limits and equalities."""
     m, c, flag, of = scene.model, scene.mj_model, mujoco.mjtDisableBit, mujoco.mjtObj
     disabled = int(m.opt.disableflags)
     if disabled & flag.mjDSBL_CONSTRAINT:
@@ -430,9 +430,9 @@ def _spring(
 
 
 def _thickness(scene: Scene, pair: ContactPair) -> float:
-    """Least thickness of two geoms together, by which they may interpenetrate and still part the way they came (m)."""
+    """Return the joint thickness of two geoms, the deepest overlap from which they still part the way they came (m)."""
     kinds = [mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2)]
-    # Behind a plane or under a height field everything is inside, however far.
+    # Everything behind a plane or under a height field is inside, at any depth.
     if {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD} & set(kinds):
         return np.inf
     return sum(_half_thickness(scene, geom, kind) for geom, kind in zip((pair.geom1, pair.geom2), kinds, strict=True))
@@ -442,7 +442,7 @@ def _half_thickness(scene: Scene, geom: int, kind: mujoco.mjtGeom) -> float:
     if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
         return float(scene.model.geom_size[geom, 0])
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        # Half extents of the box around it, in its own axes.
+        # Half extents of its bounding box, in its own axes.
         return float(scene.mj_model.geom_aabb[geom, 3:].min())
     sizes = np.asarray(scene.model.geom_size[geom], float)
     return float(sizes[sizes > 0].min(initial=np.inf))

@@ -12,17 +12,18 @@ Interval = Float[np.ndarray, "2 *shape"]
 
 # Counts of 50 resamples of 1e5 samples are 40 MB.
 _RESAMPLES_AT_A_TIME = 50
-# Below this number a bootstrap knows too little of the tails, and a test of normality finds nothing.
+# With fewer samples a bootstrap misses the tails, and a test of normality has no power.
 _FEWEST_FOR_BOOTSTRAP = 20
 
 
 def mean_interval(mean: ArrayLike, standard_error: ArrayLike, count: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Give Student's t interval of a mean.
+    """Return Student's t interval of a mean.
 
-    It covers as it says for samples near a normal distribution, or many of any with a variance; where a sample in a
-    thousand carries most of the mean (the derivative of a stiff contact), a thousand samples are not many.
+    Its coverage holds for nearly normal samples, or many samples with a variance. A thousand samples are not many where one
+    in
+    a thousand carries most of the mean (the derivative of a stiff contact).
 
-    Arguments, result and refusals are those of `bias_interval`.
+    Arguments, result and errors are as in `bias_interval`.
     """
     return bias_interval(mean, standard_error, count, 0.0, confidence=confidence)
 
@@ -36,16 +37,16 @@ def bias_interval(
     reference_count: ArrayLike = np.inf,
     confidence: float = 0.95,
 ) -> Interval:
-    """Give Welch's interval of a bias, the difference of a mean to a reference that has an error of its own.
+    """Return Welch's interval of a bias: the difference of a mean to a reference with an error of its own.
 
     Args:
-        mean: of the samples.
-        standard_error: of the mean.
+        mean: mean of the samples.
+        standard_error: standard error of the mean.
         count: number of independent samples behind it, at least 2.
-        reference: what the mean should be; independent of the samples.
-        reference_error: its standard error, zero for a closed form.
+        reference: the true mean, or an estimate independent of the samples.
+        reference_error: standard error of the reference, zero for a closed form.
         reference_count: number of independent samples behind that error; infinite if it is known.
-        confidence: chance to cover the bias.
+        confidence: coverage of the interval.
 
     Returns:
         Lower and upper ends, with the Welch-Satterthwaite degrees of freedom; NaN where there is no standard error.
@@ -78,24 +79,25 @@ def root_mean_square_interval(
     reference_variance: ArrayLike = 0.0,
     cross_variance: ArrayLike = 0.0,
 ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "2 *batch"]]:
-    r"""Give the root-mean-square error of an estimate from its repetitions, with an interval.
+    r"""Return the root-mean-square error of an estimate from its repetitions, with an interval.
 
-    The mean of squared errors is never negative and skewed, so its interval is that of a gamma distribution with the
-    same mean and variance (a chi-square with Satterthwaite's degrees of freedom): exact for one unbiased normal
-    coordinate if its kurtosis were known, the usual normal interval where a bias dominates.
+    The mean squared error is positive and skewed. Its interval is that of a gamma distribution with equal mean and variance
+    (a
+    chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
+    Where a bias dominates it becomes the usual normal interval.
 
-    A reference with a variance $v$ of its own adds $v$ to the mean, which is taken off again, and its error is common
-    to all repetitions, so it widens the interval.
+    The variance $v$ of a reference adds to the mean and is subtracted. The error of the reference is common to all
+    repetitions, so it widens the interval.
 
     Args:
         squared_errors: squared distance of each repetition to the reference.
-        confidence: chance to cover the truth.
+        confidence: coverage of the interval.
         reference_variance: $v$, the sum over coordinates of the reference's squared standard errors.
-        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, what the error $e$ of the reference adds to the variance of the
-            mean, $b$ being the bias.
+        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, the variance that the error $e$ of the reference adds to the mean,
+            with the bias $b$.
 
     Returns:
-        The root-mean-square error, zero where the reference is too uncertain to see one, and the ends of its interval.
+        The root-mean-square error, zero where the reference's error hides it, and the ends of its interval.
 
     Raises:
         ValueError: if `confidence` is not between 0 and 1.
@@ -111,7 +113,7 @@ def root_mean_square_interval(
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = 2 * mean**2 / variance
         ends = [mean * freedom / stats.chi2.isf(tail, freedom), mean * freedom / stats.chi2.ppf(tail, freedom)]
-    # All errors alike, by rounding or in truth: the error is known.
+    # All errors are equal up to rounding: the mean is known.
     ends = np.where(freedom < 1e12, ends, mean)
     taken_off = np.asarray(reference_variance, float)
     return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
@@ -120,10 +122,10 @@ def root_mean_square_interval(
 def bootstrap_variance_interval(
     samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> Float[np.ndarray, " 2"]:
-    """Give the percentile bootstrap interval of a total variance, the trace of the covariance.
+    """Return the percentile bootstrap interval of a total variance, the trace of the covariance.
 
-    It assumes no distribution. A tail that the samples have not met it cannot know: then it is too low. Samples that are
-    not finite are left out; fewer than two give NaN. The same number of samples has the same draws.
+    It assumes no distribution, but is too low where the samples miss a tail. Samples that are not finite are left out; fewer
+    than two give NaN. Equal numbers of samples share the same draws.
 
     References:
         Efron, Tibshirani. An Introduction to the Bootstrap. Chapman & Hall 1993, section 13.3.
@@ -140,7 +142,7 @@ def bootstrap_variance_interval(
     squares = (centred**2).sum(axis=1)
     rng, variances = np.random.default_rng(0), []
     for done in range(0, num_resamples, _RESAMPLES_AT_A_TIME):
-        # How often each sample is drawn in each resample.
+        # The number of times that each resample draws each sample.
         times = rng.multinomial(count, np.full(count, 1 / count), min(_RESAMPLES_AT_A_TIME, num_resamples - done))
         shift = times @ centred / count
         variances.append((times @ squares - count * (shift**2).sum(axis=1)) / (count - 1))
@@ -148,7 +150,7 @@ def bootstrap_variance_interval(
 
 
 class VarianceInterval(eqx.Module):
-    """A variance, the trace of the covariance with N − 1, with the ends of its interval, and how that was found."""
+    """A variance (the trace of the covariance with N − 1), the ends of its interval, and the method."""
 
     value: float
     ends: Float[np.ndarray, " 2"]
@@ -158,12 +160,11 @@ class VarianceInterval(eqx.Module):
 def variance_interval(
     samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95, *, num_resamples: int = 1000
 ) -> VarianceInterval:
-    """Give the interval of a total variance by the method that the samples deserve, and say which.
+    """Return the interval of a total variance, by chi-square or bootstrap, whichever suits the samples.
 
-    Chi-square is exact for normal samples of one coordinate (with several the degrees of freedom follow from the
-    eigenvalues of the covariance) and wrong for any others; the bootstrap assumes no distribution but needs samples. It
-    is taken where there are at least 20 and a test of their kurtosis refuses the normal distribution in some coordinate
-    (5 % over all of them).
+    Chi-square is exact for normal samples of one coordinate and wrong for other distributions. For several coordinates its
+    degrees of freedom follow from the eigenvalues of the covariance. The bootstrap assumes no distribution but needs samples.
+    It is used from 20 samples on, if a kurtosis test rejects normality in some coordinate (5 % over all of them).
 
     Samples that are not finite are left out; fewer than two give NaN.
     """
@@ -183,7 +184,7 @@ def variance_interval(
 
 
 def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
-    """Tell whether the kurtosis of some coordinate is not that of a normal distribution."""
+    """Return whether some coordinate has another kurtosis than a normal distribution."""
     varied = samples[:, np.ptp(samples, axis=0) > 0]
     if len(samples) < _FEWEST_FOR_BOOTSTRAP or varied.shape[1] == 0:
         return False
@@ -191,7 +192,7 @@ def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
 
 
 def checked(confidence: float) -> float:
-    """Give the confidence of an interval back, refusing what is no chance."""
+    """Return the confidence of an interval; refuse numbers outside (0, 1)."""
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
     return confidence
