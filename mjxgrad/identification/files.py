@@ -1,4 +1,4 @@
-"""Recordings and parameters from files, and what was found as MJCF."""
+"""Recordings and parameters from files, and identified scenes as MJCF."""
 
 import csv
 import dataclasses
@@ -37,20 +37,20 @@ _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
 _ALONE = {"inertia": inertia, "gains": gains}
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
-"""Of parameters that can be named in a word."""
-_SMALLEST_SIZE = 0.1  # of the largest column of a kind: what hardly moves is noise, and weighed as if it moved so much
+"""Kinds of parameters that `parameter` knows."""
+_SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
 
 def parameter(scene: Scene, text: str) -> Parameter:
-    """Return the parameter that is named, such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
+    """Return a parameter from text such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
 
     Args:
-        scene: where the nominal value is read.
-        text: one of `KINDS`, then names, several of which share one value, then bounds. Friction and softness take geoms, or
-            a pair as `floor/foot`, or nothing for all contacts.
+        scene: the scene with the nominal values.
+        text: one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
+            `floor/foot`, or nothing for all contacts.
 
     Raises:
-        ValueError: if it is none of that, or a name is unknown.
+        ValueError: if the text has another form, or a name is unknown.
     """
     match = re.fullmatch(r"(\w+)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
     if match is None or match[1] not in KINDS:
@@ -83,12 +83,12 @@ def parameter(scene: Scene, text: str) -> Parameter:
 
 
 def parameters(scene: Scene, given: Iterable[str]) -> dict[str, Parameter]:
-    """Return parameters by name, as `parameter` takes them, or from YAML as `mujoco.sysid` and `Identification.save` write it.
+    """Return parameters by name, from texts as in `parameter` or YAML of `mujoco.sysid` and `Identification.save`.
 
-    The names in YAML are those of `parameter`, without bounds. Frozen ones are left out; the search begins at their values.
+    Names in YAML are texts as in `parameter`, without bounds. Frozen ones are left out; the search begins at their values.
 
     Raises:
-        ValueError: as of `parameter`, or if a file is no such YAML.
+        ValueError: as `parameter`, or if a file is no such YAML.
         ImportError: if there is YAML, and PyYAML is not installed.
     """
     found: dict[str, Parameter] = {}
@@ -118,21 +118,22 @@ def parameters(scene: Scene, given: Iterable[str]) -> dict[str, Parameter]:
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recorded motion, and the names of the columns that are nothing of the scene's.
+    """Return a recorded motion, and the names of the columns that do not belong to the scene.
 
     Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
-    `act:actuator`, readings `sensor:name`. The kind may be left out where one thing only has the name: a joint is then its
-    position, an actuator its control. Of several numbers each has its place, `qpos:root[0]`, or `qpos[7]` in the whole. An NPZ
-    has the same names, each with an array of one row for each time, of one number or all of them.
+    `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
+    actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
+    NPZ
+    has the same names. Each array has one row per time, with one number or all of the element's numbers.
 
-    Each signal is weighed by how much it varies. The motion begins at its first row; the rest is the scene's pose, at rest.
+    Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
 
     Args:
-        scene: that was recorded.
+        scene: the recorded scene.
         path: CSV with a line of names, or NPZ. Empty cells and NaN were not measured.
 
     Raises:
-        ValueError: if the file is not so, has no time, nothing that was measured, or lacks the control of an actuator.
+        ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator.
     """
     columns = _read(Path(path))
     times = columns.pop("time", None)
@@ -203,7 +204,7 @@ def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str | None:
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
-    """Return by column name what it may be: its kind, the signal, its place in that, and the signal's width."""
+    """Return for each possible column name its kind, signal, index in the signal, and the signal's width."""
     whole: dict[str, list] = {}
     own: list[tuple[str, str | None, str, Sequence[int], int]] = []
     ends = [*model.jnt_qposadr[1:], model.nq]
@@ -223,7 +224,7 @@ def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]
         for i, index in enumerate(indices):
             place, number = (kind, signal, int(index), width), f"[{i}]" * (len(indices) > 1)
             if kind != "sensor":
-                # The same place may be named by a joint and by its number; of one number `qpos` is the whole.
+                # A joint and an index may name the same place; for one number `qpos` is the whole.
                 whole[f"{kind}[{index}]" if width > 1 else kind] = [place]
             if name:
                 whole[f"{kind}:{name}{number}"] = [place]
@@ -233,7 +234,7 @@ def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]
 
 
 def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
-    """Return the state of the first row; what it lacks is the scene's pose, at rest."""
+    """Return the state of the first row; missing parts are the scene's pose, at rest."""
     given = {}
     for key in ("qpos", "qvel", "act"):
         if key in found:
@@ -243,7 +244,7 @@ def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
 
 
 def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
-    """Return how much each column varies, of positions each velocity's."""
+    """Return the variation of each column; for positions, one number per velocity."""
     if name == "qpos":
         first = np.where(np.isfinite(value[0]), value[0], model.qpos0)
         moves = np.zeros((len(value), model.nv))
@@ -258,12 +259,12 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
 
 
 def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    """Return recordings to fit and to judge by: every so many of several, of a single one its end.
+    """Split recordings into those to fit and those held out: every n-th of several, or the end of a single one.
 
     Args:
-        scene: of the recordings.
-        recordings: all of them.
-        share: to judge by, below 1; 0 holds out nothing.
+        scene: the scene of the recordings.
+        recordings: all recordings.
+        share: held-out share, below 1; 0 holds out nothing.
 
     Raises:
         ValueError: if the share is negative or leaves nothing to fit.
@@ -284,7 +285,7 @@ def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tup
     times = np.asarray(whole.times, float)
     is_late = times > (1 - share) * times[-1]
     early = {name: value[~is_late] for name, value in whole.measured.items()}
-    # The end goes on from the same start: positions and speeds in the middle may not have been measured.
+    # The end starts where the recording does: positions and speeds in the middle may be unmeasured.
     late = {name: np.where(is_late[:, None], value, np.nan) for name, value in whole.measured.items()}
     return [dataclasses.replace(whole, measured=early, times=times[~is_late])], [
         dataclasses.replace(whole, measured=late)
@@ -292,16 +293,16 @@ def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tup
 
 
 def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) -> None:
-    """Write the MJCF of a scene with the numbers that were found; all else stays as in the file.
+    """Write the MJCF of a scene with the identified numbers; all else stays as in the file.
 
     Args:
-        scene: as loaded.
-        found: the same with other numbers.
-        source: its MJCF file.
-        path: of the MJCF to write.
+        scene: the scene as loaded.
+        found: the scene with the identified numbers.
+        source: the MJCF file of the scene.
+        path: the MJCF file to write.
     """
     spec = mujoco.MjSpec.from_file(str(source))
-    spec.compile()  # which numbers its elements
+    spec.compile()  # assigns element ids
     before, after = numbers_of(scene.model), numbers_of(found.model)
     changed = {n: np.asarray(v, float) for n, v in after.items() if not np.array_equal(v, before[n])}
 
@@ -342,12 +343,12 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
 
 
 def simulated(scene: Scene, windows: Windows, delay: Float[Array, ""] | float) -> dict[str, Array]:
-    """Return all signals as a scene has them at its own steps, and its positions as `qpos`; traceable.
+    """Return all signals of a simulation at the scene's own steps, and the positions as `qpos`; traceable.
 
     Args:
-        scene: with the parameters in it.
-        windows: of one recording, by `stack`.
-        delay: by how much the controls act later than recorded (s).
+        scene: the scene with the identified parameters.
+        windows: one recording, as `stack` returns it.
+        delay: delay of the controls beyond the recorded times (s).
     """
     names = [name for name in windows.measured if name not in ("qpos", "qvel", "act")]
     (controls,), state = windows.controls, jax.tree.map(lambda leaf: leaf[0], windows.state)

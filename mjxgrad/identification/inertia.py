@@ -1,7 +1,7 @@
-r"""The inertia of a rigid body as ten numbers of which any are possible.
+r"""The inertia of a rigid body as ten unconstrained numbers.
 
-Mass $m$, first moment $h$ and the second moments $\Sigma = \int x x^T \mathrm{d}m$ form the pseudo-inertia, positive definite for
-every body that can exist,
+The mass $m$, first moment $h$ and second moments $\Sigma = \int x x^T \mathrm{d}m$ form the pseudo-inertia. It is positive
+definite for every physically possible body,
 
 $$J = \begin{pmatrix} \Sigma & h \\ h^T & m \end{pmatrix} = U U^T, \qquad U = e^{\alpha} \begin{pmatrix} e^{d_1} & s_{12} &
 s_{13} & t_1 \\ & e^{d_2} & s_{23} & t_2 \\ & & e^{d_3} & t_3 \\ & & & 1 \end{pmatrix}.$$
@@ -9,8 +9,8 @@ s_{13} & t_1 \\ & e^{d_2} & s_{23} & t_2 \\ & & e^{d_3} & t_3 \\ & & & 1 \end{pm
 The ten numbers are $(\alpha, d_1, d_2, d_3, s_{12}, s_{23}, s_{13}, t_1, t_2, t_3)$, as in `mujoco.sysid`. The mass is
 $e^{2 \alpha}$, and $t$ the centre of mass.
 
-MuJoCo keeps principal moments and their axes. Where two moments are equal the axes have no derivative, though the tensor has one.
-The moments are therefore kept apart by a share of $\sqrt\epsilon$, to which the motion is blind.
+MuJoCo stores principal moments and their axes. For equal moments the axes have no derivative, though the tensor has one.
+The moments are therefore separated by a share of $\sqrt\epsilon$, too little to affect the motion.
 
 References:
     Rucker, Wensing. Smooth parameterization of rigid-body inertia. IEEE Robotics and Automation Letters 7(2), 2022.
@@ -26,19 +26,19 @@ from mjxgrad.identification.parameters import Parameter
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
-# As `mujoco.sysid` bounds them: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre of mass by 0.5 m.
+# The bounds of `mujoco.sysid`: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre of mass by 0.5 m.
 _REACH = np.array([np.log(10) / 2, *[np.log(2) / 2] * 3, *[0.5] * 3, *[0.5] * 3])
 
 
 def inertia(scene: Scene, body: str) -> Parameter:
-    """Return mass, centre of mass and inertia tensor of a body as ten numbers, of which any are physically possible.
+    """Return mass, centre of mass and inertia tensor of a body as ten unconstrained numbers.
 
     Args:
-        scene: where the nominal values are read.
-        body: by name.
+        scene: the scene with the nominal values.
+        body: name of the body.
 
     Raises:
-        ValueError: if there is no such body, or it is flat, so that a logarithm has no value.
+        ValueError: if there is no such body, or a flat body makes a logarithm infinite.
     """
 
     def place(model: mjx.Model) -> int:
@@ -83,7 +83,7 @@ def logarithms(pseudo: np.ndarray) -> np.ndarray:
 
 
 def second_moments(mass: float | np.ndarray, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inertia of MuJoCo's fields of a body: mass, ipos, inertia and iquat."""
+    """Return the pseudo-inertia from MuJoCo's fields of a body: mass, ipos, inertia and iquat."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, axes)
     rotation = rotation.reshape(3, 3)
@@ -93,11 +93,11 @@ def second_moments(mass: float | np.ndarray, centre: np.ndarray, moments: np.nda
 
 
 def body_fields(pseudo: Float[Array, "4 4"]) -> dict[str, Float[Array, "..."]]:
-    """Return MuJoCo's fields of the body with this pseudo-inertia; differentiable, also where principal moments are equal."""
+    """Return MuJoCo's fields of the body with this pseudo-inertia; differentiable even for equal principal moments."""
     mass, centre = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     spread = pseudo[:3, :3] - mass * jnp.outer(centre, centre)
-    apart = jnp.sqrt(jnp.finfo(spread.dtype).eps) * jnp.trace(spread)
-    along, axes = jnp.linalg.eigh(spread + apart * jnp.diag(jnp.arange(3.0)))
+    separation = jnp.sqrt(jnp.finfo(spread.dtype).eps) * jnp.trace(spread)
+    along, axes = jnp.linalg.eigh(spread + separation * jnp.diag(jnp.arange(3.0)))
     axes = axes * jnp.sign(jnp.linalg.det(axes))
     moments = jnp.sum(along) - along
     return {"body_mass": mass, "body_ipos": centre, "body_inertia": moments, "body_iquat": _quaternion(axes)}

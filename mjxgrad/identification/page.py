@@ -1,4 +1,4 @@
-"""What an identification says, for a page and for programs: the answer, signals, values, and the motion before and after."""
+"""Report of an identification as HTML page and JSON: the answer, signals, values, and the motion before and after."""
 
 import functools
 import json
@@ -26,15 +26,15 @@ _SIZE = (4.6, 2.1)  # inches
 
 @dataclass(frozen=True)
 class Identified:
-    """A result beside what was measured.
+    """A result beside its recordings.
 
     Attributes:
-        name: of the scene.
-        scene: with the nominal values.
-        result: of the search.
-        recordings: that were fitted.
-        held_out: that were judged by.
-        seconds: that it took.
+        name: name of the scene.
+        scene: the scene with the nominal values.
+        result: the result of the search.
+        recordings: the fitted recordings.
+        held_out: the held-out recordings.
+        seconds: duration of the search.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Identified:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the search ended and every number was found."""
+        """Whether the search converged and determined every number."""
         result = self.result
         return result.stopped is Stopped.CONVERGED and not (
             result.without_effect or result.inseparable or result.at_bounds
@@ -68,7 +68,7 @@ class Identified:
         return f"{found}: {which} {_percent(rms[1])} of the motion, {_percent(rms[0])} before."
 
     def as_json(self) -> str:
-        """Write it for programs; numbers in SI units, what is not determined as null."""
+        """Return the result as JSON; numbers in SI units, null where undetermined."""
         result = self.result
         lower, upper = (
             result.coordinates.unravel(np.asarray(x)) for x in (result.coordinates.lower, result.coordinates.upper)
@@ -100,7 +100,7 @@ class Identified:
         return json.dumps(table, indent=2, ensure_ascii=False)
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        """Return the result as a self-contained page; needs `mjxgrad[render]`."""
         number, (head, *rows) = f"{self.result.condition_number:.2g}", self.result.rows()
         condition = (
             f"Condition number {number}: beyond 100 or so, single intervals are much wider than those of combinations."
@@ -112,7 +112,7 @@ class Identified:
 
     @property
     def _shown(self) -> Recording:
-        """One motion: what was held out where it is the end of it, else the first."""
+        """The motion to show: the held-out end of a single recording, else the first recording."""
         return (self.held_out if len(self.recordings) == 1 and self.held_out else self.recordings)[0]
 
     @functools.cached_property
@@ -123,12 +123,12 @@ class Identified:
         return tuple(jax.tree.map(np.asarray, course) for course in courses)
 
     def _measured(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return times and values of a signal, of the motion that was fitted first and of the one that is shown."""
+        """Return times and values of a signal, from the first fitted motion and the shown one."""
         motions = list({id(one): one for one in (self.recordings[0], self._shown)}.values())
         return np.concatenate([m.times for m in motions]), np.concatenate([m.measured[name] for m in motions])
 
     def _figures(self) -> Block:
-        """Draw signals, those first that the search changed most."""
+        """Draw the signals, sorted by how much the search changed them."""
         before, after = self._courses
         signals = []
         for name in self._shown.measured:
@@ -148,7 +148,7 @@ class Identified:
         return Block(drawings=drawings, caption=caption)
 
     def _panel(self, title: str, times: np.ndarray, values: np.ndarray, before: np.ndarray, after: np.ndarray) -> Any:
-        """Draw one signal over time: measured, at the start, found; the curve at the start may leave the picture."""
+        """Draw a signal over time: measured, at the start, identified; the curve at the start may leave the picture."""
         import matplotlib.pyplot as plt
 
         figure, axis = plt.subplots(figsize=_SIZE)
@@ -156,18 +156,18 @@ class Identified:
         end = max(at[-1], times.max())
         if self._shown is not self.recordings[0]:
             axis.axvspan(float(self.recordings[0].times[-1]), end, color="#8b94a1", alpha=0.2, lw=0)
-        few = slice(None, None, max(1, len(times) // _MOST_DOTS))
-        axis.plot(times[few], values[few], "o", color=INK, ms=2.5, mew=0, alpha=0.6)
+        shown = slice(None, None, max(1, len(times) // _MOST_DOTS))
+        axis.plot(times[shown], values[shown], "o", color=INK, ms=2.5, mew=0, alpha=0.6)
         axis.plot(at, before, "--", color="#d55e00", lw=1.2)
         axis.plot(at, after, "-", color="#0072b2", lw=1.4)
         low, high = (float(pick([pick(values), pick(after)])) for pick in (np.min, np.max))
         room = 0.15 * (high - low) or max(abs(low), 1e-9)
-        axis.set_title(title, parse_math=False)  # whatever dollars are in a name
+        axis.set_title(title, parse_math=False)  # names may contain dollars
         axis.set(xlabel="time, s", xlim=(0, end), ylim=(low - room, high + room))
         return figure
 
     def _video(self) -> Block:
-        """Film the motion before and after, side by side, what was measured drawn into both where all of it was."""
+        """Film the motion before and after, side by side, overlaid with the measured motion where it is complete."""
         before, after = (course["qpos"] for course in self._courses)
         film = functools.partial(render.frames, height=_FRAME[0], width=_FRAME[1])
         at = float(self.scene.model.opt.timestep) * np.arange(len(before))
@@ -190,7 +190,7 @@ class Identified:
 
 
 def _titles(scene: Scene, name: str, width: int) -> list[str]:
-    """Name the numbers of a signal: positions and velocities by their joints, with units; others by their place."""
+    """Return titles for the numbers of a signal: joints with units for positions and velocities, else indices."""
     if name not in ("qpos", "qvel"):
         return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
     model, found = scene.mj_model, []
@@ -215,7 +215,7 @@ def _percent(share: float) -> str:
 
 
 def _plain(value: np.ndarray) -> float | list | None:
-    """Return numbers as JSON has them: null for what is not finite."""
+    """Return numbers for JSON; null where not finite."""
     made = np.where(np.isfinite(value), value, np.nan).astype(object)
     made = np.array([None if x != x else float(x) for x in np.ravel(made)], object).reshape(np.shape(value))
     return made.tolist()

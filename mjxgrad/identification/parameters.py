@@ -1,4 +1,4 @@
-"""What is to be found: named numbers between bounds, and what each of them changes in a model."""
+"""Parameters to identify: named numbers between bounds, and the model fields that each of them changes."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -17,24 +17,24 @@ from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
-"""From a model and the parameter's value to the fields of the model that change."""
+"""Function from a model and the parameter's value to the changed fields of the model."""
 Values = dict[str, Array]
 _Object = mujoco.mjtObj
-_FACTOR = 10.0  # a positive number is looked for between a tenth and ten times what the model has
-_AT_BOUND = 1e-6  # of the range
+_FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
+_AT_BOUND = 1e-6  # share of the range
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A number, or an array of them, to be found.
+    """A number, or an array of numbers, to identify.
 
     Attributes:
-        nominal: where the search begins, in the parameter's unit.
+        nominal: the value at which the search begins, in the parameter's unit.
         lower: least value; minus infinity for none.
         upper: greatest value; infinity for none.
-        write: from a model and a value to the changed fields, `{"dof_damping": ...}`. What MuJoCo derives from them follows, as
-            in `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
-        unit: for reports.
+        write: function from a model and a value to the changed fields, `{"dof_damping": ...}`. Derived fields follow, as in
+            `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
+        unit: the unit in reports.
     """
 
     nominal: Any
@@ -58,10 +58,14 @@ class Parameter:
 
 
 class Coordinates(eqx.Module):
-    """All parameters as one vector, and points of the search, in which each is measured by its range.
+    """All parameters as one vector, and the search coordinates, in which each is scaled by its range.
 
     Attributes:
-        names: one for each number, `mass` or `inertia[3]`.
+        nominal: the nominal values.
+        lower: the lower bounds.
+        upper: the upper bounds.
+        names: one name per number, `mass` or `inertia[3]`.
+        shapes: name and shape of each parameter.
     """
 
     nominal: Float[Array, " dim"]
@@ -72,7 +76,7 @@ class Coordinates(eqx.Module):
 
     @classmethod
     def of(cls, parameters: Mapping[str, Parameter]) -> "Coordinates":
-        """Return those of named parameters; refuse none."""
+        """Return the coordinates of named parameters, at least one."""
         if not parameters:
             raise ValueError("parameters must name at least one parameter, got none")
         nominal, lower, upper = [
@@ -99,28 +103,28 @@ class Coordinates(eqx.Module):
 
     @property
     def scale(self) -> Float[Array, " dim"]:
-        """Unit of each number in the search: its range, or the way to its only bound, or its size."""
+        """The scale of each number in the search: its range, else the distance to its only bound, else its size."""
         above, below = self.nominal - self.lower, self.upper - self.nominal
         reach = jnp.where(jnp.isfinite(above), above, jnp.where(jnp.isfinite(below), below, jnp.abs(self.nominal)))
         width = self.upper - self.lower
         return jnp.where(jnp.isfinite(width), width, jnp.where(reach > 0, reach, 1.0))
 
     def values(self, free: Float[Array, "*points dim"]) -> Float[Array, "*points dim"]:
-        """Return the numbers at a point of the search, which begins at zero; beyond a bound it means the bound."""
+        """Return the numbers at a point of the search, which begins at zero; points beyond a bound are clipped."""
         return jnp.clip(self.nominal + self.scale * free, self.lower, self.upper)
 
     def box(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Return the bounds of points of the search."""
+        """Return the bounds in search coordinates."""
         return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
 
     def is_at_bound(self, values: Float[Array, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
-        """Return which numbers are at their lower, and which at their upper bound, to rounding."""
+        """Return masks of the numbers at their lower and at their upper bound, up to rounding."""
         near = _AT_BOUND * self.scale
         return values - self.lower < near, self.upper - values < near
 
 
 def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:
-    """Return the scene in which each parameter has written its value, in their order; traceable."""
+    """Return the scene after each parameter, in order, has written its value; traceable."""
     model, changed = scene.model, {}
     for name, parameter in parameters.items():
         if parameter.write is not None:
@@ -130,12 +134,12 @@ def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping
 
 
 def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) -> Parameter:
-    """Return the mass of a body, or one for several bodies alike (kg); inertias change by the same factor, as with the density.
+    """Return the mass of a body, or the common mass of several (kg); inertias scale with it, as with the density.
 
     Args:
-        scene: where the nominal value is read.
-        *bodies: by name.
-        bounds: a tenth and ten times the nominal value by default.
+        scene: the scene with the nominal value.
+        *bodies: names of the bodies.
+        bounds: least and greatest value; a tenth and ten times the nominal value by default.
 
     Raises:
         ValueError: if there is no such body.
@@ -158,13 +162,13 @@ def friction(
     bounds: tuple[float, float] = (0.0, 2.0),
     **subset: Any,
 ) -> Parameter:
-    """Return the sliding friction of contacts, one for all that are named; it is written to all geoms that decide it.
+    """Return the common sliding friction of the selected contacts; all geoms that determine it receive the value.
 
     Args:
-        scene: where the nominal value is read.
-        pairs: by the names of their geoms; None for all that can touch.
-        bounds: of the coefficient.
-        **subset: `geoms`, `bodies` or `groups` in place of pairs, as of `Softness`.
+        scene: the scene with the nominal value.
+        pairs: pairs of geom names; None for all that can touch.
+        bounds: least and greatest coefficient.
+        **subset: `geoms`, `bodies` or `groups` in place of pairs, as in `Softness`.
 
     Raises:
         ValueError: if a name is unknown or can touch nothing.
@@ -190,10 +194,11 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
     """Return one part of the contact softness.
 
     Args:
-        scene: where the nominal value is read.
-        part: "stiffness" (1/s²), "damping_ratio", which decides the restitution (`mjxgrad.contact.bounce`), or "width" (m).
-        bounds: a tenth and ten times the nominal value by default.
-        **subset: `pairs`, `geoms`, `bodies` or `groups`, as of `Softness`; all contacts without one.
+        scene: the scene with the nominal value.
+        part: "stiffness" (1/s²), "damping_ratio", which determines the restitution (`mjxgrad.contact.bounce`), or "width"
+            (m).
+        bounds: least and greatest value; a tenth and ten times the nominal value by default.
+        **subset: `pairs`, `geoms`, `bodies` or `groups`, as in `Softness`; all contacts by default.
 
     Raises:
         ValueError: if there is no such part, or as `Softness`.
@@ -212,22 +217,22 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
 
 
 def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
-    """Return the damping of a joint, or one for several joints alike (N s/m or N m s/rad); as `mass` otherwise."""
+    """Return the damping of a joint, or the common damping of several (N s/m or N m s/rad); otherwise as `mass`."""
     return _of_joints(scene, "dof_damping", joints, bounds)
 
 
 def armature(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
-    """Return the armature of a joint, or one for several joints alike (kg or kg m²); as `mass` otherwise."""
+    """Return the armature of a joint, or the common armature of several (kg or kg m²); otherwise as `mass`."""
     return _of_joints(scene, "dof_armature", joints, bounds)
 
 
 def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
-    """Return the dry friction of a joint, or one for several joints alike (N or N m); as `mass` otherwise."""
+    """Return the dry friction of a joint, or the common friction of several (N or N m); otherwise as `mass`."""
     return _of_joints(scene, "dof_frictionloss", joints, bounds)
 
 
 def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
-    """Return the first number of the gear of an actuator, or one for several actuators alike; as `mass` otherwise."""
+    """Return the first gear number of an actuator, or the common one of several; otherwise as `mass`."""
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
@@ -241,9 +246,9 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
     """Return the two gains of a position actuator, `kp` and `kv`.
 
     Args:
-        scene: where the nominal values are read.
-        actuator: by name.
-        bounds: each a number or one for each gain; a tenth and ten times the nominal values by default.
+        scene: the scene with the nominal values.
+        actuator: name of the actuator.
+        bounds: least and greatest value, each a number or one per gain; a tenth and ten times the nominal values by default.
 
     Raises:
         ValueError: if there is no such actuator, or a gain is zero and no bounds are given.

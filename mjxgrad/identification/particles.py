@@ -1,13 +1,14 @@
-"""A search for where motions jump with every number: many points, that see the measurements one after the other.
+"""Sequential Monte Carlo search for motions that jump with every parameter.
 
-Hard contacts chatter. Each switch of a contact is then a jump of all that follows, the sum of squares has a minimum in every
-cell between two jumps, and descent ends in the first. The first moments of a motion have few jumps, and tell roughly where to
-look; each later one tells more, among points that the earlier ones have left over. That is sequential Monte Carlo for numbers
-that stand still.
+Hard contacts chatter. Each switch of a contact makes the later motion jump, and the sum of squares has a minimum in every
+cell between two jumps. Descent ends in the first of them. The first moments of a motion have few jumps and locate the
+parameters roughly; later moments select among the points that remain. Many points therefore see the measurements one row
+after the other.
 
 References:
     Chopin. A sequential particle filter method for static models. Biometrika 89(3), 2002.
-    Del Moral, Doucet, Jasra. Sequential Monte Carlo samplers. JRSS B 68(3), 2006 (steps of a size that keeps half of the points).
+    Del Moral, Doucet, Jasra. Sequential Monte Carlo samplers. JRSS B 68(3), 2006 (steps of a size that keeps half of the
+    points).
 """
 
 from collections.abc import Callable
@@ -15,9 +16,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-_KEPT = 0.5  # of the points, counted by their weights, in each step
-_MOVES = (1.2, 0.4, 0.13)  # of the spread of all points: far, and near for when little of a wide spread is left
-_BEYOND = 5.0  # standard deviations of chi-square, by which the best point may miss what it has seen
+_KEPT = 0.5  # effective share of the points that each step keeps
+_MOVES = (1.2, 0.4, 0.13)  # step sizes as shares of the points' spread, from far to near
+_BEYOND = 5.0  # largest misfit of the best point, in standard deviations of chi-square
 _MOST_STEPS = 200
 
 Sums = Float[np.ndarray, "points rows"]
@@ -30,14 +31,14 @@ def best_point(
     counts: Float[np.ndarray, " rows"],
     num_points: int,
 ) -> Float[np.ndarray, " dim"] | None:
-    """Return the point of least squares among those left over by all rows; None if none explains what was measured.
+    """Return the point of least squares among those that survive all rows; None if none explains the measurements.
 
     Args:
-        sums_at: from points to their sums of squared residuals, in units of the noise, over the rows up to each.
+        sums_at: function from points to their cumulative sums of squared residuals over the rows, in units of the noise.
         lower: least numbers, finite.
         upper: greatest numbers.
-        counts: of what was measured up to each row.
-        num_points: as many move side by side.
+        counts: cumulative number of measurements over the rows.
+        num_points: number of points that move side by side.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform(lower, upper, (num_points, len(lower)))
@@ -65,14 +66,14 @@ def best_point(
 
 
 def _at(sums: Sums, row: float) -> Float[np.ndarray, " points"]:
-    """Return the sums over so many rows, a share of the last one included."""
+    """Return the cumulative sums up to a row number, interpolated within the last row."""
     whole = int(row)
     before = sums[:, whole - 1] if whole else np.zeros(len(sums))
     return before if row == whole else before + (row - whole) * (sums[:, whole] - before)
 
 
 def _advanced(sums: Sums, row: float) -> tuple[float, Float[np.ndarray, " points"]]:
-    """Return up to which row the points may see at once, and how much each of them then weighs."""
+    """Return the next row up to which enough points keep their weight, and the weights there."""
 
     def weights(to: float) -> np.ndarray:
         excess = 0.5 * (_at(sums, to) - _at(sums, row))

@@ -1,4 +1,4 @@
-"""What was measured: motions of a scene, and all of them as one batch."""
+"""Measured motions of a scene, and their batch."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -21,18 +21,20 @@ _STATES = ("qpos", "qvel", "act")
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """A motion that was measured.
+    """A measured motion.
 
     Attributes:
-        measured: by name of a sensor, or as "qpos", "qvel" or "act": one row for each time. NaN where there is no measurement.
-        controls: what drove it, one row for each time step of the scene, or for each of `control_times`; None for none.
-        times: of the measurements, in s from the start, increasing; None for one at each state, the first and last included.
-        control_times: of the controls, which are then interpolated linearly (s); None for one row for each time step.
-        noise: standard deviation of each signal in its own unit, one number or one for each column, those of "qpos" being one for
-            each velocity (m, rad). Signals without one have 1. Their ratios weigh the signals; the overall size is estimated.
-        start: the state at time 0; None for the first row of "qpos" and "qvel" where that is at time 0, else the scene's pose, at
+        measured: measurements by sensor name, or as "qpos", "qvel" or "act": one row per time. NaN where there is no
+            measurement.
+        controls: the controls, one row per time step of the scene or per entry of `control_times`; None for none.
+        times: times of the measurements from the start (s), increasing; None for one at each state, the first and last
+            included.
+        control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
+        noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
+            (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
+        start: the state at time 0; None for the first row of "qpos" and "qvel" if it is at time 0, else the scene's pose, at
             rest.
-        name: for messages.
+        name: name in messages.
     """
 
     measured: Mapping[str, Any]
@@ -72,14 +74,14 @@ class Recording:
                 )
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
-        """Return windows of this duration, each of which begins at a measured state; what is left at the end is dropped.
+        """Return windows of a duration, each from a measured state; a shorter remainder is dropped.
 
-        Short windows keep a motion that is hard to predict close to what was measured. Their starts are as noisy as the
-        measurements: `free_start=True` of `identify` finds them, too.
+        Short windows keep a motion that is hard to predict close to the measurements. Their starts are as noisy as the
+        measurements: `free_start=True` of `identify` estimates them, too.
 
         Args:
-            duration: of a window (s).
-            timestep: of the scene (s).
+            duration: length of a window (s).
+            timestep: time step of the scene (s).
 
         Raises:
             ValueError: if positions or velocities were not measured, or no window fits.
@@ -112,14 +114,14 @@ class Recording:
 
 
 class Windows(eqx.Module):
-    """Recordings of one scene as a batch; shorter ones are continued by rows that weigh nothing.
+    """Recordings of one scene as a batch; shorter ones are padded by rows of weight zero.
 
     Attributes:
-        state: where each begins.
-        controls: one row for each step.
-        index: the state before, or at, each measurement.
-        share: how far from it to the next state the measurement is, of a step.
-        measured: by name.
+        state: the initial states.
+        controls: one row per step.
+        index: index of the last state at or before each measurement.
+        share: position of the measurement between this state and the next, as a share of a step.
+        measured: measurements by name.
         weight: reciprocal of the noise, 0 where nothing was measured.
     """
 
@@ -152,7 +154,7 @@ def _times(recording: Recording, timestep: float) -> np.ndarray:
 
 
 def _num_steps(recording: Recording, timestep: float) -> int:
-    """Return how many steps reach the last measurement; refuse more than there are controls for."""
+    """Return the number of steps up to the last measurement; refuse more than there are controls."""
     needed = max(1, int(np.ceil(_times(recording, timestep)[-1] / timestep - 1e-6)))
     if recording.controls is not None and recording.control_times is None and needed > len(recording.controls):
         raise ValueError(
@@ -180,7 +182,7 @@ def _window(
         columns = scene.model.nv if name == "qpos" else width
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
-        if name == "qpos":  # a quaternion without one of its numbers is none
+        if name == "qpos":  # an incomplete quaternion is useless
             value, is_there = (
                 np.where(is_there, value, np.asarray(scene.data.qpos)),
                 _joints_there(scene.model, is_there),
@@ -241,15 +243,15 @@ def residuals(
     onset: Onset | None,
     gradient: Gradient,
 ) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-    """Return simulated less measured, in units of the noise, of one window; and whether the motion diverged.
+    """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
 
     Args:
-        scene: with the parameters in it.
-        window: one, without its leading axis.
-        offset: of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
-        delay: by how much the controls act later than recorded (s); None for none.
-        onset: as of `rollout`.
-        gradient: as of `rollout`.
+        scene: the scene with the present parameters.
+        window: one window, without the leading axis.
+        offset: change of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
+        delay: delay of the controls beyond the recorded times (s); None for none.
+        onset: as in `rollout`.
+        gradient: as in `rollout`.
     """
     model, state, controls = scene.model, window.state, window.controls
     if offset is not None:

@@ -1,9 +1,11 @@
-r"""What was found, how surely, and what the recordings cannot tell.
+r"""The identified values, their intervals, and the parameters that the recordings leave undetermined.
 
-With residuals $r$ in units of the noise and $J = \partial r / \partial \theta$ at the end, $n$ numbers and $p$ unknowns,
-$s^2 = r^T r / (n - p)$ estimates how much larger the noise is than was said, and the covariance of the parameters is
-$s^2 (J^T J)^{-1}$. It holds where the model is right, the noise independent, and residuals almost linear over the interval. What
-a singular value decomposition of $J$ with columns of length 1 shows to be of no consequence has no interval: it is named.
+Let $r$ be the residuals in units of the noise, $J = \partial r / \partial \theta$ at the end, $n$ numbers and $p$ unknowns.
+Then $s^2 = r^T r / (n - p)$ estimates the ratio of the true to the stated noise variance, and the covariance of the
+parameters is
+$s^2 (J^T J)^{-1}$. This assumes a correct model, independent noise, and nearly linear residuals over the interval.
+Directions without effect have no interval; they are named. A singular value decomposition of $J$ with columns of length 1
+finds them.
 
 References:
     Bates, Watts. Nonlinear Regression Analysis and Its Applications. Wiley 1988, chapters 2 and 3.
@@ -24,17 +26,17 @@ from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
 _LEVEL = 0.95
-_SMALL_PART = 0.05  # of a combination: what takes part in it with less is not named
-_NOT_TOLD_APART = 1e-6  # of the clearest direction: the data would have to be a million times better along this one
-_RELATED = 0.5  # of the correlation of residuals: intervals are then too narrow by √3
-_REMOVED = 1e-3  # of the residuals at the start: what is left is that of numbers computed in another way
-_ENOUGH = 30  # numbers: among fewer, noise alone is as correlated once in a hundred times
-_CHANCE = 1e-4  # that residuals as large are noise
-_NO_PART = 1e-4  # of a direction that is not determined: what has no more is determined all the same
+_SMALL_PART = 0.05  # least share in a combination for a number to be named
+_NOT_TOLD_APART = 1e-6  # of the largest singular value: the data would have to be a million times better
+_RELATED = 0.5  # correlation of residuals that makes intervals too narrow by √3
+_REMOVED = 1e-3  # of the residuals at the start: less comes from numerical differences
+_ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
+_CHANCE = 1e-4  # probability that residuals as large are noise
+_NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
 
 class Stopped(enum.Enum):
-    """Why a search ended."""
+    """The reason why a search ended."""
 
     CONVERGED = "converged"
     STALLED = "stalled"
@@ -43,7 +45,7 @@ class Stopped(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Statistics:
-    """What the residuals and their derivative at the end say; see `Identification` for the fields."""
+    """Statistics from the residuals and their derivative at the end; see `Identification` for the fields."""
 
     covariance: Float[np.ndarray, "dim dim"]
     half_width: Float[np.ndarray, " dim"]
@@ -57,29 +59,29 @@ class Identification:
     """Parameters from recorded motions.
 
     Attributes:
-        values: by name.
+        values: the identified values, by name.
         start: the nominal values, by name.
-        half_width: of the 95 % intervals, by name; infinite for what the recordings do not determine.
-        covariance: of all numbers in the order of `names`; infinite on the diagonal where they are not determined.
-        names: of all numbers, `inertia[3]` for one of several.
-        condition_number: of J with columns of length 1. Beyond a hundred or so single intervals are much wider than combinations.
+        half_width: half-widths of the 95 % intervals, by name; infinite where the recordings determine nothing.
+        covariance: covariance of all numbers in the order of `names`; infinite on the diagonal where they are not determined.
+        names: one name per number, `inertia[3]` within an array.
+        condition_number: condition number of J with columns of length 1. Beyond a hundred or so, single intervals are much
+            wider than those of combinations.
         without_effect: names on which no measurement depends.
-        inseparable: combinations that no measurement can tell apart: each says by how much several numbers may change together,
-            relative to their values, without any effect.
+        inseparable: combinations without effect on any measurement, as joint changes relative to the values.
         at_bounds: names that ended at a bound: the data ask for more, and their intervals mean little.
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
-        has_noise: whether the recordings say the noise of every signal.
-        held_out_rms: the same of the recordings that were held out; None without any.
-        offsets: of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
-        correlation: of residuals with those of the same signal one time later. About 0 if all that is left is independent noise.
-        removable: share of the sum of squares that the derivative at the end could still remove within the bounds. About 0
+        has_noise: whether the recordings state the noise of every signal.
+        held_out_rms: the same for the held-out recordings; None without any.
+        offsets: changes of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        correlation: correlation of successive residuals of a signal. About 0 if only independent noise is left.
+        removable: share of the sum of squares that the linear model at the end could still remove within the bounds. About 0
             at a minimum of a smooth motion.
-        num_numbers: measured numbers that took part.
-        num_steps: of the search.
-        stopped: why it ended.
-        scenes: with the values found.
+        num_numbers: number of measured numbers.
+        num_steps: number of search steps.
+        stopped: the reason why the search ended.
+        scenes: the scenes with the identified values.
         coordinates: bounds and names, for saving.
-        units: by name.
+        units: units by name.
     """
 
     values: dict[str, np.ndarray]
@@ -106,11 +108,11 @@ class Identification:
 
     @property
     def scene(self) -> Scene:
-        """The first, or only, scene, with the values found."""
+        """The first, or only, scene with the identified values."""
         return self.scenes[0]
 
     def summary(self) -> str:
-        """Describe the result in text: the values with their intervals, then what to beware of."""
+        """Describe the result in text: the values with their intervals, then the warnings."""
         count = len(self.names)
         head = f"{count} number{'s' * (count > 1)} from {self.num_numbers} measured ones in {self.num_steps} steps"
         rms = f"Residuals, in units of the noise: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
@@ -127,7 +129,7 @@ class Identification:
         )
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return the values as a table of text, its head first: name and unit, value, interval, start, bounds."""
+        """Return the values as a table of text, header first: name and unit, value, interval, start, bounds."""
         parts = (self.values, self.half_width, self.start)
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
         bounds = zip(on_host(self.coordinates.lower), on_host(self.coordinates.upper), strict=True)
@@ -146,24 +148,24 @@ class Identification:
         return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
     def warnings(self) -> list[str]:
-        """Say what to beware of, a sentence or two each: a search that stalled, numbers that cannot be told."""
+        """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
         found = []
         if self.stopped is Stopped.STALLED:
             found.append(
-                f"Stalled: by the derivative {100 * self.removable:.2g} % of the sum of squares could go, but no step helps. "
-                "Motions that jump do that: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
+                f"Stalled: the linear model would remove {100 * self.removable:.2g} % of the sum of squares, but no step helps. "
+                "Jumps in the motion cause this: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
         if self.has_noise and exceeds_noise(self.rms[1], self.num_numbers - len(self.names)):
             found.append(
-                f"Residuals are {self.rms[1]:.3g} times the noise that was said, which is more than chance: the motion of the "
+                f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the motion of the "
                 "scene is not the recorded one, and values may be off by more than their intervals. Try free_start=True, shorter "
-                "windows (recording.cut), more parameters or num_points, or say the noise as it is."
+                "windows (recording.cut), more parameters or num_points, or correct the stated noise."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
             found.append(
                 f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
-                f"not as in the scene. {starts}Values may be off by more than their intervals, which take independent noise."
+                f"not as in the scene. {starts}Values may be off by more than their intervals, which assume independent noise."
             )
         if self.without_effect:
             found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Leave them out.")
@@ -177,10 +179,10 @@ class Identification:
         return found
 
     def save(self, path: str | Path) -> None:
-        """Write values and bounds as YAML, as a `ParameterDict` of `mujoco.sysid` is saved and loaded.
+        """Write values and bounds as YAML, in the format of `ParameterDict` in `mujoco.sysid`.
 
         Args:
-            path: of the file.
+            path: path of the file.
         """
         lower, upper = (
             self.coordinates.unravel(np.asarray(x)) for x in (self.coordinates.lower, self.coordinates.upper)
@@ -201,15 +203,15 @@ def statistics(
     num_numbers: int,
     num_offsets: int,
 ) -> Statistics:
-    """Return intervals and what the recordings cannot tell.
+    """Return the intervals, and the combinations that the recordings leave undetermined.
 
     Args:
         coordinates: names and bounds.
-        values: at the end.
-        residual: there, in units of the noise.
-        slope: its derivative by the values, what starts explain taken out.
-        num_numbers: of residuals that are measurements.
-        num_offsets: unknowns beside the parameters.
+        values: the values at the end.
+        residual: the residuals at the end, in units of the noise.
+        slope: derivative of the residuals by the values, orthogonal to the effect of the starts.
+        num_numbers: number of residuals that are measurements.
+        num_offsets: number of unknowns beside the parameters.
     """
     rounding = float(np.finfo(np.asarray(coordinates.nominal).dtype).eps)
     lengths = np.linalg.norm(slope, axis=0)
@@ -239,12 +241,12 @@ def statistics(
 
 
 def exceeds_noise(rms: float, freedom: int) -> bool:
-    """Return whether residuals are larger than the noise, in units of which they are, by more than chance (chi-square)."""
+    """Return whether residuals in units of the noise are larger than chance allows (chi-square)."""
     return bool(scipy.special.chdtrc(max(freedom, 1), rms**2 * max(freedom, 1)) < _CHANCE)
 
 
 def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:
-    """Return directions without effect as relative changes, each of as few numbers as possible, the first by one per cent."""
+    """Return directions without effect as relative changes of few numbers, the first by one per cent."""
     if not len(blurred):
         return ()
     relative = blurred / np.where(values != 0, values, 1.0)
@@ -274,5 +276,5 @@ def _yaml(number: float) -> str:
 
 
 def on_host(tree):
-    """Return arrays of numpy in double precision."""
+    """Return arrays of NumPy in double precision."""
     return jax.tree.map(lambda x: np.asarray(x, float), tree)

@@ -1,9 +1,9 @@
 r"""The search: residuals of all recordings in one program, their derivative in forward mode, and Levenberg-Marquardt.
 
-One program rolls out all windows of a scene under `jax.vmap`, with one tangent for each parameter. The unknown start of a window
-concerns that window alone, so its tangents are those of one window, however many there are. Each step of the search asks this
-program for residuals and derivative at one point; optimistix, which sees only their linear model there, accepts or refuses the
-point and chooses the next.
+One program rolls out all windows of a scene under `jax.vmap`, with one tangent per parameter. The unknown start of a window
+affects that window alone, so the tangents of the starts do not grow with the number of windows. Each step of the search asks
+this program for residuals and derivative at one point. From their linear model optimistix accepts or refuses the point and
+chooses the next.
 """
 
 import dataclasses
@@ -30,17 +30,17 @@ from mjxgrad.stepping import Gradient, Onset
 
 Apply = Callable[[Scene, Values], Scene]
 Log = Callable[[int, dict[str, float]], None]
-_MOST_REFUSALS = 12  # in a row: by then a step is shorter by a factor of ten million
-_STALLED = 1e-2  # of the sum of squares, that the linear model would remove at the end
-_VANISHED = 1e3  # roundings of the residuals at the start: what is left is no more
-# Residuals are scaled so that optimistix's first damping, 1, is a tenth of what the derivative has.
-_FIRST_SIZE = 3.0  # with less a first step may go too far to come back
-_GOOD = 0.75  # of the predicted fall: the damping is lowered; optimistix's own 0.99 keeps it for long
-# Of the variance of the noise, and in so many steps in a row: with parameters that the data hardly tell, a search creeps.
+_MOST_REFUSALS = 12  # in a row, which shorten a step by a factor of ten million
+_STALLED = 1e-2  # share of the sum of squares that the linear model would remove at the end
+_VANISHED = 1e3  # rounding errors of the first residuals: fewer are no misfit
+# Norm of the first residuals after scaling: optimistix's first damping, 1, is then about a tenth of JᵀJ.
+_FIRST_SIZE = 3.0  # with less, the first step may go too far to recover
+_GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix's 0.99 keeps it too long
+# Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
-_DIVERGED = 1e30  # sum of squares of a motion that did
-_NEAR_ENOUGH = 1e-3  # of a standard error: no step that is left would be longer
+_DIVERGED = 1e30  # sum of squares of a diverged motion
+_NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Experiment:
     """Motions of one scene.
 
     Attributes:
-        scene: with nominal values.
-        recordings: to fit.
-        held_out: to judge by.
-        apply: from the scene and all parameters as a vector to the scene with them.
+        scene: the scene with nominal values.
+        recordings: the recordings to fit.
+        held_out: the held-out recordings.
+        apply: function from the scene and the vector of all parameters to the changed scene.
     """
 
     scene: Scene
@@ -75,31 +75,33 @@ def identify(
     num_points: int = 256,
     log: Log | None = None,
 ) -> Identification:
-    r"""Find parameters of a scene from recorded motions, through contact.
+    r"""Identify parameters of a scene from recorded motions, through contact.
 
-    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with derivatives
+    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
+    derivatives
     through the simulation. Needs optimistix (`pip install 'mjxgrad[identify]'`).
 
     Args:
-        scene: with the model's numbers as far as they are known; or several, that share the parameters.
-        parameters: by name, from `mass`, `inertia`, `friction`, `softness` and the other makers, or `Parameter` with a `write` of
-            one's own.
-        recordings: of the scene; of several scenes a sequence for each of them.
-        held_out: recordings that are only judged by, likewise.
-        apply: called as `apply(scene, values)` after the parameters have written theirs, for what takes several of them.
-        delay: name of the parameter, if any, by which controls act later than recorded (s).
-        free_start: find the start of every recording, too, from where it says; for starts as noisy as the rest.
-        onset: as of `rollout`. None is MuJoCo's motion, which what MuJoCo has recorded needs: another is off by more than the
-            intervals. `mg.Onset()` is the smoother motion to search in, where real things were recorded.
-        gradient: as of `rollout`.
-        max_steps: simulations with derivatives at most.
-        num_points: if the descent leaves more than the noise that the recordings say, as where contacts chatter, so many points
-            between the bounds are narrowed down to what explains the recordings, moment by moment, and the descent begins again
-            at the best. 0 for no such search; there is none with `free_start`.
+        scene: the scene with nominal values; or several scenes that share the parameters.
+        parameters: parameters by name, from `mass`, `inertia`, `friction`, `softness` and the like, or a `Parameter` with its
+            own `write`.
+        recordings: recordings of the scene; for several scenes, a sequence for each of them.
+        held_out: recordings for validation only, in the same form.
+        apply: called as `apply(scene, values)` after the parameters have written theirs, for changes that need several of
+            them.
+        delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
+        free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
+        onset: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover the
+            error of another motion. `mg.Onset()` is a smoother motion, for recordings of real things.
+        gradient: as in `rollout`.
+        max_steps: largest number of simulations with derivatives.
+        num_points: number of points of a global search between the bounds. It runs where the descent leaves more than the
+            stated noise, as where contacts chatter; a second descent begins at the best point. 0 for no such search; there is
+            none with `free_start`.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
-        The values, their intervals, and what the recordings cannot tell; `print(result.summary())`.
+        The values, their intervals, and undetermined parameters; `print(result.summary())`.
 
     Raises:
         ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
@@ -192,7 +194,7 @@ def search(
 
 
 class _Program:
-    """Residuals and their derivatives by values and offsets. What was measured is an argument: other data compile nothing."""
+    """Residuals and their derivatives by values and offsets. Measurements are arguments, so other data compile nothing."""
 
     def __init__(
         self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
@@ -233,7 +235,7 @@ class _Program:
         return found
 
     def _sums(self, of_all: list[Windows | None], vectors: Array) -> Float[Array, "points rows"]:
-        """Return for each vector the sum of squares over all windows, up to each of their rows."""
+        """Return for each vector the sum of squares over all windows, cumulative over their rows."""
         there = [(e, w) for e, w in zip(self.experiments, of_all, strict=True) if w is not None]
         num_rows = max(windows.index.shape[1] for _, windows in there)
 
@@ -261,13 +263,13 @@ class _Program:
         )
 
     def box(self) -> tuple[Array, Array]:
-        """Return the bounds of a point; offsets have none."""
+        """Return the bounds of a point; offsets are unbounded."""
         free = jnp.full(len(self.start()) - len(self.coordinates.names), jnp.inf)
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
     def searched(self, num_points: int) -> Array | None:
-        """Return the best of many points between the bounds, found as `particles` does; None if none explains the recordings."""
+        """Return the best of many points between the bounds, by `particles`; None if none explains the recordings."""
         dtype = self.coordinates.nominal.dtype
         weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
         counts = np.zeros(max(there.shape[1] for there in weights))
@@ -284,7 +286,7 @@ class _Program:
         return None if best is None else jnp.asarray(best, dtype)
 
     def offsets(self, point: Array) -> list[Array]:
-        """Return the part of a point that moves the starts, one array for each experiment."""
+        """Return the offsets of the starts in a point, one array per experiment."""
         found, first = [], len(self.coordinates.names)
         for windows, experiment in zip(self.windows, self.experiments, strict=True) if self.free_start else ():
             shape = (len(windows.controls), 2 * experiment.scene.model.nv)
@@ -298,7 +300,7 @@ class _Program:
         return tuple(one.apply(one.scene, vector) for one in self.experiments)
 
     def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
-        """Return what is left of the recordings that were held out, at each point; None without any."""
+        """Return the rms residuals of the held-out recordings at each point; None without any."""
         judged = [stack(one.scene, one.held_out) if one.held_out else None for one in self.experiments]
         if not any(judged):
             return None
@@ -319,7 +321,7 @@ def _num_numbers(windows: Sequence[Windows]) -> int:
 
 
 def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
-    """Return the best point, what the program says of it, steps, whether it ended by itself, first rms, and what could go."""
+    """Return the best point, its linear model, steps, whether it converged, the first rms, and the removable share."""
     lower, upper = program.box()
     found = best = program(point)
     first = _rms(program, found)
@@ -354,9 +356,9 @@ def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
 
 @functools.lru_cache(maxsize=32)
 def _levenberg_marquardt(numbers: int, unknowns: int, dtype: Any) -> tuple[Any, Any]:
-    """Return optimistix's solver and its state at zero; it sees linear models alone.
+    """Return optimistix's solver and its state at zero; it sees only linear models.
 
-    The state holds functions made with it, so that a step with another state of the same shape would be compiled again.
+    The state holds functions of this solver, so a step with the state of another solver would be compiled again.
     """
     optimistix, tolerance = importlib.import_module("optimistix"), float(np.sqrt(jnp.finfo(dtype).eps))
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
@@ -369,19 +371,19 @@ def _levenberg_marquardt(numbers: int, unknowns: int, dtype: Any) -> tuple[Any, 
 
 @eqx.filter_jit
 def _step(solver: Any, point: Array, state: Any, linear: tuple[Array, Array, Array]) -> tuple[Array, Any, Any]:
-    """Return the next point, the state there, and what optimistix says besides."""
+    """Return the next point, its state, and further results of optimistix."""
     return solver.step(_predict, point, linear, {}, state, frozenset())
 
 
 def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:
-    """Return residuals by their linear model at the point that it was made at; there they are exact."""
+    """Return the residuals of the linear model; exact at the point where it was made."""
     at, residual, slope = linear
     return residual + slope @ (point - at), None
 
 
 @jax.jit
 def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
-    """Return the share of the sum of squares that the linear model would remove, as far as its directions are clear."""
+    """Return the share of the sum of squares that the linear model would remove along clear directions."""
     _, residual, slope = linear
     lengths = jnp.linalg.norm(slope, axis=0)
     columns = slope / jnp.where(lengths > 0, lengths, 1.0)
@@ -397,14 +399,14 @@ def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
 def _linear_model(
     program: _Program, found: list[tuple[Array, ...]], point: Array, size: float
 ) -> tuple[Array, Array, Array]:
-    """Return a point, the residuals there in units of those at the start, and their derivative by the point."""
+    """Return a point, its residuals in units of the first ones, and their derivative by the point."""
     count = len(program.coordinates.names)
     residual = jnp.concatenate([one[0].ravel() for one in found]) / size
     slope = jnp.concatenate([one[1].reshape(-1, count) for one in found]) / size
-    # A number at a bound that the residuals push against stays there; the others go their way without it.
+    # A number that the residuals push against its bound stays there; the others move without it.
     lower, upper = (part[:count] for part in program.box())
-    pull = residual @ slope
-    is_held = ((point[:count] <= lower) & (pull > 0)) | ((point[:count] >= upper) & (pull < 0))
+    gradient = residual @ slope
+    is_held = ((point[:count] <= lower) & (gradient > 0)) | ((point[:count] >= upper) & (gradient < 0))
     slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
     if program.free_start:
         blocks = jax.scipy.linalg.block_diag(*(window for one in found for window in one[2])) / size
@@ -413,7 +415,7 @@ def _linear_model(
 
 
 def _correlation(windows: Sequence[Windows], found: list[tuple[np.ndarray, ...]]) -> float:
-    """Return how much residuals are like those of the same signal one time before, from -1 to 1."""
+    """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
     products = squares = 0.0
     for window, (residual, *_) in zip(windows, found, strict=True):
         shapes = [weight.shape for weight in window.weight.values()]
@@ -426,7 +428,7 @@ def _correlation(windows: Sequence[Windows], found: list[tuple[np.ndarray, ...]]
 
 
 def _without_offsets(found: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return residuals, their derivative by the values orthogonal to what offsets do, and how many offsets that takes."""
+    """Return residuals, their derivative by the values orthogonal to the effect of offsets, and the number of offsets."""
     parts, count = [], 0
     for _, slope, *of_offset in found:
         for i, one in enumerate(slope):
