@@ -1,4 +1,4 @@
-"""What to do with a scene of one's own: `check` it, `sweep` its contact, and read what they say."""
+"""Advice for a scene of one's own: `check` it, `sweep` its contact softness, and read the reports."""
 
 from mjxgrad.checking.check import Verdict, check
 from mjxgrad.checking.findings import Finding, Recommendation

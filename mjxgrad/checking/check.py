@@ -1,4 +1,4 @@
-"""One call for a scene of one's own: may it be differentiated, how, and up to where."""
+"""One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import dataclasses
 import json
@@ -42,30 +42,30 @@ from mjxgrad.scene.load import count_pairs
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
-_SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, beyond the second
+_SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, else the second
 _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
-_MOVED = 0.6  # share of the budget for which motions are followed, about
+_MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What `check` says.
+    """The result of `check`.
 
     Attributes:
-        name: of the scene.
+        name: name of the scene.
         headline: the answer, in at most 15 words.
-        findings: faults first, then what there was no time for.
-        recommendation: what to ask for.
-        code: the same, to be pasted.
-        outcomes: what was looked at, in words.
-        scene: that was checked.
-        stability: what the time step makes of each contact.
-        motions: by C MuJoCo.
-        measured: of derivatives; None where that was not asked for.
-        seconds: of each part.
+        findings: faults first, then measurements left out for lack of time.
+        recommendation: recommended settings.
+        code: the recommended settings as code to paste.
+        outcomes: names of the outcomes.
+        scene: the scene that was checked.
+        stability: stability of each contact at the time step.
+        motions: motions by C MuJoCo.
+        measured: measurements of derivatives; None if derivatives were not asked for.
+        seconds: duration of each part.
     """
 
     name: str
@@ -82,11 +82,11 @@ class Verdict:
 
     @property
     def faults(self) -> tuple[Finding, ...]:
-        """Those of the findings that are to be mended or minded."""
+        """The findings that call for a change or caution."""
         return tuple(finding for finding in self.findings if finding.is_fault)
 
     def summary(self) -> str:
-        """Say it for a terminal: the answer, faults, numbers, code, then the scene in detail."""
+        """Return a report for a terminal: the answer, faults, numbers, code, then the scene in detail."""
         lines = [f"{self.name}: {self.headline}", ""]
         for finding in self.findings:
             lead = "! " if finding.is_fault else "- "
@@ -97,7 +97,7 @@ class Verdict:
         return self.summary()
 
     def _details(self) -> dict[str, str]:
-        """Return what is there to look up: what was measured, the scene, its time step."""
+        """Return the detailed report: measurements, scene, time step."""
         spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
         of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
         rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
@@ -114,7 +114,7 @@ class Verdict:
         }
 
     def as_json(self) -> str:
-        """Write it for programs; numbers in SI units."""
+        """Return the verdict as JSON; numbers in SI units."""
         measured = self.measured
         table: dict[str, Any] = {
             "scene": self.name,
@@ -133,7 +133,7 @@ class Verdict:
         return json.dumps(table, indent=2, ensure_ascii=False, default=str)
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
         figure = telling(self.measured, self.outcomes) if self.measured and self.measured.lines else Block()
         faults = [one.text for one in self.findings if one.is_fault]
         notes = [one.text for one in self.findings if not one.is_fault]
@@ -152,30 +152,30 @@ def check(
     seed: int = 0,
     log: Callable[[str], None] | None = None,
 ) -> Verdict:
-    """Say whether and how a scene can be differentiated.
+    """Check whether and how a scene can be differentiated.
 
-    Random motions by C MuJoCo come first: what touches, and what has no effect. Then derivatives are measured along lines
-    through them and under noise: which is the slope, where outcomes jump, how much better first order is than zeroth, and for how
-    long. Each diagnostic is that of `mjxgrad.diagnostics`.
+    Random motions by C MuJoCo come first: they show what touches and what has no effect. Derivatives are then measured along
+    lines through these motions and under noise. The measurements tell which derivative is the slope, where outcomes jump, how
+    much better first order is than zeroth, and up to which time. All diagnostics are from `mjxgrad.diagnostics`.
 
     Args:
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
-        cost: from a trajectory to its cost, as `SceneTask` takes it, also of a shorter one; motions are then followed from
-            their start. None looks at random mixes of where bodies end up, and how fast.
-        derivatives: measure them; False looks at motions alone.
-        engine: "mujoco" measures by C MuJoCo, with nothing to compile; "mjx" by the step that a GPU would run, which is to be
-            given a budget of minutes.
-        budget: how long it may take in s once the scene is loaded, about. Slow scenes are followed for fewer steps; what does not
-            fit is left out, and the verdict says what.
-        seed: of all that is random.
-        log: called with what is being done.
+        cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it; motions are then simulated
+            from their start. None uses random mixes of final positions and velocities.
+        derivatives: whether to measure derivatives; False looks at motions alone.
+        engine: "mujoco" measures by C MuJoCo without compilation; "mjx" measures by the step that a GPU would run, and needs
+            a budget of minutes.
+        budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
+            measurements that are left out.
+        seed: seed of all random numbers.
+        log: called with the name of each part as it starts.
 
     Returns:
         The verdict; `print` it.
 
     Raises:
         ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
-        SceneError: if MuJoCo cannot read the source; and what else `load_scene` raises.
+        SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
     if not budget > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
@@ -224,7 +224,7 @@ def check(
 
 
 def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
-    """Return the scene, and how code calls its file."""
+    """Return the scene, and the name of its file in code."""
     if isinstance(source, Scene):
         return source, "scene.xml"
     is_file = isinstance(source, os.PathLike) or (
@@ -245,7 +245,7 @@ def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
 
 
 def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) -> None:
-    """Say how many geoms can touch; what cannot be read or loaded is left to `load_scene`."""
+    """Return a finding about too many pairs of geoms that can touch; sources that cannot be read are left to `load_scene`."""
     try:
         model = read(argument)
     except ValueError:
@@ -256,11 +256,11 @@ def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) ->
 
 
 def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
-    """Leave room for the contacts that motions needed, where that is much less than for all."""
+    """Return the scene with fewer contact slots, if motions needed far fewer than all."""
     if not scene.pairs:
         return scene, None
     needed = max(contacts_needed(scene, motions.trajectory(i)) for i in range(len(motions.poses)))
-    # Motions along lines meet more than those looked at.
+    # Motions along lines may have more contacts than these.
     room = 2 * needed + _SPARE_CONTACTS
     if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
         return scene, None
@@ -271,13 +271,13 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
     for message in dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)):
-        # What the time step is too long for is said in a sentence of its own.
+        # A separate finding tells where the time step is too long.
         if "refsafe" not in message and "h²k" not in message:
             yield Finding("note", message.partition(": ")[2][:1].upper() + message.partition(": ")[2][1:] + ".")
 
 
 def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:
-    """Return what to look at of a trajectory, and its names."""
+    """Return the function from a trajectory to its outcomes, and their names."""
     if cost is not None:
         return ("the cost",), lambda trajectory: jnp.asarray(cost(trajectory)).sum()[None]
     model = scene.mj_model
@@ -314,7 +314,7 @@ def _numbers(values: list[float]) -> str:
 
 
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:
-    """Write the recommendation as a program."""
+    """Return the recommendation as a program."""
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:

@@ -1,4 +1,4 @@
-"""The figure of a verdict: an outcome along a line, and its derivatives beside the slope that they should have."""
+"""The figure of a verdict: an outcome along a line, and its derivatives beside the slope."""
 
 import functools
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from mjxgrad.checking.measure import Line, Measured
 from mjxgrad.report import INK, Block, svg
 
 _SIZE = (4.6, 2.9)  # inches
-_UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by the first word of an outcome; others are the user's own
+_UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by an outcome's first word; others have the user's units
 
 
 def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
-    """Draw the line on which MuJoCo's derivative is farthest from the slope, or that with the largest jump."""
+    """Draw the line on which MuJoCo's derivative is farthest from the slope, or the line with the largest jump."""
     line, time, outcome = _most_telling(measured)
     words, of = outcomes[outcome], (slice(None), time, outcome)
     unit = _UNITS.get(words.partition(" ")[0], "units of the cost")
@@ -63,7 +63,7 @@ def _panel(x: np.ndarray, jumps: np.ndarray, what: str, fine: str, curve: np.nda
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:
-    """Return what to show: all that is finite, and a third more, but nothing empty."""
+    """Return the range of the finite values, widened by a third and never empty."""
     values = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
     low, high = float(values.min()), float(values.max())
     room = (high - low) / 3 if high > low else max(abs(low), 1e-9)

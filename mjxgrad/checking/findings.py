@@ -1,4 +1,4 @@
-"""What the measurements mean: faults by name, findings, and what to do, in the words of the scene."""
+"""Interpretation of the measurements: named faults, findings and recommended settings, with the names of the scene."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -20,19 +20,19 @@ Kind = Literal[
     "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
 MANY_PAIRS = 1000
-"""Pairs of geoms from which on they are counted aloud."""
+"""Fewest pairs of geoms whose number is a finding."""
 _SPARE_STEP = 0.9
-_CLEAR, _SCATTERED = 0.1, 0.25  # error of a slope to compare with, and of a mean that says something, as shares
-_CLOSE = 0.05  # typical error of a derivative that is the slope
+_CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
+_CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
 _FEWEST_TEETH = 4
-_APART = 0.1  # by which share of it the slopes of two time steps are another
+_DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
 _WORDS = {"slope": 'gradient="slope"', "discrete": 'gradient="discrete"'}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found: its kind, a sentence or two in the words of the scene, and whether it is a fault."""
+    """A finding: its kind, a sentence or two about the scene, and whether it is a fault."""
 
     kind: Kind
     text: str
@@ -41,7 +41,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Slope:
-    """How often the mean of a derivative is not the slope, or too scattered to tell, and its median error as a share."""
+    """Readings of one kind of derivative: how many are off the slope or too scattered, and the median relative error."""
 
     kind: str
     num_off: int
@@ -50,22 +50,22 @@ class Slope:
 
     @property
     def share_off(self) -> float:
-        """Of all readings."""
+        """The share of all readings where the mean derivative is off."""
         return self.num_off / max(self.num_readings, 1)
 
 
 @dataclass(frozen=True)
 class Recommendation:
-    """What to ask for.
+    """Recommended settings.
 
     Attributes:
-        gradient: of MuJoCo's motion, "slope" or "discrete".
+        gradient: gradient of MuJoCo's motion, "slope" or "discrete".
         estimator: name in `mjxgrad.estimators`.
-        stddev: of the noise, as a share of half the range of controls.
-        horizon: in steps, up to which first order was the better one, or as far as it was measured.
-        timestep: in s; None is the file's, as with the next three.
-        stiffness: of all contacts, in 1/s².
-        max_contacts: room for so many.
+        stddev: standard deviation of the noise, as a share of half the range of controls.
+        horizon: number of steps up to which first order was better, or was measured.
+        timestep: time step in s; None, here and below, keeps the file's.
+        stiffness: stiffness of all contacts, in 1/s².
+        max_contacts: number of contact slots.
     """
 
     gradient: str
@@ -78,7 +78,7 @@ class Recommendation:
 
 
 def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) -> Iterator[Finding]:
-    """Yield what random motions and the contact parameters say by themselves."""
+    """Yield findings from random motions and contact parameters alone."""
     if len(scene.pairs) >= MANY_PAIRS:
         yield Finding("many_pairs", f"{len(scene.pairs)} pairs of geoms can touch: exclude those that never do.", True)
     for spring in steps_too_long(stability, touch_speed(motions)):
@@ -87,16 +87,16 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
         text = (
-            f"From {bad[0]} the motion leaves all numbers after {first:.3g} s, in C MuJoCo too: shorten the time step."
+            f"From {bad[0]} the motion ceases to be finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
         )
         yield Finding("not_finite", text, True)
     yield from _contact_findings(scene, motions)
     if motions.idle:
-        text = f"No effect: {', '.join(motions.idle)}. A change of the control leaves every position as it was."
+        text = f"No effect: {', '.join(motions.idle)}. A change of the control changes no position."
         yield Finding("no_effect", text, True)
     unfelt = [name for name in motions.unfelt if motions.touches or motions.touching or name != "friction"]
     if unfelt:
-        text = f"A tenth more changes nothing in the motion looked at: {_some(unfelt)}. Its derivative is zero."
+        text = f"A tenth more changes nothing in the tested motion: {_some(unfelt)}. Its derivative is zero."
         yield Finding("note", text)
 
 
@@ -119,13 +119,11 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
-    """Yield what lines and noise say."""
+    """Yield findings from measurements along lines and under noise."""
     jumps = [line for line in measured.lines if line.changed]
     if jumps:
         line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
-        text = (
-            f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side of it alone."
-        )
+        text = f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side only."
         yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", True)
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))
@@ -146,7 +144,7 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
 
 
 def left_out_findings(measured: Measured | None, budget: int | float) -> Iterator[Finding]:
-    """Yield what there was no time for."""
+    """Yield the measurements that were left out for lack of time."""
     if measured is None:
         text = f"Derivatives were not measured within a budget of {budget:g} s; a larger one measures them."
         yield Finding("not_measured", text)
@@ -165,17 +163,17 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
 
 
 def _time_step_findings(measured: Measured) -> Iterator[Finding]:
-    """Yield where the slope of MuJoCo's outcome is that of its time step alone."""
-    apart, readings = 0, 0
+    """Yield a finding where the slope of MuJoCo's outcome depends on its time step."""
+    differing, readings = 0, 0
     for line in measured.lines:
         own, fine = line.plain, line.fine
         size, error = np.abs(fine.slope), np.hypot(own.slope_error, fine.slope_error)
         is_clear = (size > fine.resolution) & (error <= _CLEAR * size)
         readings += int(is_clear.sum())
-        apart += int((is_clear & (np.abs(own.slope - fine.slope) > 2 * error + _APART * size)).sum())
-    if apart:
-        text = f"At {apart} of {readings} readings the slope is another at a time step {REFINED} times shorter."
-        yield Finding("note", f"{text} What is said of slopes is of the file's own time step.")
+        differing += int((is_clear & (np.abs(own.slope - fine.slope) > 2 * error + _DISAGREES * size)).sum())
+    if differing:
+        text = f"At {differing} of {readings} readings the slope is another at a time step {REFINED} times shorter."
+        yield Finding("note", f"{text} Statements about slopes concern the file's own time step.")
 
 
 def _order_findings(measured: Measured) -> Iterator[Finding]:
@@ -199,14 +197,14 @@ def _times(advantage: float) -> str:
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
-    """Count over all lines, times and outcomes how often each derivative is not the slope, where there is a clear one."""
+    """Count over all lines, times and outcomes with a clear slope how often each derivative is off."""
     found = []
     for kind in ("slope", "discrete"):
         off, errors = [], []
         for line in measured.lines:
             comparison = line.plain
             at = comparison.gradients.index(kind)
-            # Outcomes that meet hardly a tooth of the time step have the slope of a tooth: then the shorter step's alone counts.
+            # An outcome with hardly a tooth has the slope of that tooth: then only the slope at the shorter step counts.
             is_told = comparison.num_teeth >= _FEWEST_TEETH
             truths = [line.fine.slope, np.where(is_told, comparison.slope, line.fine.slope)]
             spread = np.where(is_told, np.maximum(comparison.slope_error, line.fine.slope_error), line.fine.slope_error)
@@ -216,7 +214,7 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
             off_by = np.maximum(0.0, np.maximum(np.min(truths, axis=0) - mean, mean - np.max(truths, axis=0)))
             size = np.maximum(size, line.fine.resolution)
             is_scattered = error > _SCATTERED * size
-            # A derivative that scatters little is not worse for being seen to be a percent off.
+            # A precise derivative must not fail for a visible error of one percent.
             is_far = (off_by > 2 * np.hypot(error, spread)) & (off_by > _CLOSE * size)
             off += (is_far | is_scattered)[is_clear].tolist()
             errors += (off_by / size)[is_clear].tolist()
@@ -227,14 +225,14 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
 def recommend(
     scene: Scene, motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
 ) -> Recommendation:
-    """Say what to ask for, from what was measured; without measurements what is never wrong."""
+    """Return the recommended settings from measurements; without measurements, safe ones."""
     needed = [largest_step(spring, touch_speed(motions)) for spring in steps_too_long(stability, touch_speed(motions))]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
         return Recommendation("slope", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
     slope, discrete = slopes(measured)
-    # Where both are the slope MuJoCo's own derivative is cheaper, and the more common.
+    # Where both are the slope, MuJoCo's own derivative is cheaper and more common.
     is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
     is_better = discrete.num_readings > 0 and discrete.num_off < slope.num_off
     touches = bool(motions.touches or motions.touching)
@@ -266,18 +264,18 @@ def recommend(
 
 
 def touch_speed(motions: Motions) -> float | None:
-    """Return the largest speed at which anything began to touch, in m/s."""
+    """Return the largest approach speed at any first touch, in m/s."""
     return max((touch.speed for touch in motions.touches if touch.speed > 0), default=None)
 
 
 def steps_too_long(stability: StabilityReport, speed: float | None) -> list[Spring]:
-    """Return the springs that the time step is too long for, one of those that are alike."""
+    """Return the springs for which the time step is too long, one of each group of equal ones."""
     found = [one for one in stability.springs if largest_step(one, speed) < one.timestep * (1 - 1e-6)]
     return list({(one.kind, one.given, round(one.coupled_load, 6), one.stiffness): one for one in found}.values())
 
 
 def largest_step(spring: Spring, speed: float | None) -> float:
-    """Return the longest time step in s that follows a spring: that asked for by the file, stable, and not passing through."""
+    """Return the longest time step in s that resolves a spring: as its file asks, stable, and not passing through."""
     asked = spring.given / 2 if spring.is_hidden and spring.given is not None else math.inf
     passed = spring.size / speed if speed and spring.kind == "contact" else math.inf
     return min(asked, spring.timestep / spring.coupled_load if spring.coupled_load >= 1 else math.inf, passed)
@@ -295,7 +293,7 @@ def _time_step(spring: Spring, speed: float | None) -> str:
 
 
 def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
-    """Answer in at most 15 words."""
+    """Return the answer in at most 15 words."""
     answer = (
         f'gradient="{advice.gradient}"' + f" and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
     )
@@ -315,7 +313,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
 
 
 def percent(share: float) -> str:
-    """Write a share for a reader."""
+    """Return a share as text."""
     return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 

@@ -1,4 +1,4 @@
-"""What is measured of a scene's derivatives: along lines, and under noise, by the diagnostics that there are for each."""
+"""Measurements of a scene's derivatives, along lines and under noise, by the library's diagnostics."""
 
 import functools
 import time
@@ -24,23 +24,23 @@ from mjxgrad.objective.base import unchanged
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
 
-_TEETH = 6  # time steps through which the first touch is to move from the middle of a line to its end
-_SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # of the speed of approach, and of half the range of controls, likewise
-_WIDE = 4.0  # times as long as the others is the last line: for jumps that are farther off
+_TEETH = 6  # number of time steps by which the first touch moves from the middle of a line to its end
+_SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # share of the approach speed, and of half the control range
+_WIDE = 4.0  # relative length of the last line, which finds more distant jumps
 STDDEVS = (0.1, 0.3)
-"""Noise that is tried, as a share of half the range of controls; without controls in m/s and rad/s of the start."""
+"""Noise levels, as a share of half the range of controls; without controls, of the initial velocities (m/s, rad/s)."""
 SOFTER = 0.1
-"""Stiffness that is tried beside the file's, as a share of it."""
+"""Softer stiffness to compare with the file's, as a share of it."""
 _NUM_LINES, _NUM_TIMES = 3, 4
 _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 4
-_NUM_BATCHES = 24.0  # that are moved in all, about
+_NUM_BATCHES = 24.0  # approximate number of batches in all
 _LINE_BATCHES, _NOISE_BATCHES = 6, 1
-_SMALLEST_JUMP = 0.05  # of what the outcome varies by along the line
-_AT_REST = 1e-3  # of the largest variation at any time
-_UNFELT = 1e-6  # of the largest spread of all outcomes, or of 10⁻⁶: what varies by less is rounding
-_BESIDE = 0.05  # of half a line beyond the jumps: where to look for what touches
-_REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: no sample of a hundred meets it
+_SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
+_AT_REST = 1e-3  # share of the largest variation at any time
+_UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
+_BESIDE = 0.05  # share of half a line beyond the jumps, where touching pairs are compared
+_REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: a hundred samples would miss it
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Line:
     """Motions along a line through one of the random motions.
 
     Attributes:
-        pose: where it starts, in words.
-        varied: what is changed along it, in words.
-        plain: MuJoCo's motion: its slope, and its derivatives by kind.
-        fine: the slope of the motion at a much shorter time step, beside the same derivatives.
-        jumps: of that motion, over its spread; the parameter is the place on the line.
-        changed: pairs that touch on one side of the jumps alone.
-        growth: of a change of the start, by time; NaN where only controls are changed.
-        num_diverged: motions that left all numbers.
+        pose: name of the initial pose.
+        varied: description of the change along the line.
+        plain: slope and derivatives of MuJoCo's motion, by kind.
+        fine: slope of the motion at a much shorter time step, beside the same derivatives.
+        jumps: jumps of the fine motion, over its spread; the parameter is the place on the line.
+        changed: pairs that touch only on one side of the jumps.
+        growth: growth of a change of the start, by time; NaN where only controls are changed.
+        num_diverged: number of motions that diverged.
     """
 
     pose: str
@@ -70,13 +70,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Noise:
-    """Both estimates of the derivative along one direction, under noise on everything.
+    """Both estimates of the derivative along one direction, with noise on all controls or initial velocities.
 
     Attributes:
-        stddev: see `STDDEVS`.
-        stiffness: of all contacts in 1/s²; None is the file's.
-        first: by time and outcome.
-        zeroth: of the same motions.
+        stddev: standard deviation, see `STDDEVS`.
+        stiffness: stiffness of all contacts in 1/s²; None is the file's.
+        first: first-order estimates, by time and outcome.
+        zeroth: zeroth-order estimates from the same motions.
         crossover: the time from which zeroth order is at least as good, in s.
     """
 
@@ -88,7 +88,7 @@ class Noise:
 
     @property
     def advantage(self) -> float:
-        """How many times fewer samples first order needs at the last time, by the median over outcomes."""
+        """The ratio of samples that zeroth and first order need at the last time, as the median over outcomes."""
         first, zeroth = (np.asarray(one.variance)[-1] for one in (self.first, self.zeroth))
         is_felt = zeroth > _UNFELT**2 * np.nanmax(zeroth, initial=0.0)
         return (
@@ -100,7 +100,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Measured:
-    """All that was measured, and what was not for want of time; times are those of outcomes after the start, in s."""
+    """All measurements, and the names of those left out for lack of time; times of outcomes after the start, in s."""
 
     times: Float[np.ndarray, " times"]
     num_steps: int
@@ -119,13 +119,13 @@ def measure(
     seconds: int | float,
     log: Callable[[str], None],
 ) -> Measured:
-    """Measure along lines and under noise, in about so many seconds, and leave out what would not end in time."""
+    """Measure along lines and under noise within a budget in seconds, and leave out the rest."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
     lengths = _lengths(mover, motions, onsets, seconds)
     num_steps = lengths[-1]
-    # A motion that begins to touch late is followed from shortly before.
+    # A motion with a late first touch starts shortly before it.
     begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
     log(f"derivatives over {num_steps} steps, {num_steps * motions.timestep:.3g} s, from motions that touch")
     probe = _Probe(scene, motions, mover, lengths)
@@ -151,7 +151,7 @@ def measure(
     ]
 
     def in_time(_: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
-        # Going by what the steps before it took.
+        # Estimated from the previous steps.
         seconds = num_batches * num_steps * mover.step_seconds
         if time.perf_counter() + seconds > mover.end:
             return None
@@ -161,15 +161,15 @@ def measure(
             return None
 
     def first(words: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
-        # A verdict without a line says nothing: the first one may take as long again as there was.
+        # A verdict without a line is useless: the first one may take twice the remaining time.
         end, mover.end = mover.end, max(mover.end, time.perf_counter() + 2 * seconds)
         found = in_time(words, num_batches, task)
         mover.end = end
         return found
 
-    # By worth, for the last ones are left out where time is short.
+    # In order of importance, since the last are left out where time is short.
     asked = [lines[0], noises[0], *lines[1:], *noises[1:]]
-    # One after the other: two at once waited for each other for ever on dm_control's humanoid (two cores, jax 0.10.2).
+    # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
     found = [(first if one is asked[0] else in_time)(*one) for one in asked]
     return Measured(
         np.array(lengths) * motions.timestep,
@@ -181,7 +181,7 @@ def measure(
 
 
 def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
-    """Choose how many steps, by when things touch and by how long a step takes here, and at which of them to look."""
+    """Choose the number of steps, by first touches and step time, and the steps at which to look."""
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
     still = np.zeros(motions.qvel.shape[2])
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
@@ -200,9 +200,9 @@ def _repeated(state: State, size: int) -> State:
 def _direction(
     scene: Scene, rng: np.random.Generator, num_steps: int, speed: float, number: int
 ) -> tuple[str, Direction]:
-    """Draw a change of the start, of the controls, or a wide one of both; from −1 to 1 of it is a line.
+    """Draw a change of the start, of the controls, or a wide one of both; the line runs from −1 to 1 times it.
 
-    Long enough for the first touch to move through several steps, so that it meets the teeth of MuJoCo's motion.
+    Its length moves the first touch through several steps, so that it meets the teeth of MuJoCo's motion.
     """
     model, timestep = scene.model, float(scene.model.opt.timestep)
     units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
@@ -212,7 +212,7 @@ def _direction(
     ]
     wide = _WIDE if number == _NUM_LINES - 1 else 1.0
     has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
-    # Positions no wider: they would begin within each other.
+    # Positions stay narrow: wide ones would begin in penetration.
     given = (1.0 * has_start, wide * has_start, wide * has_controls)
     words = ["the start"] * has_start + ["the controls"] * has_controls
     return " and ".join(words), Direction(*(part * share for part, share in zip(parts, given, strict=True)))
@@ -253,7 +253,7 @@ class _Probe:
         derivatives = [one.derivatives for one in own]
         plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[0], fine))
         centre = np.nanmean(fine.outcomes[:, -1], axis=0)
-        # What has come to rest by then varies by rounding alone.
+        # Outcomes at rest vary by rounding alone.
         is_moving = is_felt[-1] & (spreads[-1] > _AT_REST * spreads.max(axis=0))
         scale = np.where(is_moving, spreads[-1], np.inf)
         jumps = jumps_along(
@@ -276,7 +276,7 @@ class _Probe:
         )
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
-        """Name the pairs that touch on one side of the jumps alone; a glancing hit is several, one for each time step."""
+        """Return the pairs that touch only on one side of the jumps; a glancing hit jumps once per time step."""
         if jumps.largest < 0:
             return ()
         sides = []
@@ -287,7 +287,7 @@ class _Probe:
         return tuple(sorted(sides[0] ^ sides[1]))
 
     def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:
-        """Estimate one derivative by both orders, all controls (or velocities of the start) being noisy."""
+        """Estimate one derivative by both orders, with noise on all controls (or the initial velocities)."""
         state, controls = self._at(motion, begin)
         size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
         has_controls = self.scene.model.nu > 0
@@ -307,7 +307,7 @@ class _Probe:
         if stiffness is not None:
             contact = contact_of(Softness(stiffness=stiffness, damping_ratio=1.0).apply(self.scene.model))
         found = self.mover.move("slope", states, noisy, direction, self.lengths, contact)
-        # An outcome depends on the noise of the steps before it alone.
+        # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
         first, zeroth = _estimates(found.outcomes, found.derivatives, scores[:, :, None])
@@ -318,7 +318,7 @@ class _Probe:
 def _estimates(
     costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray
 ) -> tuple[GradientEstimate, GradientEstimate]:
-    """Return both estimates from motions that there are already, by time and outcome."""
+    """Return both estimates from given motions, by time and outcome."""
     plan = Plan(len(costs), with_gradient=True, with_score=True)
 
     def of_one(costs: Array, derivatives: Array, scores: Array) -> tuple[GradientEstimate, GradientEstimate]:
@@ -342,7 +342,7 @@ def _estimates(
 
 
 def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: GradientEstimate) -> Crossover:
-    """Find from when on single samples of zeroth order are as near to the derivative, outcomes weighing alike."""
+    """Return the time from which single zeroth-order samples are as accurate, with equal weight for all outcomes."""
     is_finite = np.isfinite(found.outcomes).all(axis=(1, 2)) & np.isfinite(found.derivatives).all(axis=(1, 2))
     costs, derivatives, scores = (x[is_finite] for x in (found.outcomes, found.derivatives, scores))
     if len(costs) < 2:

@@ -1,7 +1,6 @@
-"""What a scene does by itself: random motions in C MuJoCo, which need no compilation, and what touches in them.
+"""Random motions of a scene in C MuJoCo, which needs no compilation, and the contacts in them.
 
-They come first because they take a second, and because they say where the dear measurements should look: just before
-something begins to touch.
+They come first because they take a second and locate the expensive measurements: just before a first touch.
 """
 
 from collections.abc import Iterator
@@ -21,16 +20,16 @@ from mjxgrad.scene.refusals import element_name
 _NUM_MOTIONS = 4
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 2.0, 1000, 50
 _KNOTS_PER_SECOND = 4.0  # slow enough for bodies to follow
-_REACH = 0.8  # of half the range, so that small changes are not clipped
-_REPLAYED = 100  # steps before and after the first touch, in which what has an effect shows it
-_SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding of double precision over that many steps
-_FASTEST = 1e4  # m/s, rad/s: beyond it a rollout counts as diverged, too
+_REACH = 0.8  # share of half the range, so that small changes are not clipped
+_REPLAYED = 100  # steps before and after the first touch, within which effects show
+_SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over these steps
+_FASTEST = 1e4  # m/s, rad/s: a faster rollout counts as diverged
 _Start = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Touch:
-    """Two geoms that begin to touch: their names, when first (s), and the largest speed of approach (m/s)."""
+    """Two geoms that begin to touch: their names, the first time (s), and the largest speed of approach (m/s)."""
 
     pair: str
     time: float
@@ -42,18 +41,18 @@ class Motions:
     """Random motions from the poses of a scene, by C MuJoCo.
 
     Attributes:
-        poses: names of the poses that they start from.
+        poses: names of the initial poses.
         qpos: positions before each step and after the last.
-        qvel: velocities, likewise.
-        act: activations, likewise.
-        controls: of each step.
-        timestep: of the scene, in s.
-        bad_steps: for each motion the first step that is not finite or beyond all speeds, −1 if there is none.
-        onsets: for each motion the step in which something first begins to touch, −1 if nothing does.
+        qvel: velocities at the same times.
+        act: activations at the same times.
+        controls: controls of each step.
+        timestep: time step of the scene, in s.
+        bad_steps: for each motion the first step that is not finite or too fast, −1 if there is none.
+        onsets: for each motion the step of the first new touch, −1 if there is none.
         touches: pairs that begin to touch, in order of time.
         touching: pairs in contact from the first step on.
-        idle: actuators whose control changes nothing.
-        unfelt: masses and frictions whose change by a tenth changes nothing.
+        idle: actuators whose control has no effect.
+        unfelt: masses and frictions whose change by a tenth has no effect.
     """
 
     poses: tuple[str, ...]
@@ -71,16 +70,16 @@ class Motions:
 
     @property
     def seconds(self) -> float:
-        """How long each was followed, in s."""
+        """The duration of each motion, in s."""
         return self.controls.shape[1] * self.timestep
 
     def state(self, motion: int, step: int) -> State:
-        """Return where a motion is after so many steps."""
+        """Return the state of a motion after a number of steps."""
         qpos, qvel, act = (jnp.asarray(x[motion, step], float) for x in (self.qpos, self.qvel, self.act))
         return State(qpos, qvel, act, time=jnp.asarray(step * self.timestep), warmstart=jnp.zeros_like(qvel))
 
     def trajectory(self, motion: int) -> Trajectory:
-        """Return one of them as diagnostics of recorded motions take it."""
+        """Return one motion as a `Trajectory`, for diagnostics of recorded motions."""
         first_bad = jnp.asarray(int(self.bad_steps[motion]))
         arrays = [jnp.asarray(x[motion], float) for x in (self.qpos, self.qvel, self.controls)]
         final = self.state(motion, -1)
@@ -94,7 +93,7 @@ def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
 
 
 def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:
-    """Draw numbers between −1 and 1 that are linear in time between a few random ones."""
+    """Draw numbers between −1 and 1 that are piecewise linear in time between a few random knots."""
     knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * seconds) + 1), num_columns))
     at = np.linspace(0, len(knots) - 1, num_steps)
     lower = np.minimum(at.astype(int), len(knots) - 2)
@@ -103,7 +102,7 @@ def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: 
 
 
 def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
-    """Move a scene from its key frames and its reference pose, under random controls that are smooth in time."""
+    """Simulate a scene from its key frames and reference pose, under smooth random controls."""
     model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
@@ -136,12 +135,12 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
 
 
 def first_keyframe(model: mujoco.MjModel) -> str | int | None:
-    """Return the name, or else the number, of a scene's first key frame; None if it has none."""
+    """Return the name or else the number of a scene's first key frame; None if it has none."""
     return (model.key(0).name or 0) if model.nkey else None
 
 
 def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[_Start]:
-    """Give the key frames, and the reference pose where it is one to start from or the only one."""
+    """Return the key frames, and the reference pose if it is valid or the only one."""
     for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or str(i)
         yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
@@ -150,7 +149,7 @@ def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[_Start]:
 
 
 def _roll(model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray) -> tuple:
-    """Return positions, velocities and activations, the last good ones from the first bad step on, and that step."""
+    """Return positions, velocities and activations, held from the first bad step on, and the bad steps."""
     data, first_bad = mujoco.MjData(model), -1
     data.qpos[:], data.qvel[:], data.act[:] = start
     states = [tuple(np.array(part) for part in start)]
@@ -167,7 +166,7 @@ def _roll(model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.nda
 def _touches(
     model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray
 ) -> tuple[tuple[Touch, ...], tuple[str, ...], Int[np.ndarray, " motions"]]:
-    """Find what begins to touch in any motion, what touches from the start, and the first beginning in each."""
+    """Return the pairs that begin to touch in any motion, the initially touching ones, and each motion's first touch."""
     data, found, always, onsets = mujoco.MjData(model), {}, {}, np.full(len(qpos), -1)
     before = set()
     for motion, step in np.ndindex(qpos.shape[:2]):
@@ -175,7 +174,7 @@ def _touches(
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         now = {tuple(map(int, contact.geom)): contact for contact in data.contact if contact.efc_address >= 0}
-        # Put down on one another, bodies press from the first step on.
+        # Bodies that rest on each other press from the first step on.
         if step <= 1:
             always, before = always | now, set(now)
         for pair in now.keys() - before:
@@ -192,14 +191,14 @@ def _pair(model: mujoco.MjModel, geoms: tuple[int, ...]) -> str:
 
 
 def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
-    """Return the speed of approach along the normal; the edges of a pyramid have it as their mean."""
+    """Return the speed of approach along the normal, the mean over the edges of a pyramid."""
     is_pyramid = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and contact.dim > 1
     num_rows = 2 * (contact.dim - 1) if is_pyramid else 1
     return max(0.0, -float(data.efc_vel[contact.efc_address : contact.efc_address + num_rows].mean()))
 
 
 def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1) -> frozenset[str]:
-    """Return what touches at any time of a motion by C MuJoCo, at a time step so many times shorter."""
+    """Return the pairs that touch at any time of a motion by C MuJoCo, at a time step divided by `refined`."""
     model = scene.to_mujoco()
     model.opt.timestep /= refined
     controls = np.repeat(controls, refined, axis=0)
@@ -214,7 +213,7 @@ def _without_effect(
     controls: np.ndarray,
     changes: Iterator[tuple[str, np.ndarray]],
 ) -> tuple[str, ...]:
-    """Name the changes under which a motion stays as it was; a change of the model lasts until the next one is asked for."""
+    """Return the names of changes that leave a motion unchanged; each change of the model lasts until the next."""
     usual, found = _roll(model, start, controls), []
     for name, changed in changes:
         other = _roll(model, start, changed)
@@ -230,7 +229,7 @@ def _actuators(model: mujoco.MjModel, controls: np.ndarray, half: np.ndarray) ->
 
 
 def _parameters(model: mujoco.MjModel, controls: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Change the model in place: a tenth more mass of a body, a tenth more friction everywhere."""
+    """Change the model in place: a tenth more mass of one body at a time, or a tenth more friction everywhere."""
     kept = (model.body_mass.copy(), model.body_inertia.copy(), model.geom_friction.copy(), model.pair_friction.copy())
     moving = np.flatnonzero((model.body_weldid > 0) & (model.body_mass > 0)).tolist()
     for body in [*moving, None]:

@@ -1,7 +1,7 @@
-"""Batches of motions with their derivatives along one direction, by C MuJoCo or by MJX: what every measurement is taken from.
+"""Batches of motions with their derivatives along one direction, by C MuJoCo or MJX, for all measurements.
 
-C MuJoCo follows a change step by step, with nothing to compile: a verdict on a quadruped is a matter of seconds. MJX's step is
-what a GPU runs; to look at its derivatives one compiles for a minute. Contact parameters are arguments of either.
+C MuJoCo propagates a tangent step by step without compilation: a quadruped takes seconds. MJX's step is the one that a GPU
+runs; its derivatives compile for a minute. Contact parameters are arguments of both.
 """
 
 import dataclasses
@@ -28,12 +28,12 @@ from mjxgrad.scene import Scene
 
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
-"""Which derivative of MuJoCo's motion; "fine" is the motion at a time step `REFINED` times shorter, without derivatives."""
+"""Kind of derivative of MuJoCo's motion; "fine" is the motion at a `REFINED` times shorter time step, without derivatives."""
 REFINED = 4
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
-# XLA's code of the first level: half the time to compile (hopper, jax 0.10.2: 12 s in place of 24) and as fast.
+# XLA's optimisation level 1 halves the time to compile (hopper, jax 0.10.2: 12 s in place of 24); the code is as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-_TINY = 1e-5  # m, rad: of a central difference through the exponential map of orientations, exact to its square
+_TINY = 1e-5  # m, rad: step of a central difference through the exponential map; its error is second order
 _VELOCITY_LIMIT = 1e4
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
@@ -41,7 +41,7 @@ Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
 
 @dataclass(frozen=True)
 class Direction:
-    """A change of a motion: of the positions (m, rad) and velocities at its start (m/s, rad/s), and of its controls."""
+    """A change of a motion: of its initial positions (m, rad) and velocities (m/s, rad/s), and of its controls."""
 
     positions: Float[np.ndarray, " nv"]
     velocities: Float[np.ndarray, " nv"]
@@ -58,10 +58,10 @@ class Moved:
     """Outcomes of a batch of motions at several times, and their derivatives along a direction.
 
     Attributes:
-        outcomes: what was looked at; NaN for motions that diverged.
-        derivatives: their derivatives along the direction, likewise.
-        growth: how many times longer the change of the state is than at the start.
-        num_diverged: number of motions that left all numbers.
+        outcomes: outcomes; NaN for motions that diverged.
+        derivatives: derivatives along the direction; NaN for motions that diverged.
+        growth: growth of the tangent of the state relative to the start.
+        num_diverged: number of motions that diverged.
     """
 
     outcomes: Float[np.ndarray, "motions times outcomes"]
@@ -70,7 +70,7 @@ class Moved:
     num_diverged: int
 
     def where(self, is_felt: Bool[np.ndarray, "times outcomes"]) -> "Moved":
-        """Return the same with those outcomes that are not felt as constants: rounding has jumps and slopes of its own."""
+        """Return the same with insensitive outcomes as constants: rounding has jumps and slopes of its own."""
         mean = np.nansum(self.outcomes, axis=0) / np.maximum(np.isfinite(self.outcomes).sum(axis=0), 1)
         kept = is_felt | np.isnan(self.outcomes)
         return dataclasses.replace(self, outcomes=np.where(kept, self.outcomes, mean))
@@ -78,13 +78,13 @@ class Moved:
 
 @dataclass
 class Mover:
-    """What moves batches in a scene.
+    """Simulator of batches of motions in a scene.
 
     Attributes:
         scene: the scene.
         size: number of motions in a batch.
-        outcomes: what is looked at of a trajectory.
-        end: when no more batches are begun, by `time.perf_counter`.
+        outcomes: function from a trajectory to its outcomes.
+        end: latest start of a batch, by `time.perf_counter`.
         engine: "mujoco" or "mjx".
     """
 
@@ -102,7 +102,7 @@ class Mover:
 
     @property
     def step_seconds(self) -> float:
-        """How long a step of a batch took so far, in the mean."""
+        """The mean duration of a step of a batch so far."""
         return self._seconds / max(self._num_steps, 1)
 
     def move(
@@ -114,10 +114,10 @@ class Mover:
         lengths: Sequence[int],
         contact: dict[str, Array] | None = None,
     ) -> Moved:
-        """Move a batch, with its change along a direction, and judge it after so many steps.
+        """Simulate a batch with its tangent along a direction, and return the outcomes after the given steps.
 
         Raises:
-            TimeoutError: at the `end`.
+            TimeoutError: after `end`.
         """
         if time.perf_counter() > self.end:
             raise TimeoutError
@@ -145,8 +145,8 @@ class Mover:
         return Moved(np.asarray(outcomes), np.asarray(derivatives), size / (first or 1.0), int(bad.sum()))
 
     def _by_mujoco(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
-        """Return the path and what becomes of a change, by C MuJoCo."""
-        # The batch shares them, and they lack its axis.
+        """Return the path and its tangent, by C MuJoCo."""
+        # The batch shares them, without a leading axis.
         engine, numbers = engine_of(self.scene.mj_model), {k: np.asarray(v)[None] for k, v in contact.items()}
         given = {"time": np.zeros((len(controls), 1)), **start}
         if kind == "fine":
@@ -158,7 +158,7 @@ class Mover:
         return [found[k] for k in start], found["change"]
 
     def _by_mjx(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
-        """Return the same by MJX's step; compiled once for each kind and number of steps."""
+        """Return the path and its tangent by MJX's step; compiled once for each kind and number of steps."""
         scene, nv, dtype = self.scene, self.scene.model.nv, self.scene.data.qpos.dtype
         moves = change_of_poses(scene.mj_model, start["qpos"], changes[0][0, :nv])
         tangents = (moves, changes[0][:, nv : 2 * nv], changes[0][:, 2 * nv :], changes[1])
@@ -187,7 +187,7 @@ class Mover:
         return list(path), np.concatenate([self._tangents(path[0], turned), *rest], axis=2)
 
     def _coordinates(self, qpos: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Return changes of poses as changes of coordinates."""
+        """Return the tangents of poses as changes of coordinates."""
         if self.scene.model.nq == self.scene.model.nv:
             return change
         return np.asarray(_to_coordinates(self.scene, jnp.asarray(qpos), jnp.asarray(change, qpos.dtype)))
@@ -198,7 +198,7 @@ class Mover:
         return np.asarray(_to_tangents(self.scene, jnp.asarray(qpos), jnp.asarray(change)))
 
     def _judge(self, lengths: tuple[int, ...]) -> Callable:
-        """Return a compiled function from a batch of motions and their changes to outcomes and theirs."""
+        """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
         if lengths in self._judges:
             return self._judges[lengths]
 
@@ -243,7 +243,7 @@ def moved(
     positions: Float[np.ndarray, " nv"],
     places: Float[np.ndarray, " motions"] | float,
 ) -> Float[np.ndarray, "motions nq"]:
-    """Move poses by so much of a change of positions, quaternions by their own rule."""
+    """Return poses moved along a change of positions, with quaternions by the exponential map."""
     found = np.array(qpos, float)
     for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
         mujoco.mj_integratePos(model, one, positions, float(place))
@@ -253,13 +253,13 @@ def moved(
 def change_of_poses(
     model: mujoco.MjModel, qpos: Float[ArrayLike, "motions nq"], positions: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, "motions nq"]:
-    """Return the derivative of `moved` by the place, at zero."""
+    """Return the derivative of `moved` with respect to the place, at zero."""
     below, above = (moved(model, qpos, positions, x) for x in (-_TINY, _TINY))
     return (above - below) / (2 * _TINY)
 
 
 def contact_of(model: mjx.Model) -> dict[str, Array]:
-    """Return what of a model `Softness` changes, but for margins."""
+    """Return the fields of a model that `Softness` changes, except margins."""
     return {name: jnp.asarray(getattr(model, name)) for name in CONTACT_FIELDS}
 
 
@@ -269,6 +269,6 @@ def with_contact(scene: Scene, contact: dict[str, Array]) -> Scene:
 
 
 def compiler_options() -> dict | None:
-    """Return what makes XLA compile in half the time, where it is known to."""
+    """Return options that halve XLA's compile time, where known."""
     is_known = device.is_cpu() and jax.__version_info__ < (0, 11)
     return _OPTIONS if is_known else None

@@ -1,4 +1,4 @@
-"""Bias and variance of gradients in a scene of one's own, over contact stiffness; scene, cost and start are given by names."""
+"""Bias and variance of gradients over contact stiffness, for a scene, cost and start given by names."""
 
 import functools
 import importlib
@@ -36,9 +36,9 @@ from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Gradient
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
-_BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # and how many bodies or sites each is of
+_BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # costs, and the number of bodies or sites of each
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
-_NONE, _BLIND = 0.05, 0.5  # shares of the truth: a smaller bias is none, and at least a larger one must have been seen
+_NONE, _BLIND = 0.05, 0.5  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
 def scene_task(
@@ -51,18 +51,18 @@ def scene_task(
     engine: Engine | None = None,
     seed: int = 0,
 ) -> SceneTask:
-    """Make a task of a scene by names.
+    """Return a task of a scene, with cost and start given by names.
 
     Args:
         scene: from `load_scene`; its resting controls become those of the key frame.
-        cost: of a trajectory: a function; or file.py:function, module:function; or of bodies and sites, in the end, height:torso
-            (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of its tilt),
-            reach:hand/ball (their distance, m). None is a random mix of where the heaviest body ends up.
+        cost: function of a trajectory; or file.py:function, module:function; or a cost of bodies and sites at the end,
+            height:torso (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of
+            its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
         start: a key frame; None is the reference pose, at rest.
-        horizon: steps; None is half a second, but 50 to 300 steps.
-        gradient: of MuJoCo's motion, see `rollout`.
+        horizon: number of steps; None is half a second, but 50 to 300 steps.
+        gradient: gradient of MuJoCo's motion, see `rollout`.
         engine: see `rollout`.
-        seed: of the mix.
+        seed: seed of the mix.
 
     Raises:
         ValueError: in one sentence, if there is no such file, function, body or key frame.
@@ -82,14 +82,14 @@ def scene_task(
 
 
 def load_function(name: str) -> Callable[..., Any]:
-    """Find a function by file.py:function or module:function, the module also in the current folder."""
+    """Return a function by file.py:function or module:function, the module also in the current folder."""
     source, _, function = name.rpartition(":")
     if source.endswith(".py") and not Path(source).is_file():
         raise ValueError(f"cost: there is no file {source}")
     try:
         sys.path.insert(0, str(Path.cwd()))
         names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
-    except Exception as error:  # whatever a file of one's own may do
+    except Exception as error:  # a user's file may raise anything
         forms = "file.py:function, module:function, or of a body as height:torso"
         raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
     if not callable(names.get(function)):
@@ -124,7 +124,7 @@ def _named_cost(scene: Scene, name: str) -> Cost:
 
 
 def _found(model: mujoco.MjModel, name: str, *kinds: str) -> tuple[int, bool]:
-    """Return the number of a thing of one of some kinds, and whether it is of the first."""
+    """Return the id of a named element of one of several kinds, and whether it is of the first kind."""
     known = {kind: _names(model, kind) for kind in kinds}
     for kind, names in known.items():
         if name in names:
@@ -138,10 +138,10 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i) or "" for i in range(number)]
 
 
-class Push(OpenLoop):
-    """The cost under noise on every control, by how far all of them are moved along one direction, at every step.
+class CommonShift(OpenLoop):
+    """The cost under noise on every control, as a function of a common shift of all controls along one direction.
 
-    By single controls the gradient is hundreds of small numbers; of a single one an interval says what is known of it.
+    The gradient by single controls is hundreds of small numbers; for a single number an interval is informative.
     """
 
     direction: Float[Array, " nu"]
@@ -163,10 +163,12 @@ def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1
 
 @dataclass(frozen=True)
 class Knob:
-    """A task's cost under noise, as a function of the stiffness of its contacts and of one number.
+    """A task's cost under noise, as a function of its contact stiffness and of one number.
 
-    That number moves all controls along one direction, and noise is on each of them at each step, both in halves of their ranges;
-    without actuators both are on the velocities at the start, in m/s or rad/s. Of several the direction is random.
+    The number shifts all controls along one direction, and every control has noise at each step; both are in halves of the
+    control ranges. Without actuators both act on the initial velocities, in m/s or rad/s. The direction is random where there
+    are
+    several.
     """
 
     task: SceneTask
@@ -175,7 +177,7 @@ class Knob:
 
     @functools.cached_property
     def own(self) -> float:
-        """The stiffness of the file's contacts (1/s²), their median; exactly this one stands for them as they are."""
+        """The median stiffness of the file's contacts (1/s²); exactly this value leaves them unchanged."""
         scene = self.task.scene
         return float(np.median(np.asarray(scene.contact_parameters().stiffness))) if scene.pairs else 0.0
 
@@ -195,7 +197,7 @@ class Knob:
         if not task.num_controls:
             return parameter_noise(Partial(_thrown, task, along), self.noise, dim=1)
         half = jnp.asarray(half_range(scene), like)
-        return Push(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
+        return CommonShift(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
 
     def __str__(self) -> str:
         kind = "actuator" if self.task.num_controls else "joint"
@@ -208,7 +210,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What `sweep` measured: of which scene, what by what in words, the stiffness of the file's own contacts, and the numbers."""
+    """The result of `sweep`: the scene, a description, the stiffness of the file's contacts, and the measurements."""
 
     name: str
     question: str
@@ -217,12 +219,12 @@ class Sweep:
 
     @property
     def labels(self) -> list[str]:
-        """What the rows are called."""
+        """The labels of the rows."""
         return [format_number(k) + " (file)" * bool(k == self.own) for k in self.result.knob[1]]
 
     @property
     def headline(self) -> str:
-        """The answer in a line: where an estimate has no bias worth the name, nor one that is not to be seen."""
+        """The answer in a line: the stiffnesses where an estimate has no relevant bias, and none too small to see."""
         table, found = self.result.table(), {}
         truth = abs(table["truth"])
         for name, words in ESTIMATES.items():
@@ -242,7 +244,7 @@ class Sweep:
         return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"
 
     def as_html(self) -> str:
-        """Write it as one page that needs nothing beside it; it takes `mjxgrad[render]`."""
+        """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
         picture, (head, *rows) = (
             svg(self.result.plot, "Bias and variance over stiffness"),
             self.result.rows(self.labels),
@@ -264,21 +266,21 @@ def sweep(
     log: Callable[[str], None] | None = None,
     **task_settings: Any,
 ) -> Sweep:
-    """Measure bias and variance of first, zeroth and α-order over contact stiffness, in a scene of one's own.
+    """Measure bias and variance of first, zeroth and α-order gradients over contact stiffness, in a scene of one's own.
 
     Args:
-        source: an MJCF file, or what else `load_scene` takes.
-        cost: as of `scene_task`.
-        stiffness: to sweep (1/s²), besides the file's own.
-        noise: standard deviation, as of `Knob`.
-        num_samples: rollouts of each estimate.
-        num_reference: rollouts of the truth.
-        seed: of all that is random.
-        log: called with what is being done.
+        source: an MJCF file, or another source for `load_scene`.
+        cost: as in `scene_task`.
+        stiffness: stiffnesses to sweep (1/s²), besides the file's own.
+        noise: standard deviation, as in `Knob`.
+        num_samples: rollouts per estimate.
+        num_reference: rollouts for the truth.
+        seed: seed of all random numbers.
+        log: called with the name of each part as it starts.
         **task_settings: start, horizon, gradient and engine of `scene_task`.
 
     Raises:
-        ValueError: as `scene_task` and `bias_variance` do, or if a stiffness is not positive.
+        ValueError: as `scene_task` and `bias_variance`, or if a stiffness is not positive.
     """
     if not all(0 < k < np.inf for k in stiffness):
         raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, stiffness))}")

@@ -1,4 +1,4 @@
-"""Pages that need nothing beside them: an answer, then figures, sentences, tables; one template, one style sheet."""
+"""Self-contained HTML pages of figures, sentences and tables; one template, one style sheet."""
 
 import base64
 import importlib.util
@@ -11,45 +11,45 @@ from typing import Any
 
 _FOLDER = Path(__file__).parent
 STYLE = _FOLDER / "figure.mplstyle"
-"""How figures look, for matplotlib."""
+"""Style of figures, for matplotlib."""
 INK = "#22262e"
-"""The colour in a figure that becomes that of the page's text."""
-_WIDE = 6.0  # inches; on a telephone wider figures keep a width at which they can be read, and scroll within their box
-_GREY = 40  # of 255: colours whose parts differ by less
-# What colours do by `_for_both`, in pictures within a figure.
+"""The colour in a figure that becomes the page's text colour."""
+_WIDE = 6.0  # inches; on a telephone wider figures keep a readable width and scroll within their box
+_GREY = 40  # largest difference of a grey's colour components, of 255
+# The change of colours by `_for_both`, for pictures within a figure.
 _IMAGES = "<style>@media (prefers-color-scheme: dark) { image { filter: invert(1) hue-rotate(180deg) } }</style>"
-# Opened by itself a figure has no page to take colours from.
+# A figure opened by itself has no page colours.
 _ALONE = f"color-scheme: light dark; color: {INK}; color: light-dark({INK}, #e7eaef)"
 _XMLNS = ' xmlns="http://www.w3.org/2000/svg"'
 
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers to read, already rounded to what their error bars allow."""
+    """A table of numbers, already rounded to what their error bars allow."""
 
     columns: Sequence[str]  # headings
     rows: Sequence[Sequence[str]]  # cells, as text
-    caption: str = ""  # what it shows
-    # Positions (row, column) of the cells that the answer rests on.
+    caption: str = ""  # description
+    # Positions (row, column) of the cells behind the answer.
     emphasised: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a page: what is given of it, in the order of the fields; between backticks a sentence has code."""
+    """A part of a page: its non-empty fields, in order; backticks in sentences mark code."""
 
     title: str = ""  # heading
     lead: str = ""  # words in bold before text or caption
     text: str = ""  # paragraph
     drawings: Sequence[str] = ()  # by `svg`, side by side where there is room
     video: bytes = b""  # MP4
-    caption: str = ""  # what drawings or video show
-    faults: Sequence[str] = ()  # sentences of a list, in bold
-    items: Sequence[str] = ()  # further ones
+    caption: str = ""  # description of drawings or video
+    faults: Sequence[str] = ()  # list of sentences, in bold
+    items: Sequence[str] = ()  # further sentences of the list
     table: Table | None = None
     code: str = ""  # a program, or text in columns
     look: str = ""  # class of the style sheet
-    folded: str = ""  # the title of what a click opens, table and code
+    folded: str = ""  # title of the fold that holds table and code
 
     def __bool__(self) -> bool:
         """Whether there is anything to show."""
@@ -57,7 +57,7 @@ class Block:
 
 
 def require() -> None:
-    """Refuse a page where what writes it is missing; to be asked before the work that the page is about.
+    """Refuse a page if jinja2 or matplotlib is missing; call this before the work that the page reports.
 
     Raises:
         ImportError: if jinja2 or matplotlib is not installed.
@@ -67,12 +67,12 @@ def require() -> None:
 
 
 def page(answer: str, about: str, blocks: Iterable[Block], cards: Sequence[Mapping[str, Any]] = ()) -> str:
-    """Write a page as HTML.
+    """Return a page as HTML.
 
     Args:
-        answer: its first line.
-        about: what it answers, or the command that it is of.
-        blocks: in order of reading.
+        answer: first line of the page.
+        about: the question it answers, or the command that wrote it.
+        blocks: parts in order of reading.
         cards: links to other pages: href, figure or video (paths or nothing), about, title and text of each.
 
     Raises:
@@ -93,12 +93,12 @@ def page(answer: str, about: str, blocks: Iterable[Block], cards: Sequence[Mappi
 
 
 def svg(draw: Callable[[], Any], label: str) -> str:
-    """Draw a figure as SVG for light and dark pages, and close it.
+    """Return a figure as SVG for light and dark pages, and close it.
 
     Args:
-        draw: returns matplotlib's figure; called in the style of the pages. `INK` becomes the colour of the text, and what is
-            dark on a white page is light on a black one.
-        label: what it shows, for who does not see it.
+        draw: function that returns matplotlib's figure; called in the style of the pages. `INK` becomes the colour of the
+            text, and dark colours on a light page become light on a dark one.
+        label: description for readers who cannot see it.
 
     Raises:
         ImportError: as `require`.
@@ -122,7 +122,7 @@ def svg(draw: Callable[[], Any], label: str) -> str:
 
 
 def _for_both(found: re.Match) -> str:
-    """Set a colour, and where the browser knows how, one for dark pages; white becomes their background, no hue too dark."""
+    """Replace a colour by one for light and, where the browser can, one for dark pages; white becomes the background."""
     name, colour = found.groups()
     parts = bytes.fromhex(colour[1:])
     lightness = "max(0.6, 1.21 - l)" if max(parts) - min(parts) > _GREY else "calc(1.21 - l)"
@@ -131,7 +131,7 @@ def _for_both(found: re.Match) -> str:
 
 
 def _prose(text: object) -> str:
-    """Escape a sentence, with what stands between backticks as code; no line ends within a name."""
+    """Escape a sentence, with code between backticks; no line ends within a name."""
     from markupsafe import Markup, escape
 
     whole = escape(text).replace("α-order", Markup('<span class="whole">α-order</span>'))
