@@ -1,4 +1,4 @@
-"""Many steps of a scene: states and trajectories, by MJX or C MuJoCo; linear models, adaptive integration, pictures of them."""
+"""Rollouts of a scene by MJX or C MuJoCo, with states, trajectories, linear models, adaptive integration and rendering."""
 
 from mjxgrad.rollouts.arguments import Engine, Observe, Policy, Sees
 from mjxgrad.rollouts.linearisation import Linearisation, linearise

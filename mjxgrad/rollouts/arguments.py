@@ -1,4 +1,4 @@
-"""What a rollout is called with: the types of it, and what is refused."""
+"""Arguments of a rollout: types and checks."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
@@ -15,15 +15,15 @@ from mjxgrad.rollouts.state import State
 from mjxgrad.scene import Scene
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
-"""From its parameters and what it sees to controls."""
+"""Function from policy parameters and the state or observations to controls."""
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
-"""From model and data to anything made of arrays."""
+"""Function from model and data to a pytree of arrays."""
 Sees = Literal["state", "observations"]
 Engine = Literal["mjx", "mujoco"]
 
 
 def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
-    """Refuse to show a policy what there is not."""
+    """Refuse to show a policy observations that do not exist."""
     if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
         raise ValueError(
             f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}, {observe=}'
@@ -33,7 +33,7 @@ def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
 def sequence_of(
     controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:
-    """Return the controls where they are a sequence, and the number of steps; or refuse what does not go together."""
+    """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
     for name, value in (("controls", sequence), ("noise", noise)):
@@ -43,7 +43,7 @@ def sequence_of(
 
 
 def check_shapes(scene: Scene, state: State) -> None:
-    """Refuse a state of another scene, or several at once."""
+    """Refuse a state of another scene, or several states at once."""
     for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
         if (shape := jnp.shape(getattr(state, name))) != (size,):
             remedy = "map over batches with jax.vmap"
@@ -51,7 +51,7 @@ def check_shapes(scene: Scene, state: State) -> None:
 
 
 def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
-    """Return what is given to each step besides controls, or refuse what there is not."""
+    """Return the further inputs of each step; refuse unknown ones."""
     found = {}
     for name, value in ({} if inputs is None else inputs).items():
         if name not in INPUTS[1:]:
@@ -64,7 +64,7 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
 
 
 def check_engine(engine: str, **given: Any) -> None:
-    """Refuse an engine that there is not, and what C MuJoCo's motion does not know."""
+    """Refuse an unknown engine, and settings that C MuJoCo does not have."""
     if engine != "mujoco":
         raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
     if named := [name for name, value in given.items() if value is not None]:
@@ -72,7 +72,7 @@ def check_engine(engine: str, **given: Any) -> None:
 
 
 def one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
-    """Refuse what a policy chose unless it is one control per actuator: others would be added up, or shared out, in silence."""
+    """Refuse controls of a policy unless there is one per actuator: other shapes would silently be added or broadcast."""
     chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
     if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (num_controls,):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A rollout by MJX: one scan with a lean carry, checkpointed, that says when it has gone wrong."""
+"""A rollout by MJX: one checkpointed scan with a small carry, and failure flags."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from mjxgrad.stepping.onset import reach
 
 
 class Settings(NamedTuple):
-    """How steps are taken, looked at and kept: arguments of `rollout`, by the same names."""
+    """Settings of a rollout: arguments of `rollout`, by the same names."""
 
     policy_sees: Sees
     checkpoint: bool
@@ -34,16 +34,16 @@ class Settings(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """What goes from step to step.
+    """The carry of the scan.
 
     Attributes:
-        state: the last good one.
-        before: the control before, under which a policy looks; None for one that sees the state.
+        state: the last good state.
+        before: the previous control, under which a policy observes; None for a policy that sees the state.
         first_bad: the first bad step, −1 so far.
-        unsolved: steps whose solve was cut short.
-        crowded: steps with too little room for contacts.
-        tangent: the change of positions and velocities by which growth is measured.
-        growth: the largest size of it.
+        unsolved: number of steps whose solve was cut short.
+        crowded: number of steps with too few contact slots.
+        tangent: tangent of positions and velocities that measures growth.
+        growth: largest norm of the tangent.
     """
 
     state: State
@@ -66,7 +66,7 @@ class _Scan:
     settings: Settings
 
     def begin(self, state: State) -> _Carry:
-        """Return what the first step is given."""
+        """Return the carry of the first step."""
         looks = self.policy is not None and self.settings.policy_sees == "observations"
         return _Carry(
             state,
@@ -79,7 +79,7 @@ class _Scan:
         )
 
     def advance(self, carry: _Carry, given: tuple[Array, Array, Array, dict]) -> tuple[_Carry, tuple]:
-        """Take one step, and return with the next carry what of this one is kept."""
+        """Take one step, and return the next carry and the outputs of this step."""
         state, model, settings = carry.state, self.scene.model, self.settings
         index, row, disturbance, forces = given
         seen = None if carry.before is None else self.look(state, carry.before, forces)
@@ -105,7 +105,7 @@ class _Scan:
         return one_each(self.policy(self.params, seen), self.scene.model.nu)  # pyright: ignore[reportOptionalCall]
 
     def take(self, data: mjx.Data, tangent: tuple | None, growth: Array | None) -> tuple[mjx.Data, Any, Array | None]:
-        """Return the data after a step, and the tangent there with the largest size that it has had."""
+        """Return the data after a step, the tangent there, and its largest norm so far."""
         settings, model = self.settings, self.scene.model
         how = {"gradient": settings.gradient, "onset": settings.onset, "smoothing": settings.smoothing}
         if tangent is None or growth is None:
@@ -120,12 +120,12 @@ class _Scan:
         return stepped, change, jnp.maximum(growth, jnp.linalg.norm(jnp.concatenate(change)))  # a NaN stays one
 
     def look(self, state: State, ctrl: Array, forces: dict, stepped: mjx.Data | None = None) -> PyTree:
-        """Return what is observed in a state under a control; of what a step has left, if it is given."""
+        """Return the observations in a state under a control, from the data of a step where it is given."""
         if self.observe is None:
             return None
         model, data = self.scene.model, data_of(self.scene, state, ctrl).replace(**forces)
         has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        if stepped is None or has_stages:  # what a step of several stages leaves is of its last
+        if stepped is None or has_stages:  # data of a multi-stage step belongs to its last stage
             return self.observe(
                 model, forward(model, data, onset=self.settings.onset, smoothing=self.settings.smoothing)
             )
@@ -142,22 +142,22 @@ def rolled_out(
     observe: Observe | None,
     settings: Settings,
 ) -> Trajectory:
-    """Return what `rollout` does, once all of its arguments are known to be right.
+    """Return the result of `rollout` for checked arguments.
 
     Args:
-        scene: where it happens.
-        state: where it begins.
+        scene: the scene.
+        state: the initial state.
         rows: controls, noise and inputs of each step.
-        policy: what chooses controls in place of the rows, if anything.
-        params: of the policy.
-        observe: what to keep of every state.
-        settings: how.
+        policy: policy that replaces the rows of controls; None without one.
+        params: parameters of the policy.
+        observe: function from each state's model and data to the observations to keep.
+        settings: settings of the rollout.
     """
     scan = _Scan(scene, policy, params, observe, settings)
     advance = scan.advance
     if settings.checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
-        # Inside a scan nothing can be merged across the barrier that prevent_cse would put up.
+        # Inside a scan prevent_cse is needless: XLA cannot merge the recomputation with the forward pass.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows[0]), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, *rows))
@@ -185,13 +185,13 @@ rolled_out_compiled = compiled(rolled_out)
 
 
 def _has_numbers(scene: Scene) -> Bool[Array, ""]:
-    """Whether what only the running program knows of a model are numbers: a contact of NaN would not be felt at all."""
+    """Whether traced fields of a model are numbers: a NaN in a contact would go unnoticed."""
     traced = [x for x in numbers_of(scene.model).values() if isinstance(x, jax.core.Tracer)]
     return jnp.array(True) if not traced else ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced]))
 
 
 def _is_crowded(model: mjx.Model, data: mjx.Data, settings: Settings) -> Bool[Array, ""]:
-    """Return whether, in the step that the data is from, contacts may have acted that found no slot."""
+    """Return whether contacts may have acted without a slot in the step behind this data."""
     if not data._impl.ncon or slot_geoms(model, data) is not None:
         return jnp.array(False)
     if settings.smoothing is not None:

@@ -1,4 +1,4 @@
-"""A rollout by C MuJoCo: on all cores of the processor, with nothing to compile, differentiable once."""
+"""A rollout by C MuJoCo: on all cores of the processor, without compilation, differentiable once."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def rolled_out(
     *,
     measure_growth: bool,
 ) -> Trajectory:
-    """Return what C MuJoCo makes of controls, noise included, or of a policy; from the first bad step on the last good state."""
+    """Return C MuJoCo's rollout under controls, noise included, or a policy; the last good state is held."""
     if callable(controls):
         found = _by_policy(scene, state, controls, params, noise, applied, gradient, velocity_limit)
     else:
@@ -46,7 +46,7 @@ def _by_policy(
     gradient: Gradient,
     velocity_limit: float | None,
 ) -> Trajectory:
-    """Step by step, as each control is chosen in the state that it finds."""
+    """Roll out step by step, since each control depends on the state before it."""
 
     def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
         state, first_bad = carry
@@ -74,7 +74,7 @@ def _course(
 ) -> Trajectory:
     """Return the motion under known controls: one call of C MuJoCo."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-    is_finite = jnp.isfinite(ctrl)  # MuJoCo takes another for zero
+    is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
     given = {
         name: jnp.broadcast_to(getattr(scene.data, name), (len(ctrl), *getattr(scene.data, name).shape))
         for name in INPUTS[1:]
@@ -100,7 +100,7 @@ def _trajectory(states: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[
 
 
 def _growth(scene: Scene, state: State, ctrl: Array, applied: dict[str, Array], gradient: Gradient) -> Float[Array, ""]:
-    """Return how many times longer a change of the start becomes; it has no derivative."""
+    """Return the growth of a tangent of the start; it has no derivative."""
     given = (scene, state, ctrl, applied)
     scene, state, ctrl, applied = jax.tree.map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, given

@@ -1,13 +1,13 @@
-r"""Adaptive integration with diffrax: the motion to any accuracy, as a reference for steps of fixed length.
+r"""Adaptive integration with diffrax: the motion to any accuracy, as a reference for fixed steps.
 
-The state moves by $\dot v = $ `forward`'s acceleration and $\dot q = $ the velocity carried to the coordinates: a quaternion
-turns by $\tfrac12 q \otimes (0, \omega)$, whose norm the integration keeps to its tolerance, and every use normalises it. A
-force that jumps makes the error control reject steps until one is short enough that the jump does no harm.
+The state moves by $\dot v = $ `forward`'s acceleration and $\dot q = $ the velocity in coordinates. A quaternion
+turns by $\tfrac12 q \otimes (0, \omega)$. The integration keeps its norm to the tolerance, and every use normalises it. At
+a force jump the error control rejects steps until one is short enough that the jump does no harm.
 
 **Its derivative.** Reverse mode goes through the accepted steps. Where contact forces begin continuously ($d_0 = 0$) it
-converges to the derivative of the motion. Where they jump (MuJoCo's default, $d_0 = 0.9$) it does not, at any tolerance: the
-jump falls into some step and stays there, as in steps of fixed length. A reference for the derivative is then the difference
-quotient of two adaptive rollouts, whose motion is accurate either way.
+converges to the derivative of the motion. Where they jump (MuJoCo's default, $d_0 = 0.9$) it does not, at any tolerance:
+the jump stays within some step, as with fixed steps. The reference for the derivative is then the difference quotient of two
+adaptive rollouts, whose motion is accurate in both cases.
 
 References:
     Kidger. On Neural Differential Equations. PhD thesis, Oxford 2021 (diffrax).
@@ -35,14 +35,14 @@ Rates = tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " na"]]
 
 
 class AdaptiveTrajectory(eqx.Module):
-    """States at the times that were asked for.
+    """States at the requested times.
 
     Attributes:
-        times: in s.
+        times: the times, in s.
         qpos: positions at these times, quaternions normalised.
-        qvel: velocities.
-        num_steps: taken in all, rejected ones included.
-        num_rejected: of these, the ones that were repeated shorter.
+        qvel: velocities at these times.
+        num_steps: number of all steps, including rejected ones.
+        num_rejected: number of rejected steps.
         has_failed: whether the steps ran out, or the state ceased to be finite; the states are then without meaning.
     """
 
@@ -66,24 +66,24 @@ def adaptive_rollout(
 ) -> AdaptiveTrajectory:
     """Integrate a scene with error control.
 
-    Differentiable in reverse mode; see the module for what the derivative misses. Needs diffrax
+    Differentiable in reverse mode; see the module for the limits of the derivative. Needs diffrax
     (`pip install 'mjxgrad[adaptive]'`).
 
     Args:
         scene: from `load_scene`. Its integrator is not used; its time step only where `refsafe` clamps contact parameters.
-        state: where to begin.
-        times: at which to give the state, increasing, from the beginning on (s after it).
-        controls: from the time since the beginning to controls; None for the scene's resting ones.
-        tolerance: relative and absolute, on the error of a step.
-        solver: of diffrax, explicit; None is `diffrax.Bosh3()`, of third order: contact forces are not smooth enough for more.
-        max_steps: give up after as many. Memory in reverse mode grows with its square root.
+        state: the initial state.
+        times: output times since the start, increasing (s).
+        controls: function from the time since the start to controls; None for the scene's resting ones.
+        tolerance: relative and absolute tolerance on the error of a step.
+        solver: explicit solver of diffrax; None is `diffrax.Bosh3()`, of third order: contact forces are not smooth enough
+            for more.
+        max_steps: largest number of steps. Memory in reverse mode grows with its square root.
 
     Returns:
-        The states, and what they cost.
+        The states, and the number of steps.
 
     Raises:
-        ValueError: if the tolerance or `max_steps` is not positive, or the times do not increase from zero on (where they are
-            known).
+        ValueError: if the tolerance or `max_steps` is not positive, or known times do not increase from zero on.
         ImportError: if diffrax is not installed.
     """
     accuracy = known(tolerance)
@@ -98,7 +98,7 @@ def adaptive_rollout(
     if asked is not None and (not asked.size or asked[0] < 0 or np.any(np.diff(asked) <= 0)):
         raise ValueError(f"times must increase and begin at or after 0, got {asked.tolist()}")
 
-    def rates(t: Float[Array, ""], y: Rates, _: None) -> Rates:
+    def vector_field(t: Float[Array, ""], y: Rates, _: None) -> Rates:
         qpos, qvel, act = y
         ctrl = scene.data.ctrl if controls is None else controls(t)
         now = State(qpos, qvel, act, state.time + t, state.warmstart)
@@ -108,7 +108,7 @@ def adaptive_rollout(
         return carried, data.qacc, data.act_dot
 
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(rates),
+        diffrax.ODETerm(vector_field),
         diffrax.Bosh3() if solver is None else solver,
         t0=jnp.zeros_like(moments[0]),
         t1=moments[-1],

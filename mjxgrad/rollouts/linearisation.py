@@ -15,15 +15,15 @@ from mjxgrad.stepping import Gradient, Onset, step
 
 
 class Linearisation(eqx.Module):
-    """Derivatives of the next state and of the sensors; a change of state is (positions, velocities, activations).
+    """Derivatives of the next state and the sensors; a change of state is (positions, velocities, activations).
 
     Positions change in tangent space, a quaternion by three numbers (m, rad).
 
     Attributes:
-        A: of the next state by the present one.
-        B: of the next state by the controls.
-        C: of the sensors by the present state.
-        D: of the sensors by the controls.
+        A: derivative of the next state by the present one.
+        B: derivative of the next state by the controls.
+        C: derivative of the sensors by the present state.
+        D: derivative of the sensors by the controls.
     """
 
     A: Float[Array, "changes changes"]
@@ -41,14 +41,14 @@ def linearise(
     onset: Onset | None = None,
     engine: Engine | None = None,
 ) -> Linearisation:
-    """Return the linear model of one step; a batch of states is `jax.vmap`.
+    """Return the linear model of one step; use `jax.vmap` for a batch of states.
 
     Args:
         scene: from `load_scene`.
-        state: where the step begins.
+        state: the state before the step.
         ctrl: the controls; None for the scene's resting ones.
-        gradient: "slope" or "discrete", see `rollout`. The discrete one is what `mjd_transitionFD` gives.
-        onset: of the step, see `rollout`; for MJX alone, with the gradient "discrete".
+        gradient: "slope" or "discrete", see `rollout`. The discrete one corresponds to `mjd_transitionFD`.
+        onset: onset of contacts within the step, see `rollout`; for MJX alone, with the gradient "discrete".
         engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
 
     Raises:

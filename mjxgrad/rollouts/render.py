@@ -1,4 +1,4 @@
-"""From a trajectory to frames to a video, offscreen."""
+"""Offscreen rendering of trajectories to frames and video."""
 
 import copy
 import functools
@@ -23,7 +23,7 @@ Frames = UInt8[np.ndarray, "_ _ _ 3"]
 
 
 class RenderingUnavailableError(RuntimeError):
-    """There is no OpenGL that renders without a display; the message names the package that brings one."""
+    """No OpenGL renders without a display; the message names the package that provides one."""
 
 
 def frames(
@@ -37,19 +37,19 @@ def frames(
     width: int = 640,
     camera: str | int | mujoco.MjvCamera | None = None,
 ) -> Frames:
-    r"""Draw a trajectory at the times at which a video shows it.
+    r"""Draw a trajectory at the frame times of a video.
 
     Frame $i$ shows time $i \cdot$ `speed` / `fps`, by the nearest state: states are close in time, and the mean of
     two quaternions is not the orientation between them.
 
     Args:
-        scene: what moves; a scene's complete C model is drawn, or a C model itself.
-        qpos: the states, one per `timestep`, the first at time zero.
+        scene: the scene, drawn by its complete C model; or a C model.
+        qpos: positions, one row per `timestep`, the first at time zero.
         timestep: simulated time between two states, in s; None is the model's own.
         fps: frames per second of the video.
         speed: simulated over shown time; 0.25 is four times slower than real.
-        height: in pixels.
-        width: in pixels.
+        height: height in pixels.
+        width: width in pixels.
         camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view.
 
     Returns:
@@ -86,7 +86,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     The file appears at its place once it is complete.
 
     Args:
-        path: of the file; its folder exists.
+        path: path of the file, in an existing folder.
         video: the frames; an odd last row or column is left out, for H.264 takes even sizes only.
         fps: frames per second.
 
@@ -94,7 +94,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         OSError: if the file cannot be written.
         RuntimeError: if ffmpeg fails, or is not installed.
     """
-    # Imported here, for mediapy brings IPython with it, and drawing needs neither.
+    # Imported here, since mediapy imports IPython, and drawing needs neither.
     try:
         import imageio_ffmpeg
         import mediapy
@@ -103,7 +103,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
 
     path = Path(path)
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    # Compressed to memory: a full disk is then Python's own OSError and not a page of ffmpeg's.
+    # Compressed to memory: a full disk then raises Python's own OSError, not a page of ffmpeg's output.
     even = video[:, : video.shape[1] // 2 * 2, : video.shape[2] // 2 * 2]
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     # The index at the front lets a browser start before all is read.
@@ -127,14 +127,14 @@ def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) 
 
 
 def _nearest(num_states: int, timestep: Number, interval: Number) -> np.ndarray:
-    """The state nearest to each frame's time."""
+    """Return the index of the state nearest to each frame's time."""
     # The last state counts as reached despite rounding in its time.
     num_frames = int((num_states - 1) * timestep / interval + 1e-6) + 1
     times = np.arange(num_frames) * interval
     return np.minimum(np.rint(times / timestep).astype(int), num_states - 1)
 
 
-# A broken driver may end the process that tries it, so another one does.
+# A broken driver may end the process that tries it, so a subprocess does.
 _PROBE = """
 import mujoco
 with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8) as renderer:
@@ -145,7 +145,7 @@ print("rendered")
 
 @functools.cache
 def _choose_opengl() -> None:
-    """Choose EGL or OSMesa, whichever works, where nobody chose and there is no display."""
+    """Choose EGL or OSMesa, whichever works, if none is chosen and there is no display."""
     chosen = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
     if chosen or platform.system() != "Linux":
         return
@@ -155,7 +155,7 @@ def _choose_opengl() -> None:
             [sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False, cwd=tempfile.gettempdir()
         )
         if b"rendered" in probe.stdout:
-            # MuJoCo chose while it was imported; to try that choice first would spoil the process for the others.
+            # MuJoCo chose during its import; trying its choice first would prevent the others in this process.
             context = importlib.import_module(f"mujoco.{name}").GLContext
             importlib.import_module("mujoco.rendering.classic.gl_context").GLContext = context
             return
@@ -165,10 +165,10 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Rend
     try:
         _choose_opengl()
         with warnings.catch_warnings():
-            # glfw warns of what it is about to raise.
+            # glfw warns before it raises.
             warnings.simplefilter("ignore")
             return mujoco.Renderer(mj_model, height, width)
-    # MuJoCo, PyOpenGL, glfw and the drivers each raise errors of their own here, some of no common class.
+    # MuJoCo, PyOpenGL, glfw and the drivers raise errors without a common class.
     except Exception as error:
         reason = str(error).partition(",")[0] or type(error).__name__
         chosen = os.environ.get("MUJOCO_GL")

@@ -1,4 +1,4 @@
-"""Many steps of a scene, by either engine."""
+"""Rollouts of a scene, by either engine."""
 
 import warnings
 from collections.abc import Mapping
@@ -45,48 +45,49 @@ def rollout(
 ) -> Trajectory:
     """Step a scene many times.
 
-    Batches are `jax.vmap` over any argument. Differentiable both ways; a rollout that diverged has no meaningful
-    derivative, and `diverged` says so.
+    Batches are `jax.vmap` over any argument. Differentiable in forward and reverse mode. A diverged rollout has no meaningful
+    derivative; its flag `diverged` is set.
 
     Args:
         scene: from `load_scene`.
-        state: where to begin, from `initial_state` or the end of another rollout.
+        state: the initial state, from `initial_state` or the end of another rollout.
         controls: one row per step; or a policy, called as `policy(params, state)`; or None for the scene's resting ones.
-            Beyond an actuator's `ctrlrange` a control has the effect of its end, and derivative zero.
-        params: handed to the policy.
-        noise: added to the controls, one row per step.
-        horizon: number of steps; needed only where neither controls nor noise give it.
-        observe: called as `observe(model, data)` with the data of every state, all positions, contacts and forces filled
-            in; its results are stacked. Name what you need: what it does not return is not kept. `mg.sensor`,
-            `mg.site_position` and `mg.contact_force` read things by name.
-        policy_sees: "state", or "observations": the policy is then called with what `observe` returns in place of the state.
-            It looks before it chooses: forces and accelerations are those under the control before, in the first step under the
-            scene's resting one. This takes a second solve per step where they are observed.
-        checkpoint: recompute each step in reverse mode and keep only its state and the solutions of its solves, so that memory
-            grows by a few numbers per step. Off, everything is kept: somewhat faster, and hundreds of times larger.
-        gradient: "discrete", the derivative of each step, which finite differences of it give; or "slope", which knows that
-            contacts and limits begin and end at times that move, so that its mean is the slope of the outcome. The motion is the
-            same. Of C MuJoCo's step see `native.events`, of MJX's `step`.
-        onset: lets contacts and limits begin within the step, see `step`: a continuous motion, whose plain derivative is the
+            MuJoCo clips a control at `ctrlrange`; beyond it the derivative is zero.
+        params: parameters of the policy.
+        noise: noise on the controls, one row per step.
+        horizon: number of steps; needed only where neither controls nor noise determine it.
+        observe: called as `observe(model, data)` with the complete data of every state, including contacts and forces; its
+            results are stacked, and only these are kept. `mg.sensor`, `mg.site_position` and `mg.contact_force` read
+            things by name.
+        policy_sees: "state", or "observations": the policy then receives the result of `observe` in place of the state.
+            Forces and accelerations are those under the previous control, in the first step under the scene's resting one.
+            Observing them takes a second solve per step.
+        checkpoint: whether to recompute each step in reverse mode from its state and the solutions of its solves. Memory then
+            grows by a few numbers per step. False keeps everything: somewhat faster, and hundreds of times larger.
+        gradient: "discrete", the derivative of each step, equal to its finite differences; or "slope", which includes the
+            moving times of contact and limit events, so that its mean is the slope of the outcome. The motion is the same.
+            See `native.events` for C MuJoCo, `step` for MJX.
+        onset: onset of contacts and limits within the step, see `step`: a continuous motion, whose plain derivative is the
             slope. None is MuJoCo's motion, to the bit.
-        smoothing: averages the contacts of each step over noise on their distance, see `step`. It is said by a
-            `SceneWarning` what of the scene it has no effect on.
-        velocity_limit: a generalised speed beyond it counts as diverged (m/s, rad/s); None switches this off.
-        measure_growth: carry one tangent along and tell by `growth` and `explodes` whether derivatives of this rollout can be
-            believed: contacts that chatter may multiply them at every switch. It takes as long as a derivative in forward mode.
-        inputs: what else is given to each step, one row per step, by MuJoCo's names: `qfrc_applied`, `xfrc_applied`,
-            `mocap_pos`, `mocap_quat`, `eq_active`. Differentiable, but for the last. What is not named stays as in `scene.data`.
-        engine: "mjx" or "mujoco": C MuJoCo on all cores of the processor, with nothing to compile, differentiable once. Its
-            motion has no onset, to the solver's tolerance; what has no meaning there is refused. None is the scene's own,
-            `scene.engine`.
+        smoothing: average of the contacts of each step over noise on their distance, see `step`. A `SceneWarning` names the
+            parts of the scene that it does not affect.
+        velocity_limit: largest generalised speed (m/s, rad/s); beyond it a rollout counts as diverged. None for no limit.
+        measure_growth: whether to propagate one tangent, for `growth` and `explodes`: they tell whether the derivatives can
+            be trusted. Chattering contacts may multiply derivatives at every switch. It costs as much as a derivative in
+            forward mode.
+        inputs: further inputs of each step, one row per step, by MuJoCo's names: `qfrc_applied`, `xfrc_applied`, `mocap_pos`,
+            `mocap_quat`, `eq_active`. Differentiable, except the last. Others stay as in `scene.data`.
+        engine: "mjx"; or "mujoco", C MuJoCo on all cores of the processor, without compilation, differentiable once. The
+            motions agree to the solver's tolerance, without onset; settings that C MuJoCo lacks are refused. None is the
+            scene's own, `scene.engine`.
 
     Returns:
         The trajectory, with `horizon + 1` states.
 
     Raises:
         ValueError: if there is no such gradient, it does not go with onset or smoothing, shapes do not fit the scene, the
-            horizon is missing or contradicted, or controls or noise hold numbers that are not finite (checked where
-            values are known, that is outside `jax.jit`; inside, the rollout is flagged as diverged at that step).
+            horizon is missing or contradicted, or known controls or noise are not finite (inside `jax.jit` the rollout is
+            flagged as diverged at this step).
     """
     check_scene(scene)
     if not isinstance(state, State):
@@ -109,7 +110,7 @@ def rollout(
     scene.check_mjx()
     rows = (base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     settings = by_mjx.Settings(policy_sees, checkpoint, gradient, onset, smoothing, velocity_limit, measure_growth)
-    # Functions may read what changes from call to call: they are traced anew in each, unless the caller compiles.
+    # Functions may read changing variables: every call traces them anew, unless the caller compiles.
     if policy is None and observe is None:
         return by_mjx.rolled_out_compiled(scene, state, rows, None, None, None, settings)
     return by_mjx.rolled_out(scene, state, rows, policy, params, observe, settings)

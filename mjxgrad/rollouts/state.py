@@ -1,4 +1,4 @@
-"""States: what the next step needs, where to begin, and what is wrong with a pose."""
+"""States, initial states, and checks of a pose."""
 
 import warnings
 from collections.abc import Iterator
@@ -15,19 +15,19 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene, SceneWarning
 
-_DEEP = 0.02  # m, that a pose may have a geom inside another
+_DEEP = 0.02  # m, largest penetration of a pose without a warning
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
 
 class State(eqx.Module):
-    """What the next step needs.
+    """The state before a step.
 
     Attributes:
         qpos: generalised positions (m, rad, unit quaternions).
         qvel: generalised velocities (m/s, rad/s).
         act: actuator activations.
         time: simulated time (s).
-        warmstart: acceleration from which the next solve starts. It affects the time a solve takes, not its result.
+        warmstart: acceleration at which the next solve starts. It affects the solve's duration, not its result.
     """
 
     qpos: Float[Array, " nq"]
@@ -45,21 +45,21 @@ def initial_state(
     *,
     keyframe: str | int | None = None,
 ) -> State:
-    """Return the state at the scene's reference pose, at rest, or at one of its key frames, with the given parts replaced.
+    """Return the state at the scene's reference pose, at rest, or at a key frame, with the given parts replaced.
 
-    Where values are known it warns of a joint that begins beyond its limits, which would push it back from the first step, and
-    of a pose of the file that is deep inside something.
+    Where values are known, it warns about a joint beyond its limits, which would push it back from the first step, and about
+    deep penetration in a pose of the file.
 
     Args:
-        scene: where it lives.
+        scene: the scene of the state.
         qpos: generalised positions (m, rad, unit quaternions).
         qvel: generalised velocities (m/s, rad/s).
         act: actuator activations.
         keyframe: name or number of a key frame of the file, for its positions, velocities and activations.
 
     Raises:
-        ValueError: if a part does not have the shape that the scene gives it, is not finite, has a quaternion of zeros, or there
-            is no such key frame.
+        ValueError: if a part does not fit the scene's shapes, is not finite, has a zero quaternion, or there is no such key
+            frame.
     """
     check_scene(scene)
     data, keys, parts = scene.data, {}, []
@@ -89,7 +89,7 @@ def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
 
 
 def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayLike) -> Iterator[str]:
-    """Say what is wrong with a known pose: joints beyond their limits and, of one that a file has, geoms deep in others.
+    """Return warnings about a known pose: joints beyond their limits and, for poses of the file, deep penetration.
 
     Raises:
         ValueError: if a quaternion is zero.
@@ -127,14 +127,14 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
 
 
 def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:
-    """Return data in a state, ready to be stepped."""
+    """Return the data of a state, ready to be stepped."""
     return scene.data.replace(
         qpos=state.qpos, qvel=state.qvel, act=state.act, time=state.time, qacc_warmstart=state.warmstart, ctrl=ctrl
     )
 
 
 def state_of(data: mjx.Data) -> State:
-    """Return the state that data is in."""
+    """Return the state of data."""
     return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
 
 
@@ -147,7 +147,7 @@ def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
 
 
 def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-    """Return a change of the start of length one, the same for every rollout of a scene."""
+    """Return a unit tangent of the initial state, the same for every rollout of a scene."""
     random = np.random.default_rng(0)
     parts = (random.normal(size=state.qpos.shape), random.normal(size=state.qvel.shape))
     size = np.sqrt(sum((part**2).sum() for part in parts))
@@ -155,6 +155,6 @@ def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
 
 
 def check_scene(scene: Any) -> None:
-    """Refuse what is no scene."""
+    """Refuse an argument that is no scene."""
     if not isinstance(scene, Scene):
         raise ValueError(f"scene must be of mg.load_scene, got {type(scene).__name__}")

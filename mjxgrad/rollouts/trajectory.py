@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from mjxgrad.rollouts.state import State
 
 LARGEST_GROWTH = 1e3
-"""Of a change of the start. Half a second of free motion makes half a metre of a metre per second, a bounce less of it."""
+"""Growth of a tangent that counts as exploding. In half a second of free motion 1 m/s becomes 0.5 m; a bounce reduces it."""
 
 
 class Trajectory(eqx.Module):
@@ -15,23 +15,22 @@ class Trajectory(eqx.Module):
 
     Attributes:
         qpos: positions before each step and after the last.
-        qvel: velocities, likewise.
+        qvel: velocities at the same times.
         ctrl: controls applied in each step, noise included.
-        observations: what `observe` returned for each of these states, stacked, under the control of the step that follows
-            (of the last step for the last state); None without it.
-        seen: what a policy that sees observations was called with, stacked; None for others.
+        observations: stacked results of `observe` for each of these states, under the control of the next step (the last step
+            for the last state); None without it.
+        seen: stacked observations given to the policy; None for other policies.
         final: the last state, to continue from.
-        diverged: whether some step gave a non-finite or runaway state, or the model holds what is no number.
+        diverged: whether some step gave a non-finite or runaway state, or the model holds NaN.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
-        unsolved: number of steps before it whose solve ran into the model's limit of iterations, short of its tolerance, or
-            whose forces, by an estimate of rounding, this precision does not resolve to a thousandth. There the motion is not
-            quite that of the model, and the derivative, which takes the solve for finished, not quite its own. Zero, unless
-            `opt.iterations` is small or, in single precision, pyramids have little friction (below 0.01; elliptic cones
-            hardly have such a limit). Only `rollout` counts it.
-        crowded: number of steps before it in which more contacts may have acted than the scene has room for, see `max_contacts`
-            of `load_scene`. Under smoothing, where contacts act at any distance, it counts every step of such a scene.
-        growth: how many times longer a small change of the start has at most become along the way, in one fixed direction of all
-            velocities and positions alike; None unless asked for.
+        unsolved: number of steps before it with an inaccurate solve: it ran into the model's iteration limit, or this
+            precision does not resolve its forces to a thousandth, by an estimate of rounding. Motion and derivative, which
+            assumes a converged solve, are then inexact. Zero, unless `opt.iterations` is small or, in single precision,
+            pyramids have little friction (below 0.01; elliptic cones hardly have such a limit). Only `rollout` counts it.
+        crowded: number of steps before it in which more contacts may have acted than the scene has slots for, see
+            `max_contacts` of `load_scene`. Smoothed contacts act at any distance, so then every step of such a scene counts.
+        growth: largest growth of one fixed unit tangent of all initial velocities and positions along the way; None unless
+            asked for.
         act: activations of actuators, as positions; only `rollout` keeps them.
     """
 
@@ -50,7 +49,7 @@ class Trajectory(eqx.Module):
 
     @property
     def explodes(self) -> Bool[Array, "*batch"]:
-        """Whether the derivative has grown beyond belief: a thousandfold, or out of all numbers. False if it was not measured."""
+        """Whether the derivative has grown a thousandfold, or is not finite. False if growth was not measured."""
         return jnp.zeros_like(self.diverged) if self.growth is None else self.growth > LARGEST_GROWTH
 
 
@@ -62,7 +61,7 @@ def check_trajectory(trajectory: Trajectory) -> None:
     """Raise if any rollout of a trajectory, batched or not, has diverged. Call it on the host.
 
     Raises:
-        DivergedError: naming how many diverged and the earliest bad step.
+        DivergedError: with the number of diverged rollouts and the earliest bad step.
     """
     diverged = jnp.atleast_1d(trajectory.diverged)
     if not bool(diverged.any()):

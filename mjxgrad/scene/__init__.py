@@ -1,4 +1,4 @@
-"""From MJCF to a scene that MJX can step: what it has, what was converted and left out."""
+"""Scenes that MJX can step, from MJCF: their contents, conversions and omissions."""
 
 from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.load import load_scene

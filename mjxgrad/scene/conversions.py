@@ -1,6 +1,6 @@
-"""Settings that MJX trips over or ignores, replaced by what gives the same motion.
+"""Settings that MJX rejects or ignores, replaced by equivalent ones.
 
-Each rule changes a copy of the C model in place and says what it did. Where the motion cannot be
+Each rule changes a copy of the C model in place and returns its change. Where the motion cannot be
 kept exactly the conversion says so, and loading the scene warns.
 """
 
@@ -31,20 +31,20 @@ _IMPEDANCES = (
     "eq_solimp",
 )
 _ENDLESS = 1e12  # metres or radians
-# Newton's method needs a few for most steps and up to 20 for some. It ends by itself, so a high limit costs nothing.
+# Newton's method needs a few for most steps and up to 20 for some. It stops by itself, so a high limit costs nothing.
 _FEWEST_ITERATIONS, _ITERATIONS = 20, 100
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """A setting of the file and what stands in its place.
+    """A setting of the file and its replacement.
 
     Attributes:
         what: the setting, as MJCF calls it.
         given: its value in the file.
-        used: what stands in its place.
-        reason: why the motion is the same, or what differs.
-        exact: whether the motion is that of C MuJoCo, up to the solver's tolerance.
+        used: its replacement.
+        reason: why the motion is the same, or how it differs.
+        exact: whether the motion equals C MuJoCo's, up to the solver's tolerance.
     """
 
     what: str
@@ -98,7 +98,7 @@ def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _idle(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Both are refused before, if there is friction, or a constraint, for them to act on."""
+    """Switch off two options without effect; scenes with friction or constraints, where they act, were refused before."""
     if model.opt.noslip_iterations > 0:
         given, model.opt.noslip_iterations = model.opt.noslip_iterations, 0
         yield Conversion("noslip_iterations", str(given), "0", "the scene has no friction")
@@ -113,7 +113,7 @@ def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _passive_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """With one of the two flags disabled MJX drops every passive force, C only its own."""
+    """Disable both passive forces by their parameters: with one flag disabled MJX drops all, C only its own."""
     spring, damper = _has(model, _SPRING), _has(model, _DAMPER)
     if spring and not damper:
         model.opt.disableflags &= ~_SPRING
@@ -132,7 +132,7 @@ def _passive_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Armature and damping of an actuator, seen through its gear, belong to its target."""
+    """Move armature and damping of an actuator, scaled by its gear, to its target."""
     if not (model.actuator_armature.any() or model.actuator_damping.any()):
         return
     tendons = np.arange(model.ntendon)
@@ -156,7 +156,7 @@ def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """C clips every coefficient from below, MJX does not and divides by it."""
+    """Clip friction coefficients from below as C does; MJX divides by them unclipped."""
     used, raised = {1: [], 3: [0], 4: [0, 1], 6: [0, 1, 2]}, []
     for pair in contact_pairs(model):
         if pair.explicit >= 0:
@@ -173,10 +173,10 @@ def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _no_width(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Without a width C takes the mean impedance at every depth, MJX the largest.
+    """Replace a zero width: C then takes the mean impedance at every depth, MJX the largest.
 
-    The largest also scales stiffness and damping, so it stays: from the mean it is then approached over a width that nothing
-    reaches.
+    The largest impedance also scales stiffness and damping, so it stays. The impedance starts from the mean and rises over an
+    endless width.
     """
     fields = {name: getattr(model, name) for name in _IMPEDANCES}
     flat = {name: _is_flat_but_uneven(values) for name, values in fields.items()}
@@ -200,10 +200,10 @@ def _is_flat_but_uneven(solimp: np.ndarray) -> np.ndarray:
 
 
 def _mixed_with_a_width(model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms have contacts where their solimp is averaged with one that keeps its width."""
+    """Return the geoms with contacts where their solimp is averaged with one that keeps its width."""
     keeps = model.geom_solimp[:, 2] > mujoco.mjMINVAL
     averaged = [list(deciding_geoms(model, pair)) for pair in contact_pairs(model)]
-    for _ in averaged:  # what is averaged with a geom that keeps its width keeps it, too
+    for _ in averaged:  # an average with a geom that keeps its width keeps it, too
         for geoms in averaged:
             keeps[geoms] = keeps[geoms].any()
     return keeps
@@ -230,7 +230,7 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def searched_contacts(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Without the user's word they are refused before."""
+    """Allow contacts found on distance fields, which are refused unless the user asks for them."""
     if found := list(searched_pairs(model)):
         reason = (
             "its normal may be off by 10 degrees, its derivative by any factor, or NaN; use capsules, spheres or boxes"
@@ -239,14 +239,14 @@ def searched_contacts(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """A sensor that MJX lacks would raise or read zero; it moves nothing, so it may stay."""
+    """Drop sensors that MJX lacks, which would raise or read zero; sensors move nothing."""
     known = {int(member) for member in mjx.SensorType}
     delayed = (model.sensor_history[:, 0] > 0) | (model.sensor_interval[:, 0] > 0)
     for i in range(model.nsensor):
         kind = mujoco.mjtSensor(model.sensor_type[i])
         if int(kind) in known and not delayed[i] and not _is_unmatched_contact(model, i):
             continue
-        # No stage computes it any more; the type must be one that MJX knows.
+        # No stage computes it any more, but MJX must know its type.
         model.sensor_needstage[i] = mujoco.mjtStage.mjSTAGE_NONE
         model.sensor_type[i] = mujoco.mjtSensor.mjSENS_CLOCK
         name = element_name(model, mujoco.mjtObj.mjOBJ_SENSOR, i)
@@ -256,7 +256,7 @@ def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def kinematics_alone(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return what MJX can hold of a model that C MuJoCo steps: its tree and its numbers, without anything that acts."""
+    """Return a copy of a model for C MuJoCo that MJX can hold: its tree and numbers, without anything that acts."""
     bare = copy.deepcopy(model)
     bare.opt.solver, bare.opt.integrator = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtIntegrator.mjINT_EULER
     bare.opt.cone, bare.opt.enableflags, bare.opt.noslip_iterations = mujoco.mjtCone.mjCONE_PYRAMIDAL, 0, 0
@@ -285,7 +285,7 @@ def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
 
 
 _Rules = tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...]
-# Those that make a refusal needless come before the refusals, the others after them.
+# The first group avoids refusals and runs before them, the second runs after them.
 BEFORE_REFUSALS: _Rules = (_flags, _wind, _passive_flags)
 AFTER_REFUSALS: _Rules = (
     _solver,

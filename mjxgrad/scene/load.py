@@ -1,4 +1,4 @@
-"""From a file, a string or a C model to a scene."""
+"""Loading of scenes from a file, a string or a C model."""
 
 import contextlib
 import copy
@@ -34,8 +34,8 @@ from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
-"""Pairs of geoms beyond which loading takes minutes and a scene is refused."""
-_LISTENING = threading.Lock()  # there is one handler of warnings for all threads
+"""Largest number of geom pairs; loading more takes minutes and is refused."""
+_LISTENING = threading.Lock()  # all threads share one handler of warnings
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -51,36 +51,37 @@ def load_scene(
 ) -> Scene:
     """Load a scene, convert what MJX lacks and leave out what the scene does not need.
 
-    What MJX cannot step C MuJoCo does, with derivatives, too: `scene.engine` says which, `scene.unsupported` why.
+    C MuJoCo steps a scene that MJX cannot, with derivatives, too: see `scene.engine`, and `scene.unsupported` for the reason.
 
     Arrays are float64 if `jax_enable_x64` is set and float32 otherwise. In float32 a solver
-    tolerance below 1e-6 is raised to it: the scaled improvement and gradient that it is compared
-    with are not resolved below, and the solver would only run into its iteration limit.
+    tolerance below 1e-6 is raised to it. Float32 does not resolve a smaller scaled improvement or
+    gradient, and the solver would run into its iteration limit.
 
     Args:
         source: path of an MJCF file, MJCF as a string, a `MjSpec` or a C model; neither is changed.
-        softness: contact softness to set, instead of that in the file.
+        softness: contact softness, instead of the file's.
         keep_everything: leave out nothing, and keep the solver tolerance and the storage of
             matrices as in the file. The motion is the same to rounding.
-        timestep: in s, instead of that in the file.
-        max_contacts: how many contacts of each friction dimension (`condim`) a state has room for: the nearest get it, and
-            only they cost anything in the solve. None has room for all that could touch. Where all of them are taken, in
-            some step, `Trajectory.crowded` says so.
-        distance_fields: take contacts of cylinders and ellipsoids with each other and capsules, and of ellipsoids with
-            spheres, on your own responsibility. MJX searches them on distance fields: the motion may be good, the gradient
-            is often not, or NaN. Else C MuJoCo steps such a scene.
-        engine: "mjx" refuses what MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None is MJX where it can.
+        timestep: time step in s, instead of the file's.
+        max_contacts: number of contact slots per friction dimension (`condim`), for the nearest contacts; only these cost
+            anything in the solve. None has room for all possible contacts. `Trajectory.crowded` counts the steps that filled
+            all slots.
+        distance_fields: accept contacts on distance fields: of cylinders and ellipsoids with each other and capsules, and of
+            ellipsoids with spheres. The motion may be good, but the gradient is often wrong or NaN. By default C MuJoCo steps
+            such a scene.
+        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None is MJX where
+            possible.
 
     Returns:
-        The scene. `print(scene.summary())` shows what it has.
+        The scene. `print(scene.summary())` describes it.
 
     Raises:
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if the path is a folder.
         TypeError: if the source is none of these.
         ValueError: if `timestep` or `max_contacts` is not positive, or as `Softness.apply`.
-        SceneError: if MuJoCo cannot read the MJCF, nothing in it can move, or, where MJX is asked for, so many geoms can touch
-            that loading would take minutes, or MJX cannot simulate it; all unsupported features are named at once.
+        SceneError: if MuJoCo cannot read the MJCF, or nothing in it can move. Where MJX is asked for, also if MJX cannot
+            simulate it, with all unsupported features, or loading would take minutes by the number of geom pairs.
     """
     if softness is not None and not isinstance(softness, Softness):
         raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
@@ -88,49 +89,18 @@ def load_scene(
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with _listening() as told:
         mj_model, name = _compile(source)
-    try:
-        mj_model.names.decode()
-    except UnicodeDecodeError as error:
-        raise SceneError(
-            f"{name} must have names in UTF-8, got {mj_model.names[error.start :][:1]!r}; save it as UTF-8"
-        ) from None
-    if timestep is not None:
-        if not (math.isfinite(timestep) and timestep > 0):
-            raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
-        mj_model.opt.timestep = timestep
-    elif not (math.isfinite(mj_model.opt.timestep) and mj_model.opt.timestep > 0):
-        remedy = "set it in <option>, or give load_scene a timestep"
-        raise SceneError(f"{name} must have a positive time step, got {mj_model.opt.timestep:g} s: {remedy}")
-    if mj_model.nv == 0:
-        reason = "so that nothing can move; give a body a joint"
-        raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
-    unsupported = ""
-    original = copy.deepcopy(mj_model)
-    try:
-        if engine == "mujoco":
-            raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
-        _refuse_many_pairs(mj_model, name)
-        if mujoco.__version__.split(".")[:2] != MJX_VERSION.split(".")[:2]:
-            raise SceneError(
-                f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
-                "pip install 'mjxgrad[mjx]' for MJX's step"
-            )
-        conversions = _make_simulable(mj_model, name, distance_fields)
-        stepped = copy.deepcopy(mj_model)
-        conversions += list(drop_sensors(stepped))
-    except SceneError as error:
-        if engine == "mjx" or original.nflex:
-            raise
-        mj_model, stepped, conversions, unsupported = original, kinematics_alone(original), [], str(error)
+    _set_timestep(mj_model, name, timestep)
+    _check_model(mj_model, name)
+    mj_model, stepped, conversions, unsupported = _converted(mj_model, name, distance_fields, engine)
     omissions = ()
     if not keep_everything and not unsupported:
         omissions = switch_off(stepped)
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped) if not unsupported or count_pairs(mj_model) > MOST_PAIRS else contact_pairs(mj_model)
-    with jax.ensure_compile_time_eval():  # also where a function that is traced loads its own scene
+    with jax.ensure_compile_time_eval():  # also within a traced function that loads its own scene
         model, data = _put(stepped, name, max_contacts)
     if unsupported:
-        touching = {name: getattr(original, name) for name in ("geom_contype", "geom_conaffinity", "geom_type")}
+        touching = {name: getattr(mj_model, name) for name in ("geom_contype", "geom_conaffinity", "geom_type")}
         model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS, **touching})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
@@ -148,7 +118,7 @@ def load_scene(
 
 @contextlib.contextmanager
 def _listening() -> Iterator[list[str]]:
-    """Take what MuJoCo warns of, which it would write to the terminal and to a file in the current folder."""
+    """Collect the warnings that MuJoCo would write to the terminal and to a file in the current folder."""
     told: list[str] = []
     with _LISTENING:
         former = mujoco.get_mju_user_warning()
@@ -160,7 +130,7 @@ def _listening() -> Iterator[list[str]]:
 
 
 def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:
-    """The C model of a source, ours to change, and how messages call it."""
+    """Return a copy of the C model of a source, and its name in messages."""
     if isinstance(source, mujoco.MjModel):
         name = source.names.partition(b"\0")[0].decode(errors="replace")
         return copy.deepcopy(source), name if name not in ("", "MuJoCo Model") else "the model"
@@ -200,7 +170,7 @@ def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
 
 
 def count_pairs(model: mujoco.MjModel) -> int:
-    """Count the pairs of geoms that can touch, without listing them; a `<pair>` counts beside what its geoms' masks say."""
+    """Count the pairs of geoms that can touch, without listing them; explicit `<pair>` elements count in addition."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return 0
     masks, weld = np.stack([model.geom_contype, model.geom_conaffinity], axis=1), model.body_weldid
@@ -216,7 +186,7 @@ def count_pairs(model: mujoco.MjModel) -> int:
     for fixed in np.unique(weld[body]):
         own = weld[body] == fixed
         count -= matching(own, own)
-    # Both orders were counted. What MuJoCo filters besides is a body and the one it is jointed to, unless that is the world, ...
+    # Both orders were counted. MuJoCo also filters pairs of a body and its parent, unless that is the world, ...
     count //= 2
     jointed = {(int(weld[model.body_parentid[fixed]]), int(fixed)) for fixed in np.unique(weld[1:]) if fixed}
     jointed = {pair for pair in jointed if pair[0]}
@@ -232,6 +202,52 @@ def count_pairs(model: mujoco.MjModel) -> int:
     return count + model.npair
 
 
+def _set_timestep(model: mujoco.MjModel, name: str, timestep: float | None) -> None:
+    if timestep is not None:
+        if not (math.isfinite(timestep) and timestep > 0):
+            raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
+        model.opt.timestep = timestep
+    elif not (math.isfinite(model.opt.timestep) and model.opt.timestep > 0):
+        remedy = "set it in <option>, or give load_scene a timestep"
+        raise SceneError(f"{name} must have a positive time step, got {model.opt.timestep:g} s: {remedy}")
+
+
+def _check_model(model: mujoco.MjModel, name: str) -> None:
+    try:
+        model.names.decode()
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{name} must have names in UTF-8, got {model.names[error.start :][:1]!r}; save it as UTF-8"
+        ) from None
+    if model.nv == 0:
+        reason = "so that nothing can move; give a body a joint"
+        raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
+
+
+def _converted(
+    model: mujoco.MjModel, name: str, distance_fields: bool, engine: Literal["mjx", "mujoco"] | None
+) -> tuple[mujoco.MjModel, mujoco.MjModel, list[Conversion], str]:
+    """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
+    original = copy.deepcopy(model)
+    try:
+        if engine == "mujoco":
+            raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
+        _refuse_many_pairs(model, name)
+        if mujoco.__version__.split(".")[:2] != MJX_VERSION.split(".")[:2]:
+            raise SceneError(
+                f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
+                "pip install 'mjxgrad[mjx]' for MJX's step"
+            )
+        conversions = _make_simulable(model, name, distance_fields)
+        stepped = copy.deepcopy(model)
+        conversions += list(drop_sensors(stepped))
+    except SceneError as error:
+        if engine == "mjx" or original.nflex:
+            raise
+        return original, kinematics_alone(original), [], str(error)
+    return model, stepped, conversions, ""
+
+
 def _make_simulable(mj_model: mujoco.MjModel, name: str, distance_fields: bool) -> list[Conversion]:
     """Convert in place what can be converted; refuse the rest."""
     conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
@@ -245,7 +261,7 @@ def _make_simulable(mj_model: mujoco.MjModel, name: str, distance_fields: bool) 
 
 
 def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
-    """Store small matrices densely, and ask of float32 only what it resolves."""
+    """Store small matrices densely, and limit the tolerance to the resolution of float32."""
     conversions = []
     if model.nv < _SPARSE_FROM:
         if model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE:
@@ -259,17 +275,17 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
 
 
 def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mjx.Model, mjx.Data]:
-    """Model and data of MJX."""
+    """Return MJX's model and data."""
     if not contact_pairs(model):
         # MJX insists on a collision function even for pairs whose contact is disabled.
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
-        # Nor can it put the forces of no contact together for sensors, which read zero.
+        # Nor can it sum the forces of zero contacts for sensors, which then read zero.
         of_contact = np.isin(model.sensor_type, [mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT])
         model.sensor_needstage[of_contact] = mujoco.mjtStage.mjSTAGE_NONE
         model.sensor_type[of_contact] = mujoco.mjtSensor.mjSENS_CLOCK
     try:
-        # Of several processes each has its own; MJX would take the first of all.
+        # The device of this process; MJX would take the first of all processes.
         with np.errstate(over="raise"):
             mjx_model = mjx.put_model(model, impl="jax", device=own_device())
         return mjx_model, _make_data(model, mjx_model, max_contacts)
@@ -283,7 +299,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
 
 
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
-    """Data of MJX with room for so many contacts, also for frictionless ones beside elliptic ones, which MJX refuses."""
+    """Return MJX's data with contact slots, including frictionless ones beside elliptic ones, which MJX refuses."""
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
     data = mjx.make_data(model, impl="jax", device=own_device())
     model.opt.cone = cone

@@ -1,4 +1,4 @@
-"""What a step of a scene leaves out because its motion does not need it, and why."""
+"""Parts of a step that a scene's motion does not need, and the reasons."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
 
 @dataclass(frozen=True)
 class Omission:
-    """Work that a step of this scene does not do.
+    """Work that a step of this scene leaves out.
 
     Attributes:
         what: the stage, or the elements.
@@ -27,12 +27,12 @@ class Omission:
 
 
 def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
-    """Switch off what a scene does not need, and list all that a step of it leaves out.
+    """Switch off the parts that a scene does not need, and return all omissions of its step.
 
-    Most stages cost nothing once the model has no element for them, for their arrays have no
-    rows, and what is computed for reading only is removed by XLA from a compiled rollout, which
-    carries nothing but the state. One flag has to be set, in place: Euler integration would factorise the
-    mass matrix a second time for damping that is zero.
+    Most stages cost nothing once the model has no element for them, since their arrays have no
+    rows. XLA removes computations for reading only from a compiled rollout, which carries nothing
+    but the state. One flag is set in place: Euler integration would factorise the mass matrix a
+    second time for zero damping.
     """
     omissions = tuple(Omission(what, reason) for what, find in _TABLE if (reason := find(model)))
     if _has_needless_eulerdamp(model):
@@ -41,7 +41,7 @@ def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
 
 
 def _absent(absence: str, is_there: Callable[[mujoco.MjModel], bool], flag=None):
-    """Reason for leaving out a stage: it has no elements, or its flag is disabled."""
+    """Return the omission of a stage without elements, or with a disabled flag."""
 
     def reason(model: mujoco.MjModel) -> str | None:
         if flag is not None and model.opt.disableflags & flag.value:
@@ -53,7 +53,7 @@ def _absent(absence: str, is_there: Callable[[mujoco.MjModel], bool], flag=None)
 
 
 def _counted(count: Callable[[mujoco.MjModel], int], reason: str):
-    """Reason for leaving out elements of which there are some, with their number."""
+    """Return the omission of some elements, with their number."""
 
     def find(model: mujoco.MjModel) -> str | None:
         number = int(count(model))
@@ -75,7 +75,7 @@ def _touching(model: mujoco.MjModel) -> set[int]:
 
 
 def _num_unused_sites(model: mujoco.MjModel) -> int:
-    """Sites at which no tendon, actuator or equality constraint acts."""
+    """Return the number of sites at which no tendon, actuator or equality constraint acts."""
     wrap = mujoco.mjtWrap
     acts = (
         np.isin(model.wrap_type, [wrap.mjWRAP_SITE, wrap.mjWRAP_SPHERE, wrap.mjWRAP_CYLINDER]).any()
@@ -86,7 +86,7 @@ def _num_unused_sites(model: mujoco.MjModel) -> int:
 
 
 def _num_render_meshes(model: mujoco.MjModel) -> int:
-    """Meshes of which no instance collides."""
+    """Return the number of meshes without colliding instance."""
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     return model.nmesh - len({int(model.geom_dataid[g]) for g in _touching(model) if is_mesh[g]})
 

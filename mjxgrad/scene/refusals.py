@@ -1,7 +1,7 @@
-"""What MJX cannot simulate, each with its remedy.
+"""Features that MJX cannot simulate, each with its remedy.
 
-The table is the result of stepping a small scene per feature in C MuJoCo and in MJX 3.17 and
-comparing: some features raise in MJX, without naming the element, and many more are ignored.
+The table comes from a small scene per feature, stepped in C MuJoCo and in MJX 3.17. Some features
+raise in MJX without naming the element, and many more are ignored.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -20,14 +20,14 @@ _SEARCHED = (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER)
 
 
 def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
-    """An element as messages call it: its kind with its name or its number."""
+    """Return an element's name in messages: its kind with its name or number."""
     name = mujoco.mj_id2name(model, kind, index)
     word = kind.name.removeprefix("mjOBJ_").lower()
     return f"{word} {name!r}" if name else f"{word} {index}"
 
 
 def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray]):
-    """Names of the elements for which a condition holds; it gives one row per element."""
+    """Return a function that names the elements for which a condition holds; the condition returns one row per element."""
 
     def find(model: mujoco.MjModel) -> list[str]:
         rows = np.asarray(condition(model))
@@ -38,7 +38,7 @@ def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray
 
 
 def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type, prefix: str):
-    """Names of elements whose type MJX does not know, with that type."""
+    """Return a function that names elements whose type MJX does not know, with this type."""
 
     def find(model: mujoco.MjModel) -> list[str]:
         known = {int(member) for member in ours}
@@ -52,7 +52,7 @@ def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: 
 
 
 def _when(condition: Callable[[mujoco.MjModel], bool], given: str | Callable):
-    """What is given, if a condition on the whole model holds."""
+    """Return a function that returns `given` if a condition on the whole model holds."""
 
     def find(model: mujoco.MjModel) -> list[str]:
         return [given(model) if callable(given) else given] if condition(model) else []
@@ -81,7 +81,7 @@ def has_limits(model: mujoco.MjModel) -> bool:
 
 
 def has_friction_loss(model: mujoco.MjModel) -> bool:
-    """Whether a joint or tendon has any."""
+    """Whether a joint or tendon has friction loss."""
     return bool((model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any())
 
 
@@ -93,7 +93,7 @@ def has_constraints(model: mujoco.MjModel) -> bool:
 
 
 def describe_pair(model: mujoco.MjModel, pair) -> str:
-    """Two geoms by name and type."""
+    """Return two geoms by name and type."""
     kinds = (mujoco.mjtGeom(kind).name for kind in model.geom_type[[pair.geom1, pair.geom2]])
     return " with ".join(
         f"{name!r} ({kind.removeprefix('mjGEOM_').lower()})" for name, kind in zip(pair.names, kinds, strict=True)
@@ -107,7 +107,7 @@ def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def searched_pairs(model: mujoco.MjModel) -> Iterator[str]:
-    """Name the pairs whose contact MJX finds by a search on distance fields, where `contact.collision` has nothing better."""
+    """Yield the pairs whose contact MJX can only find by a search on distance fields."""
     smooth = {kind.value for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, *_SEARCHED)}
     searched = {kind.value for kind in _SEARCHED}
     known = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CYLINDER.value}
@@ -159,7 +159,7 @@ def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
 _DIRECTLY = "remove it from the MJCF"
 _LINEAR = "keep the linear coefficient only"
 
-# What MJX has none of; what names the places where a model uses it, nothing if it does not; what to do instead.
+# The missing feature; a function that names its uses in a model; the remedy.
 REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...] = (
     ("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
      "build them of rigid bodies and joints"),
@@ -229,7 +229,7 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
 )  # fmt: skip
 
 
-# Of an ellipsoid on another in dm_control's finger the derivative is 2000 times the slope; elsewhere it is NaN.
+# In dm_control's finger, with two ellipsoids, the derivative is 2000 times the slope; elsewhere it is NaN.
 _SEARCH = (
     "exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
     searched_pairs,
@@ -239,7 +239,7 @@ _SEARCH = (
 
 
 def refusal_messages(model: mujoco.MjModel, *, distance_fields: bool = False) -> list[str]:
-    """One sentence for each feature of a model that MJX cannot simulate; distance fields may be taken all the same."""
+    """Return one sentence per feature that MJX cannot simulate; distance fields are allowed on request."""
     messages = []
     for feature, find, remedy in REFUSALS if distance_fields else (*REFUSALS, _SEARCH):
         if found := list(find(model)):

@@ -1,4 +1,4 @@
-"""What `load_scene` returns, how it describes itself, and what its sensors and sites are by name."""
+"""The scene that `load_scene` returns, its description, and its sensors and sites by name."""
 
 import copy
 import difflib
@@ -26,18 +26,18 @@ from mjxgrad.scene.conversions import Conversion
 from mjxgrad.scene.omissions import Omission, has_medium
 from mjxgrad.stepping.rows import index_of
 
-_WIDTH = 118  # characters; what a laptop's terminal shows
+_WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
 _NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "dof_armature", "timestep"}
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
 class SceneError(ValueError):
-    """A scene cannot be loaded or stepped; the message says what, what is required and the remedy."""
+    """A scene cannot be loaded or stepped; the message has the element, the requirement and the remedy."""
 
 
 class SceneWarning(UserWarning):
-    """A scene moves otherwise than its file says, or has a contact that its time step cannot."""
+    """A scene moves differently from its file, or has a contact that its time step cannot resolve."""
 
 
 class Scene(eqx.Module):
@@ -46,14 +46,14 @@ class Scene(eqx.Module):
     Indices of bodies, joints and geoms are those of the C model: `scene.model.geom_friction[i]` is as in MuJoCo.
 
     Attributes:
-        model: for MJX; its array leaves may be differentiated, replaced and batched.
+        model: model for MJX; its array leaves may be differentiated, replaced and batched.
         data: template at `qpos0`; no stage of the dynamics has run.
         mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`.
-        omissions: what a step leaves out, and why.
+        omissions: parts that a step leaves out, and why.
         conversions: settings replaced by others, and why.
-        pairs: all geoms that can touch, in the order of `contact_parameters`; `summary` groups those that are alike.
-        name: where the scene came from.
-        unsupported: why MJX cannot step it, so that C MuJoCo does; empty where it can.
+        pairs: all geom pairs that can touch, in the order of `contact_parameters`; `summary` groups equal ones.
+        name: source of the scene.
+        unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
     """
 
     model: mjx.Model
@@ -67,20 +67,20 @@ class Scene(eqx.Module):
 
     @property
     def engine(self) -> Literal["mjx", "mujoco"]:
-        """What steps the scene where nothing else is said: MJX, or C MuJoCo where MJX lacks something."""
+        """The default engine: "mjx", or "mujoco" where MJX lacks something."""
         return "mujoco" if self.unsupported else "mjx"
 
     def check_mjx(self) -> None:
         """Refuse a scene that MJX cannot step.
 
         Raises:
-            SceneError: with what MJX lacks.
+            SceneError: with the features that MJX lacks.
         """
         if self.unsupported:
             raise SceneError(self.unsupported)
 
     def contact_parameters(self) -> ContactParameters:
-        """Effective parameters of the pairs that can touch, one row each; traceable."""
+        """Return the effective parameters of the pairs that can touch, one row each; traceable."""
         return contact_parameters(self.model, self.pairs)
 
     def with_softness(self, softness: Softness) -> "Scene":
@@ -90,7 +90,7 @@ class Scene(eqx.Module):
         parts without effect and about contacts that the time step cannot follow.
 
         Args:
-            softness: what to change, and for which pairs.
+            softness: the change, and the pairs that it applies to.
 
         Returns:
             The scene with other contact parameters.
@@ -104,22 +104,23 @@ class Scene(eqx.Module):
         return scene
 
     def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
-        """Replace numbers of the MJX model, such as `geom_friction` or `body_mass`, or `timestep`, `gravity` and `wind`.
+        """Return the scene with other numbers of the MJX model, such as `geom_friction`, `timestep`, `gravity` or `wind`.
 
-        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. What MuJoCo computes
-        from masses, inertias, lengths and sizes when it compiles a model follows, unless it is given, too; see `mg.set_const`.
+        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. Constants that
+        MuJoCo
+        derives from masses, inertias, lengths and sizes are updated, unless they are given, too; see `mg.set_const`.
 
         Args:
-            **fields: new values of the model's floating-point arrays, each of the shape that it has; of its options the time
-                step (s), gravity (m/s²) and wind (m/s), which acts in a medium alone.
+            **fields: new values of the model's floating-point arrays, each of unchanged shape. Allowed options are the time
+                step (s), gravity (m/s²) and wind (m/s), which acts only in a medium.
 
         Returns:
             The scene with these values.
 
         Raises:
-            ValueError: if there is no such field, it is not an array of numbers, the shape is another, or a value is NaN, or a
-                mass, inertia, size or time step negative (where values are known; inside `jax.jit` a rollout with NaN is
-                flagged as diverged).
+            ValueError: if there is no such field, it is not an array of numbers, or the shape differs. Known values are also
+                refused if one is NaN, or a mass, inertia, size or time step is negative; inside `jax.jit` a rollout with NaN
+                is flagged as diverged.
         """
         every = numbers_of(self.model)
         options = {name: every[f"opt.{name}"] for name in _OPTIONS}
@@ -149,7 +150,7 @@ class Scene(eqx.Module):
         chosen = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
         model, derived = self.model.replace(**changed).tree_replace(chosen), {}  # pyright: ignore[reportArgumentType]
         if constants.CAUSES & fields.keys():
-            # These alone: what else is known of the model stays so while it is traced.
+            # Only these, so that other fields stay known while the model is traced.
             derived = jax.jit(constants.constants_of)(model)
         elif "geom_size" in fields:
             derived = {"geom_rbound": constants.bounding_radii(model)}  # pyright: ignore[reportArgumentType]
@@ -157,19 +158,19 @@ class Scene(eqx.Module):
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:
-        """Least and largest control of each actuator, beyond which MuJoCo clips it; infinite where there is no limit."""
+        """Least and largest control of each actuator, at which MuJoCo clips it; infinite where there is no limit."""
         limited = np.asarray(self.model.actuator_ctrllimited, bool)[:, None]
         return jnp.where(limited, self.model.actuator_ctrlrange, jnp.array([-jnp.inf, jnp.inf]))
 
     def warnings(self) -> list[str]:
-        """Say which contacts `refsafe` alters or the time step cannot follow; nothing while the model is traced or batched."""
+        """Return warnings of contacts that `refsafe` alters or the time step cannot resolve; none while traced or batched."""
         is_batched = np.ndim(self.model.geom_solref) != 2 or np.ndim(self.model.opt.timestep) != 0
         if is_batched or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self.model)):
             return []
         return contact_warnings(self.model, self.pairs)
 
     def to_mujoco(self) -> mujoco.MjModel:
-        """Return the C model with the present values of `model`, softness included; sizes and flags are those of `mj_model`.
+        """Return the C model with the present values of `model`, including softness; sizes and flags are those of `mj_model`.
 
         Raises:
             ValueError: if the scene is batched or traced.
@@ -180,7 +181,7 @@ class Scene(eqx.Module):
         return with_numbers(self.mj_model, numbers)
 
     def __repr__(self) -> str:
-        # All arrays of it would fill pages of messages.
+        # All its arrays would fill pages of messages.
         return f"Scene({self.name!r}, nq={self.mj_model.nq}, nu={self.mj_model.nu}, pairs={len(self.pairs)})"
 
     def __hash__(self) -> int:
@@ -210,12 +211,12 @@ class Scene(eqx.Module):
 
 
 def _warn(scene: Scene, message: str) -> None:
-    """Warn whoever called a method of the scene; Equinox wraps methods, so this is one level further up."""
+    """Warn the caller of a scene's method; Equinox wraps methods, so this is one stack level further up."""
     warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
 
 
 def numbers_of(model: mjx.Model) -> dict[str, Array]:
-    """Return the floating-point arrays of a model by name, those of its options as `opt.timestep`."""
+    """Return the floating-point arrays of a model by name, with options as `opt.timestep`."""
     parts = (("", model), ("opt.", model.opt))
     every = {prefix + f.name: getattr(part, f.name, None) for prefix, part in parts for f in part.fields()}
     return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
@@ -225,7 +226,7 @@ _PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "bo
 
 
 def with_numbers(mj_model: mujoco.MjModel, numbers: dict[str, Array] | dict[str, np.ndarray]) -> mujoco.MjModel:
-    """Return a copy of a C model with the numbers of one of MJX's, where it has them."""
+    """Return a copy of a C model with the numbers of an MJX model, where it has them."""
     target = copy.deepcopy(mj_model)
     for name, value in numbers.items():
         is_option = name.startswith("opt.")
@@ -236,7 +237,7 @@ def with_numbers(mj_model: mujoco.MjModel, numbers: dict[str, Array] | dict[str,
 
 
 def _enclose(target: mujoco.MjModel) -> None:
-    """Let the boxes by which C MuJoCo leaves out pairs hold geoms that have moved or grown: cubes around their bounding balls."""
+    """Enlarge the bounding boxes by which C MuJoCo rejects pairs, around geoms that have moved or grown."""
     turn = np.zeros(9)
     for body, (first, count) in enumerate(zip(target.body_bvhadr, target.body_bvhnum, strict=True)):
         mujoco.mju_quat2Mat(turn, target.body_iquat[body])
@@ -262,7 +263,7 @@ def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.nd
     if given.size != value.size:
         raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
     value = value.reshape(given.shape)
-    # What float32 alone has rounded keeps the digits of the file.
+    # Numbers that differ only by float32 rounding keep the digits of the file.
     changed = value != given.astype(value.dtype)
     if isinstance(present, float):
         setattr(target, name, float(value if changed else given))
@@ -300,7 +301,7 @@ def _heading(scene: Scene) -> str:
 
 
 def _contacts(scene: Scene) -> str:
-    """Return one line for all pairs with the same parameters."""
+    """Return one line per group of pairs with equal parameters."""
     if not scene.pairs:
         return ""
     columns = list(_columns(scene))
@@ -325,7 +326,7 @@ def _contacts(scene: Scene) -> str:
 
 
 def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield what the table says of each pair: the name of a column, its unit, its cells."""
+    """Yield the columns of the table of pairs: name, unit, cells."""
     parameters = scene.contact_parameters()
     yield "condim", "", [str(pair.condim) for pair in scene.pairs]
     yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]
@@ -341,7 +342,7 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     yield "friction", "", [_friction(pair.condim, row) for pair, row in zip(scene.pairs, frictions, strict=True)]
     yield "margin", "mm", _numbers(1e3 * parameters.margin)
     gravity = float(np.linalg.norm(np.asarray(scene.model.opt.gravity)))
-    # Some margin makes where bodies rest under gravity worth a column.
+    # A margin makes the rest position under gravity worth a column.
     if gravity > 0 and np.any(parameters.margin) and np.all(parameters.stiffness > 0):
         yield "at rest", "mm", _numbers(1e3 * parameters.rest_distance(gravity))
 
@@ -351,7 +352,7 @@ def _numbers(values) -> list[str]:
 
 
 def _friction(condim: int, friction: Sequence[float]) -> str:
-    """Return sliding, torsional and rolling coefficients, as far as the contact has them."""
+    """Return the sliding, torsional and rolling coefficients that the contact has."""
     if condim == 1:
         return "none"
     sliding = [format_number(x) for x in friction[:2]]
@@ -369,7 +370,7 @@ def _range(pair: np.ndarray) -> str:
 
 
 def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = False) -> str:
-    """A title and aligned columns, the first to the left; nothing without rows."""
+    """Return a title and aligned columns, the first left-aligned; nothing without rows."""
     if not rows:
         return ""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
@@ -379,7 +380,7 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
         cells = [align(cell, width) for cell, width in zip(others, widths[1:], strict=True)]
         line = "  " + "  ".join([first.ljust(widths[0]), *cells]).rstrip()
         if not is_numeric and len(line) > _WIDTH:
-            # Only sentences wrap: a broken row of numbers could not be read.
+            # Only sentences wrap: a broken row of numbers is unreadable.
             line = textwrap.fill(line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      ")
         lines.append(line)
     return "\n".join([title, *lines])
@@ -393,15 +394,15 @@ def _bullets(title: str, sentences: Sequence[str]) -> str:
 
 
 def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
-    """Return what a sensor reads.
+    """Return the reading of a sensor.
 
     Args:
-        model: the scene's.
-        data: with its sensors computed, as `forward`, a step or a rollout leaves them.
-        name: of the sensor.
+        model: the scene's model.
+        data: data with computed sensors, after `forward`, a step or a rollout.
+        name: name of the sensor.
 
     Returns:
-        Its numbers, in MuJoCo's units of that sensor; one for a touch sensor, three for a force.
+        Its numbers, in MuJoCo's units for this sensor; one for a touch sensor, three for a force.
 
     Raises:
         ValueError: if there is no such sensor, or MJX cannot compute it.
@@ -414,12 +415,12 @@ def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
 
 
 def site_position(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, "3"]:
-    """Return where a site is, in world coordinates (m).
+    """Return the position of a site in world coordinates (m).
 
     Args:
-        model: the scene's.
-        data: with its positions computed, as `forward`, a step or a rollout leaves them.
-        name: of the site.
+        model: the scene's model.
+        data: data with computed positions, after `forward`, a step or a rollout.
+        name: name of the site.
 
     Raises:
         ValueError: if there is no such site.
