@@ -1,4 +1,4 @@
-"""What is known of arrays while a program is traced, and whether arguments are such arrays."""
+"""Known values of traced arrays, and checks of arguments."""
 
 import operator
 from typing import Any
@@ -10,31 +10,31 @@ import numpy as np
 
 
 def as_float(value: Any) -> Any:
-    """Return numbers, integers too (10000 is a natural way to write a stiffness), as an array; None as it is."""
+    """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
     return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 def known(values: Any) -> np.ndarray | None:
-    """Return numbers as they are; None for those that only the running program, or a derivative, knows."""
+    """Return numbers with known values; None for values that only the running program, or a derivative, knows."""
     return None if isinstance(values, jax.core.Tracer) else np.asarray(values)
 
 
 def is_known(value: Any) -> bool:
-    """Return whether this is an array that can be looked at.
+    """Return whether an argument is an array with known values.
 
-    Trees of other things than numbers (axes of vmap, shapes) go through the same constructors.
+    Trees of other leaves (axes of vmap, shapes) go through the same constructors.
     """
     return isinstance(value, jax.Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
 
 
 def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> bool:
-    """Return whether all numbers of an array, or of one of its columns, are known, and are this one."""
+    """Return whether all numbers of an array, or one of its columns, are known to equal a value."""
     found = known(values)
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
 
 
 def whole(name: str, value: Any, least: int | None = 1) -> int:
-    """Return a count, refusing what is no whole number, too small, or known to the running program alone."""
+    """Return a count; refuse fractions, counts that are too small, and traced values."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(
             f"{name} must be known before anything is compiled, got a traced value; make it static in jax.jit"
@@ -49,12 +49,12 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
 
 
 def form(value: Any) -> str:
-    """Return the shape of numbers, or the type of what is none, as messages print it."""
+    """Return the shape of numbers, or the type of anything else, for messages."""
     return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__
 
 
 def one_key(key: Any) -> None:
-    """Refuse what is not a single random key."""
+    """Refuse anything but a single random key."""
     dtype, shape = getattr(key, "dtype", None), jnp.shape(key)
     is_new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not ((is_new and shape == ()) or (dtype == jnp.uint32 and shape == (2,))):

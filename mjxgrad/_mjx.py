@@ -1,8 +1,8 @@
-"""The one place that imports MJX.
+"""The only import of MJX.
 
-`mujoco.mjx` prints two lines to stdout when NVIDIA Warp, which this library does not use, is
-absent. A library must not print, and a program that writes its results to stdout must not find
-them there. Only those two lines are dropped: anything else said while importing is passed on.
+`mujoco.mjx` prints two lines to stdout if NVIDIA Warp is absent, which this library does not use.
+A library must not print, and stdout may carry a program's results. Only those two lines are
+dropped; other output of the import is passed on.
 """
 
 import contextlib
@@ -17,8 +17,8 @@ try:
     with contextlib.redirect_stdout(_said):
         from mujoco import mjx
 
-        # Not public, but what decides which geoms MJX tests for contact, and what sizes its data
-        # has: second implementations of these rules could disagree with them.
+        # Private functions that decide which geoms MJX tests for contact, and the sizes of its data: a second
+        # implementation of these rules could disagree.
         from mujoco.mjx._src.collision_driver import _COLLISION_FUNC as COLLISION_FUNCTIONS
         from mujoco.mjx._src.collision_driver import _contact_groups as contact_groups
         from mujoco.mjx._src.collision_driver import _geom_groups as geom_groups

@@ -1,4 +1,4 @@
-"""Programs that are compiled once: in a process, and from one process to the next."""
+"""Compiled programs, kept within a process and from one process to the next."""
 
 import collections
 import functools
@@ -18,10 +18,11 @@ _Function = TypeVar("_Function", bound=Callable)
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a function of arrays, or of trees with arrays, once for each shape and structure of them.
+    """Compile a function of arrays, or trees with arrays, once per shape and structure.
 
-    Called with traced values it is part of a larger program and left to that, in which more of the values may be known. It must
-    depend on its arguments alone: what it reads besides is read once.
+    Called with traced values it becomes part of the outer program, where more values may be known. The function must depend
+    on
+    its arguments alone: other variables are read only once.
     """
     program = eqx.filter_jit(function)
 
@@ -29,7 +30,7 @@ def compiled(function: _Function) -> _Function:
     def call(*args: Any, **kwargs: Any) -> Any:
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
             return function(*args, **kwargs)
-        # Whether a type is weak is part of a program: results that go in again would be compiled for a second time.
+        # Weak types belong to a program's signature: feeding results back would compile it a second time.
         strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
         return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
 
@@ -41,9 +42,9 @@ _MOST_KEPT = 64
 
 
 def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> jax.stages.Compiled:
-    """Compile a program, or return what was compiled of the same text: a function that was traced anew need not be.
+    """Compile a program, or return the compiled program of equal text, so that tracing a function anew costs no compilation.
 
-    The text has every number in it that is no argument, but not what a callback calls.
+    The text contains all constants, but not the bodies of callbacks.
     """
     text = lowered.as_text()
     if "callback" in text:
@@ -59,10 +60,11 @@ def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> ja
 
 
 def keep_compiled() -> Path | None:
-    """Keep compiled programs in the user's folder of caches, for the next process. Call it before anything is computed.
+    """Keep compiled programs in the user's cache folder, for the next process. Call it before any computation.
 
-    It sets JAX's global `jax_compilation_cache_dir`, unless that is set already. Programs hold for one processor and one jaxlib,
-    so each of them has a folder of its own. Nothing removes old programs; the folder may be deleted at any time.
+    It sets JAX's global `jax_compilation_cache_dir`, unless it is set already. Programs hold for one processor and one
+    jaxlib,
+    so each combination has its own folder. Nothing removes old programs; the folder may be deleted at any time.
 
     Returns:
         The folder in use; None if it cannot be written, and nothing is kept.
@@ -73,7 +75,7 @@ def keep_compiled() -> Path | None:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute()
         place = caches / "mjxgrad" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{_processor()}"
         place.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # read-only, or there is no home
+    except (OSError, RuntimeError):  # read-only, or no home directory
         return None
     if not os.access(place, os.W_OK):
         return None
@@ -85,7 +87,7 @@ def keep_compiled() -> Path | None:
 
 
 def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any, *args: Any, **kwargs: Any) -> None:
-    """Show a warning; of JAX's for each program that cannot be read or written, dozens with one cause, one in their place."""
+    """Show a warning, but JAX's many warnings about unreadable or unwritable programs only once."""
     if "persistent compilation cache" in str(message):
         told.append(message)
         message = UserWarning(f"programs in {place} cannot be read or written and are compiled again; delete it")
@@ -94,7 +96,7 @@ def _show(show: Callable[..., None], place: Path, told: list[Any], message: Any,
 
 
 def _processor() -> str:
-    """Return a short name of what programs are compiled for: the processor with all that it can do."""
+    """Return a short name of the processor with its features, for which programs are compiled."""
     about = Path("/proc/cpuinfo")
     lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
     kinds = sorted(

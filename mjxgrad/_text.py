@@ -1,4 +1,4 @@
-"""Numbers and names as messages and tables print them."""
+"""Numbers and names as text, for messages and tables."""
 
 from collections.abc import Sequence
 
@@ -6,14 +6,14 @@ import numpy as np
 
 
 def name_pairs(pairs: Sequence[object]) -> str:
-    """Return two pairs, or whatever else has a name, by name; or the first of them and how many more there are."""
+    """Return one or two names; or the first and the number of the others."""
     if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
         return ", ".join(str(pair) for pair in pairs)
     return f"{pairs[0]} + {len(pairs) - 1} more"
 
 
 def format_number(x: float) -> str:
-    """Write three digits; whole numbers up to 99999 in full."""
+    """Return a number with three digits; whole numbers up to 99999 in full."""
     if np.isinf(x):
         return "∞" if x > 0 else "−∞"
     if 1e3 <= abs(x) < 99999.5:

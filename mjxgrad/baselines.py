@@ -1,11 +1,11 @@
-r"""What one would otherwise use, in the same loop, with rollouts counted alike: methods that look at costs alone.
+r"""Gradient-free baselines in the same loop, with rollouts counted alike.
 
-Each draws candidates $\theta_i = \mu + \sigma \epsilon_i$ about the present point $\mu$ and moves it by a rule of its
-own. The search noise takes the place of the objective's: candidates are rolled out without that, or, where a task's
-start is random, with a start of their own. The cost in the history is the mean over the candidates, and the best
+Each draws candidates $\theta_i = \mu + \sigma \epsilon_i$ around the present point $\mu$ and updates it by its own
+rule. The search noise replaces the objective's noise: candidates are rolled out without it, or, where a task's
+start is random, each with its own start. The cost in the history is the mean over the candidates. The best
 parameters are among the points $\mu$, whose noise-free cost `evaluate` measures.
 
-They are written here, for each is short, and a library of them would bring in a neural-network framework.
+The methods are short, and a library of them would require a neural-network framework.
 """
 
 import dataclasses
@@ -31,9 +31,9 @@ Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tupl
 
 
 class Population(Descent):
-    """Draw candidates, roll them out, move; the state is the width of the search, at the start `stddev`.
+    """Optimiser by candidates: draw, roll out, move; its state is the width of the search, at the start `stddev`.
 
-    `move` goes from the point, the width, the candidates and their costs, infinite where they are not finite, to the next
+    `move` is a function from the point, the width, the candidates and their costs (infinite where not finite) to the next
     point and width. A step is taken if at least `least_finite` candidates are finite; the present point may be the first.
     """
 
@@ -78,29 +78,29 @@ def cross_entropy(
     r"""Minimise a cost by the cross-entropy method.
 
     Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
-    best of them, by maximum likelihood (so $\sigma$ has no $n - 1$):
+    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$):
 
     $$\mu \leftarrow \kappa \mu + (1 - \kappa)\, \mathrm{mean}(\mathrm{elite}), \qquad
       \sigma \leftarrow \kappa \sigma + (1 - \kappa)\, \mathrm{std}(\mathrm{elite}).$$
 
-    Candidates are rolled out without the objective's noise, from random starts where the task has them; one that is not
-    finite is never elite. A step with fewer than `num_elite` finite ones is not taken.
+    Candidates are rolled out without the objective's noise, from random starts where the task has them. Candidates that are
+    not finite are never elite. A step with fewer than `num_elite` finite ones is not taken.
 
     Args:
-        objective: what to minimise; only its cost is used.
+        objective: the objective; only its cost is used.
         params: the first $\mu$.
         key: as in `optimise`.
         num_samples: candidates, and so rollouts, per step.
-        num_elite: the best of them that the fit is to. At least 2.
-        num_steps: at most.
+        num_elite: number of the best candidates in the fit. At least 2.
+        num_steps: largest number of steps.
         stddev: the first $\sigma$, in the parameters' units; one number, or one per parameter. None takes the
-            objective's noise, if that is on the parameters.
+            objective's noise, if it is on the parameters.
         keep: $\kappa \in [0, 1)$, share of the old fit.
-        min_stddev: $\sigma$ is not let below it, lest the search freeze too early.
+        min_stddev: least $\sigma$, against early convergence.
         **options: see `RunOptions`.
 
     Returns:
-        As `optimise`; what belongs to gradients is NaN.
+        The result, as in `optimise`, with NaN for fields about gradients.
 
     Raises:
         ValueError: if a number is out of range or does not fit, or as in `optimise`.
@@ -143,13 +143,14 @@ def mppi(
     $$\mu \leftarrow \mu + \sum_i \frac{\exp(-f_i/\lambda)}{\sum_j \exp(-f_j/\lambda)}\, \sigma\epsilon_i,
       \qquad f_i = f(\mu + \sigma\epsilon_i).$$
 
-    The whole horizon is planned anew in each step; nothing is shifted or executed in between, and the cost is the
-    objective's alone, without the cited method's extra charge $\lambda\mu^\top\Sigma^{-1}\epsilon$ for control.
+    Each step plans the whole horizon anew; nothing is shifted or executed in between. The cost is the objective's alone,
+    without the cited method's extra charge $\lambda\mu^\top\Sigma^{-1}\epsilon$ for control.
     A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
 
-    The temperature $\lambda$ follows the best candidate where it is low and averages over all where it is high. It is in
-    units of the standard deviation of the step's costs if `is_relative`, so that the cost's unit has no effect, else in
-    units of the cost. All else is as in `cross_entropy`.
+    A low temperature $\lambda$ follows the best candidate, a high one averages over all. If `is_relative`, its unit is the
+    standard deviation of the step's costs, so that the cost's unit has no effect; else it is the unit of the cost. All else
+    is
+    as in `cross_entropy`.
 
     References:
         Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based
@@ -164,9 +165,9 @@ def mppi(
         scale = jnp.asarray(temperature, costs.dtype)
         if is_relative:
             spread = jnp.std(costs, where=jnp.isfinite(costs))
-            # All costs alike: any temperature gives equal weights, but zero would give 0/0.
+            # For equal costs any temperature gives equal weights, but zero would give 0/0.
             scale *= jnp.where(spread > 0, spread, 1)
-        # Weighting the offsets, not the candidates: equal to rounding, and exact where a weight of one is left.
+        # Weighted offsets, not candidates: equal to rounding, and exact for a single weight of one.
         return mean + jax.nn.softmax(-costs / scale) @ (at - mean), stddev
 
     method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples)
@@ -183,9 +184,9 @@ def predictive_sampling(
     stddev: ArrayLike | None = None,
     **options: Any,
 ) -> Optimisation:
-    r"""Minimise a cost by going to the best candidate, the present point among them.
+    r"""Minimise a cost by moving to the best candidate, including the present point.
 
-    The cost without noise never rises, unless the task's start is random. Arguments, result and refusals are those of
+    The cost without noise never rises, unless the task's start is random. Arguments, result and errors are as in
     `cross_entropy`.
 
     References:
@@ -204,7 +205,7 @@ def predictive_sampling(
 
 
 def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:
-    """Return the noise of a rollout with none on actions or parameters, but a random start where the task has one."""
+    """Return rollout noise with none on actions or parameters, but a random start where the task has one."""
     if isinstance(objective, ActionNoise):
         _, start = objective.split(objective.sample_noise(key))
         if start is not None:
@@ -215,7 +216,7 @@ def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:
 def search_stddev(
     objective: Objective, params: Float[Array, "..."], stddev: ArrayLike | None, num_samples: int
 ) -> Float[Array, " dim"]:
-    """Return the width of the search for each parameter, refusing what makes no sense."""
+    """Return the width of the search for each parameter; refuse invalid ones."""
     as_objective(objective)
     whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1

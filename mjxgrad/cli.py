@@ -58,7 +58,7 @@ mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 
 
 class CommandError(Exception):
-    """What cannot be done, in a sentence for whoever asked."""
+    """A request that cannot be carried out; the message is a sentence for the user."""
 
 
 app = cyclopts.App(
@@ -75,25 +75,25 @@ def main(arguments: list[str] | None = None) -> int:
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
     interruption.
     """
-    # Whatever asks to stop is answered as Ctrl-C is.
+    # SIGTERM is handled like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
     except KeyboardInterrupt:
         _say("interrupted")
         status = 130
-    except BrokenPipeError:  # whoever read has read enough
+    except BrokenPipeError:  # the reader has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
         _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
         status = 2
-    # What the library refuses, it refuses with these and in a sentence; anything else is a mistake in the program.
+    # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
         status = 2
     if arguments is None and threading.active_count() > 1:
-        # A compilation that `check` gave up cannot be stopped otherwise, and leaving would wait for it.
+        # An abandoned compilation of `check` cannot be stopped otherwise, and the exit would wait for it.
         sys.stdout.flush()
         os._exit(status)
     return status
@@ -114,16 +114,16 @@ def check(
     budget: float = 12.0,
     seed: int = 0,
 ) -> int:
-    """Say whether and how a scene can be differentiated; the exit status is 1 where there are faults.
+    """Check whether and how a scene can be differentiated; the exit status is 1 where there are faults.
 
     Args:
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; modules of the current folder, too.
         as_json: write JSON.
         html: write a page to this file.
-        quick: only what takes seconds: contact, time step, what has no effect.
-        budget: how long it may take in s, once the scene is loaded; what does not fit is left out by name.
-        seed: of what is random.
+        quick: only fast checks, in seconds: contact, time step, parts without effect.
+        budget: duration in s once the scene is loaded; the report names measurements that are left out.
+        seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
     mg, started = _library(), time.monotonic()
@@ -160,15 +160,15 @@ def sweep(
     Args:
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or at the end height:body, speed:body,
-            upright:body, reach:body/site; without it, a random mix of where the heaviest body ends up.
-        start: a key frame by name; without it the reference pose.
-        horizon: time steps; without it those of half a second, 50 to 300.
-        stiffness: of contacts in 1/s², beside the file's own: 1e2 to 1e6 unless given.
+            upright:body, reach:body/site; by default a random mix of the heaviest body's final coordinates.
+        start: a key frame by name; by default the reference pose.
+        horizon: number of time steps; by default half a second, but 50 to 300 steps.
+        stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
         samples: rollouts of each estimate; the truth takes eight times as many.
         gradient: the slope of the outcome, or the discrete one of each step.
-        engine: mjx, or mujoco for C MuJoCo, which has nothing to compile and is slower; without it what the scene can have.
-        seed: of what is random.
+        engine: mjx, or mujoco for C MuJoCo, which compiles nothing and is slower; by default the scene's own.
+        seed: seed of all random numbers.
         html: the page to write.
     """
     if not html.parent.is_dir():
@@ -207,9 +207,10 @@ def identify(
 ) -> int:
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
 
-    A recording is a CSV with a line of names, or an NPZ. It has a column time (s). The others are named by joints (positions),
-    sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator, act:actuator. Of several
-    numbers each has its place, qpos:root[0], or qpos[7] in the whole. The controls of all actuators are needed.
+    A recording is a CSV with a line of names, or an NPZ. It has a column time (s). The others are named by joints
+    (positions),
+    sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator, act:actuator. An element
+    with several numbers takes an index, qpos:root[0], or qpos[7] in the whole. The controls of all actuators are needed.
 
     Args:
         scene: an MJCF file.
@@ -217,9 +218,9 @@ def identify(
         parameter: kind:name, kind:name=low..high, or YAML of mujoco.sysid with such names. Kinds are mass, inertia (bodies),
             friction, stiffness, damping_ratio, width (geoms, geom/geom or nothing for all), damping, armature, friction_loss
             (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
-        held_out: share that is only judged by: every so many recordings or windows, or the end of a single one.
-        window: cut recordings into windows of so many seconds, each from its measured state.
-        free_start: find where each motion begins, too; without it the noise of the first state goes into the values.
+        held_out: share for validation only: every n-th recording or window, or the end of a single one.
+        window: duration in s of windows to cut recordings into, each from its measured state.
+        free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
         as_json: write JSON.
     """
@@ -267,15 +268,15 @@ def identify(
 def new(
     scene: str, *, output: Path = Path("task.py"), force: Annotated[bool, cyclopts.Parameter(negative="")] = False
 ) -> None:
-    """Write a program that optimises a motion of a scene and films it, with what a quick check recommends.
+    """Write a program that optimises a motion of a scene and films it, with the settings that a quick check recommends.
 
     Args:
         scene: an MJCF file, with actuators.
         output: the program to write.
-        force: replace a program that is there.
+        force: overwrite an existing program.
     """
     if output.exists() and not force:
-        raise CommandError(f"{output} is there already; name another --output, or replace it with --force")
+        raise CommandError(f"{output} exists already; name another --output, or replace it with --force")
     _writable(output)
     verdict = _library().check(_existing(scene), derivatives=False)
     advice, timestep = verdict.recommendation, verdict.motions.timestep
@@ -298,7 +299,7 @@ def new(
     output.write_text(text, encoding="utf-8")
     print(f"wrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
-        _say("its video needs what is not installed: pip install 'mjxgrad[render]'")
+        _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
 
 
 @app.command
@@ -335,7 +336,7 @@ def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.m
 
 @functools.cache
 def _library() -> Any:
-    """Return mjxgrad in double precision, in which jumps and slopes are told apart."""
+    """Return mjxgrad in double precision, which distinguishes jumps from slopes."""
     import jax
 
     from mjxgrad.batched.device import all_devices
@@ -343,7 +344,7 @@ def _library() -> Any:
     jax.config.update("jax_enable_x64", True)
     try:
         all_devices()
-    except (AssertionError, RuntimeError) as error:  # an assertion, where JAX_PLATFORMS names what is not there
+    except (AssertionError, RuntimeError) as error:  # JAX asserts where JAX_PLATFORMS names a missing platform
         raise CommandError(
             f"JAX finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: unset it {error}".rstrip()
         ) from error
@@ -359,7 +360,7 @@ def _existing(path: str) -> str:
 
 
 def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = False) -> None:
-    """Refuse, before any work, a file that could not be written after it, or a page without what writes pages."""
+    """Refuse in advance an output file that cannot be written, or a page without the packages for pages."""
     if path is None:
         return
     there = (
@@ -368,6 +369,6 @@ def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = 
         else path.absolute().parent
     )
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
-        raise CommandError(f"{path} cannot be written: {there} must be a folder that is there and can be written to")
+        raise CommandError(f"{path} cannot be written: {there} must be an existing folder that can be written to")
     if is_page:
         importlib.import_module("mjxgrad.report").require()
