@@ -22,7 +22,7 @@ _Matrix = Float[Array, "n n *batch"]
 # Longer sums are left to a matrix product: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
 # What only some of a batch need is computed for this part of it at a time.
-_FEW = 8
+_NUM_PARTS = 8
 
 
 def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
@@ -113,7 +113,7 @@ def _batch_last(function: Callable, batch: int | None) -> Callable:
     return batched
 
 
-def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
+def solve_subset(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
     """Return what a function gives where it is needed, and the default elsewhere.
 
     Of a batch, the trailing axis of all arrays, an eighth is taken at a time, until none is left: for what few of its
@@ -121,17 +121,17 @@ def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree
     """
     if not is_needed.ndim:
         return jax.lax.cond(is_needed, lambda: function(*args), lambda: default)
-    count = -(-is_needed.shape[0] // _FEW)
+    count = -(-is_needed.shape[0] // _NUM_PARTS)
 
     def turn(state):
         is_left, result = state
-        few = Few(is_left, count)
+        few = Subset(is_left, count)
         return is_left & ~few.is_taken, few.put(result, function(*few.take(args)))
 
     return jax.lax.while_loop(lambda state: jnp.any(state[0]), turn, (is_needed, default))[1]
 
 
-class Few:
+class Subset:
     """Some of a batch, the trailing axis of arrays, taken out and put back.
 
     Of those chosen the first, in their order, then others as there is room; `is_taken` says who is among them of those chosen.

@@ -63,13 +63,13 @@ def solve(
     scale: Float[Array, "rows batch"] | None = None,
     right: Float[Array, "rows n batch"] | None = None,
     *,
-    most_mended: float = 0.0,
+    max_shift: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "n batch"], Float[Array, "n batch"]]:
     """Return (mass + Σ scale left rightᵀ)⁻¹ vector, the sum over rows, and the diagonal of that matrix.
 
     The solution is not finite where the matrix, which must be symmetric, is not positive definite, and a share of its diagonal
-    below `most_mended` does not mend that. The right rows are by default the left ones; a row whose scale is zero costs little.
+    below `max_shift` does not mend that. The right rows are by default the left ones; a row whose scale is zero costs little.
     """
 
     def kernel(mass, vector, *refs):
@@ -78,7 +78,7 @@ def solve(
         if left is not None:
             matrix = add_rows(matrix, refs[0], refs[1][...], refs[2 if right is not None else 0])
         on_diagonal[...] = diagonal(matrix)
-        solution[...] = mended(matrix, vector[...], size, most_mended)
+        solution[...] = solve_regularised(matrix, vector[...], size, max_shift)
 
     size, inputs = len(vector), [x for x in (filled(mass), vector, left, scale, right) if x is not None]
     found = run(kernel, inputs, [(vector.dtype, padded(size))] * 2, interpret=interpret)
@@ -180,10 +180,12 @@ def solve_blocks(matrix: _Blocks, vector: Float[Array, " width"], size: int) -> 
     return join(_solve(matrix, [_part(vector, b) for b in range(len(matrix))], size))
 
 
-def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mended: float) -> Float[Array, " width"]:
+def solve_regularised(
+    matrix: _Blocks, vector: Float[Array, " width"], size: int, max_shift: float
+) -> Float[Array, " width"]:
     """Return matrix⁻¹ vector, with the least share of its diagonal added that makes it positive definite."""
     found, own = solve_blocks(matrix, vector, size), diagonal(matrix)
-    if not most_mended:
+    if not max_shift:
         return found
     can_be = is_finite(own) & is_finite(vector)
 
@@ -193,7 +195,7 @@ def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mend
 
     def goes_on(carry):
         share, found = carry
-        return can_be & ~is_finite(found) & (next_share(share) < most_mended)
+        return can_be & ~is_finite(found) & (next_share(share) < max_shift)
 
     return jax.lax.while_loop(goes_on, attempt, (jnp.zeros((), vector.dtype), found))[1]
 

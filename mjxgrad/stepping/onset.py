@@ -267,11 +267,11 @@ def _share(
 ) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and what may push instead of it; None where no sides change."""
     each, h = block.rows_each, model.opt.timestep
-    rates = block.map.rates(data.qvel).reshape(-1, each)
+    rates = block.map.mv(data.qvel).reshape(-1, each)
     rate = _normal(block, rates)
     stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
-    press = jnp.abs(_normal(block, block.map.rates(data.qacc_smooth).reshape(-1, each))) - gravity
+    press = jnp.abs(_normal(block, block.map.mv(data.qacc_smooth).reshape(-1, each))) - gravity
     press = _PRESS * jnp.where(press > 0, press, 0.0)
     depth = _depth(block.solimp[::each])
     creep = _creep(gravity, press, h, stiffness, damping, depth)
@@ -287,7 +287,7 @@ def _share(
     distance = block.residual[::each] + h * rate * slow
     if after is not None:
         least = 2 * _AT_MOTION * depth
-        ahead = h * jnp.abs(_normal(block, block.map.rates(after).reshape(-1, each)))
+        ahead = h * jnp.abs(_normal(block, block.map.mv(after).reshape(-1, each)))
         width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
         distance = block.residual[::each]
     if contacts is None:
@@ -336,7 +336,7 @@ def _side(
     others, nearer = other_sides(model, data, contact, geoms)
     dim = block.rows_each // 2 + 1 if block.is_pyramid else block.rows_each
     turned = row_map(model, data, others, contacts.start, dim)
-    turning = model.opt.timestep * jnp.abs(rate - _normal(block, turned.rates(data.qvel).reshape(-1, block.rows_each)))
+    turning = model.opt.timestep * jnp.abs(rate - _normal(block, turned.mv(data.qvel).reshape(-1, block.rows_each)))
     width = jnp.where(turning > 2 * least, turning, 2 * least)
     share = 0.5 + nearer / jnp.where(width > 0, width, 1.0)
     return _Side(jnp.where(can_turn & (width > 0) & (share < 1), jnp.where(share > 0.5, share, 0.5), 1.0), turned)

@@ -76,7 +76,7 @@ def joined(blocks: list[Block]) -> Block:
 def law(model: mjx.Model, qvel: Float[Array, " nv"], block: Block) -> tuple[_PerRow, _PerRow]:
     """Return a_ref and weight D of rows; those of inactive rows are zero and of no effect."""
     residual = jnp.where(block.is_active, block.residual, 0.0)
-    rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
+    rate = jnp.where(block.is_active, block.map.mv(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
     present = block.impedance.present
     drift = 0.0 if block.drift is None else jnp.where(block.is_active, block.drift, 0.0)

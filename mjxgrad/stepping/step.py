@@ -272,16 +272,16 @@ def _minimum(
     if partial is None:
         acceleration, num_iterations = implicit.solve(layout, iterations, system, start, tolerance)
         force = system.row_force(layout, acceleration)
-        total = system.pull(force)
+        total = system.rmv(force)
     else:
         both, num_iterations = implicit.solve_both(
             layout, iterations, system, partial.variants, partial.is_split, start, tolerance
         )
 
         def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
-            varied = system.varied(variant)
+            varied = system.with_variant(variant)
             force = varied.row_force(layout, acceleration)
-            return force, varied.pull(force)
+            return force, varied.rmv(force)
 
         # In this order they are the whole contact's to the last bit where the two do not differ.
         acceleration, force, total = (
