@@ -4,8 +4,8 @@ Arrays may carry the batch as trailing axis, see `linear`. A CPU runs the factor
 the batch. It is written out, or, where that would take long to compile, runs block by block with a loop over the columns of a
 block. On a GPU starting these operations would dominate the solve, so it is one kernel.
 
-A CPU does not use LAPACK for batches. LAPACK takes one matrix after the other, and jaxlib before 0.11 waits within the threads
-that share the batch: when as many programs wait as there are threads, they deadlock.
+A CPU does not use LAPACK for batches. LAPACK takes one matrix after the other, and jaxlib before 0.11 waits within the
+threads that share the batch. When as many programs wait as there are threads, they deadlock.
 """
 
 from typing import Protocol, runtime_checkable

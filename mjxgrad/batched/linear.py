@@ -217,8 +217,8 @@ def add_to_diagonal(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array,
 def _add_block(x: Array, where: tuple[slice, ...], part: Array) -> Array:
     """Return x with `part` added to a block.
 
-    A CPU adds in place and touches no other entry. A GPU spends more on starting an operation than on a whole array: the sum
-    of many padded blocks is one operation.
+    A CPU adds in place and touches no other entry. A GPU spends more on starting an operation than on a whole array, and
+    sums many padded blocks in one operation.
     """
     if part.shape == x.shape:
         return x + part

@@ -60,8 +60,8 @@ class Softness(eqx.Module):
     A margin moves the start of the force away from the surface, and with it the place of rest: bodies hover by the margin less
     their depth. `rest_acceleration` restores the height, exactly under one load, by a softer spring:
     $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Two other ways fail. Geoms that shrink by
-    the margin cancel it, since a margin only enlarges geoms. A lower impedance reaches $d = 0$ where $k m > a_0$. The price
-    of a softer spring: n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
+    the margin cancel it, since a margin only enlarges geoms. A lower impedance reaches $d = 0$ where $k m > a_0$. But under a
+    softer spring n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
 
     A part that is `None` stays as it is in the model. If only one of stiffness and damping ratio is given, the other keeps its
     present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` over a `Softness` with a

@@ -39,8 +39,8 @@ def solve_regularised(
 ) -> _Vector:
     """Return (M + Jᵀ s'' J)⁻¹ vector, regularised where rounding has made the matrix indefinite.
 
-    At an impedance near 1, s'' may exceed M so far that M is lost in single precision. Then the smallest sufficient share
-    of the diagonal is added, tried in powers of four from rounding on. Less then moves.
+    At an impedance near 1, s'' may exceed M so far that M is lost in single precision. Then the smallest share of the
+    diagonal that suffices is added, tried in powers of four from rounding on, which makes the step shorter.
     """
     unit = jnp.eye(len(vector), dtype=vector.dtype).reshape(len(vector), -1, *(1,) * (vector.ndim - 1))
 

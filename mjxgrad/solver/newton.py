@@ -17,8 +17,8 @@ not depend on the units of joints or on the ratios of masses.
 
 The same steps solve a batch, operation by operation, and a single state in a GPU's program; `Problem` holds the difference.
 
-The gradient is formed anew in each iteration: in single precision an update along the line would keep the rounding errors
-of a poor start.
+The gradient is formed anew in each iteration: in single precision an update along the line would keep rounding errors from
+a poor start.
 """
 
 import abc
@@ -365,8 +365,8 @@ def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vec
     The loop runs until every member of the batch is done; members that are done stay where they are. The last eighth is taken
     out and finished on its own. A start that is not finite is replaced by zero.
 
-    The tolerance bounds the remaining step, in the norm of kinetic energy over the trace of the mass matrix. For a single body
-    that is the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
+    The tolerance bounds the remaining step, in the norm of kinetic energy over the trace of the mass matrix; for a single
+    body this is the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
     number is `max_iterations` + 1 where the iterations, or the digits of the precision, did not suffice.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
