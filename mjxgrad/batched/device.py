@@ -41,7 +41,7 @@ def own_device() -> jax.Device:
 
 
 def by_platform(*args: Any, gpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
-    """Call one function on NVIDIA's GPUs and another elsewhere; the choice is made when the program is compiled."""
+    """Return a function's result on NVIDIA's GPUs and another's elsewhere, chosen when the program is compiled."""
     return jax.lax.platform_dependent(*args, cuda=gpu, default=default)
 
 

@@ -11,7 +11,7 @@ T = |u₁..|:
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
 Rows under noise (see `smoothing`) have the mean of these costs, at x + c w over noise w on the distance, where it makes
-contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_push`. The cone is as simple: its three zones
+contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_violation`. The cone is as simple: its three zones
 are the sum of two such terms,
 
     ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
@@ -130,7 +130,7 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
     ]
     if layout.kernel is not None:
         noisy = slice(layout.hard_stop, layout.simple_stop)
-        parts.append(rows.weight[noisy] * _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
+        parts.append(rows.weight[noisy] * _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
     for k in range(len(layout.cones)):
         parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
@@ -191,7 +191,7 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array,
     if layout.kernel is None:
         return curvature
     noisy = slice(layout.hard_stop, layout.simple_stop)
-    share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
+    share = _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
     return jnp.concatenate([curvature, rows.weight[noisy] * share])
 
 
@@ -236,12 +236,12 @@ class _NoisyCone(eqx.Module):
     stiffness: _PerContact
     tangential: Float[Array, "contacts tangents *batch"]
     slip: _PerContact
-    pushes: tuple[_PerContact, _PerContact]
+    violations: tuple[_PerContact, _PerContact]
     shares: tuple[_PerContact, _PerContact]
     hold: _PerContact
 
     def force(self, _: _PerRow) -> _Directions:
-        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
+        press = self.violations[0] + self.scale[:, 0] * self.violations[1]
         both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
         return self.stiffness[:, None] * self.scale * both
 
@@ -276,17 +276,17 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
     first = Noise(mu * noise.spread, mu * noise.gate)
     second = Noise(mu * first.spread, mu * first.gate)
-    push1, share1 = _mean_push(layout.kernel, normal - mu * slip, first)
-    push2, share2 = _mean_push(layout.kernel, mu * normal + slip, second)
+    violation1, share1 = _mean_violation(layout.kernel, normal - mu * slip, first)
+    violation2, share2 = _mean_violation(layout.kernel, mu * normal + slip, second)
     # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the
     # slip is taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
-    still = _mean_push(layout.kernel, normal, first)[1]
+    still = _mean_violation(layout.kernel, normal, first)[1]
     smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
     is_small = slip < smallest
-    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
+    moving = (mu * violation1 - violation2) / jnp.where(is_small, 1.0, slip)
     resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
     hold = jnp.where(is_small, resting, moving)
-    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)
+    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (violation1, violation2), (share1, share2), hold)
 
 
 def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
@@ -298,7 +298,7 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
     return Noise(rows.noise.spread[which], rows.noise.gate[which])
 
 
-def _mean_push(
+def _mean_violation(
     kernel: Kernel, x: Float[Array, "n *batch"], noise: Noise
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
     """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.

@@ -44,7 +44,7 @@ impedance p d. The result is continuous, and the mean share is φ.
   floor) each switch multiplies the tangent by about h Δa / w, which w₀ bounds at every time step. A larger w₀ gives a smoother
   motion, farther from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
 
-At the floor r is taken ahead, r + h v (1 - h²v²/w²), which damps oscillations on the ramp.
+Where w has its floor, r is taken ahead, r + h v (1 - h²v²/w²), which damps oscillations on the ramp.
 
 **Change of sides.** The normal flips where two centres pass each other along it (a ball driven through a thin wall). It turns by
 a right angle where another face of a box becomes the nearest to a ball's centre within the box. Both sides then act for a
@@ -54,8 +54,8 @@ step. The other side has the rest, at the same depth. This covers geoms with a c
 **Limits.** True discontinuities remain: hit or miss, an edge that catches or not. So do jumps where two boxes change their
 touching faces, and where three faces of a box are equally near within a step. A contact shorter than about three steps is smooth
 but not resolved. Chatter still multiplies tangents, within the bound of the width. The distance of boxes and meshes is known only
-where they overlap, except from planes, and between boxes and balls. Elsewhere the ramp lies at 0 > r > -w: continuous, but half
-a step late.
+where they overlap, except from planes, and between boxes and balls. Without a distance the ramp lies at 0 > r > -w: continuous,
+but half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
@@ -213,7 +213,7 @@ def begin(
 ) -> tuple[list[Block], Shares | None]:
     """Return rows that are active if they act for any part of the step, and their shares; None if no row begins or ends.
 
-    With `after`, the velocity after MuJoCo's step, the shares are those of MuJoCo's own motion, for a derivative there.
+    With `after`, the velocity after MuJoCo's step, the shares belong to MuJoCo's own motion, for a derivative there.
     `without` says whether contacts, and limits, stay unchanged, as smoothing averages them over noise.
     """
     if not any(block.rows_each for block in blocks):

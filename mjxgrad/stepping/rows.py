@@ -43,7 +43,7 @@ class Block(eqx.Module):
         drift: J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²); None where it is not used.
         rows_each: number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
         is_pyramid: whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
-        is_contact: whether the rows are those of contacts.
+        is_contact: whether the rows belong to contacts.
     """
 
     map: RowMap

@@ -38,7 +38,7 @@ _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
 Gradient = Literal["discrete", "slope"]
-"""Along MuJoCo's own motion: the derivative of each step, or one whose mean is the slope of the outcome."""
+"""Derivatives along MuJoCo's own motion: "discrete", of each step, or "slope", with the slope of the outcome as mean."""
 
 
 @contextlib.contextmanager

@@ -232,5 +232,5 @@ def test_a_gpu_adds_the_same_blocks(monkeypatch, random):
 
 def test_rows_of_one_joint_each_keep_their_order(random):
     rows, x = AxisRows(jnp.array([1.0, -1.0]), (1, 3), 4), jnp.asarray(random.normal(size=4))
-    np.testing.assert_array_equal(rows.rates(x), [x[1], -x[3]])
-    np.testing.assert_array_equal(rows.pull(jnp.array([2.0, 3.0])), [0, 2, 0, -3])
+    np.testing.assert_array_equal(rows.mv(x), [x[1], -x[3]])
+    np.testing.assert_array_equal(rows.rmv(jnp.array([2.0, 3.0])), [0, 2, 0, -3])
