@@ -273,7 +273,7 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
         if block.rows_each:
             distance, rates = (
                 block.residual[:: block.rows_each],
-                block.map.rates(after.qvel).reshape(-1, block.rows_each),
+                block.map.mv(after.qvel).reshape(-1, block.rows_each),
             )
             rate = jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
             found |= jnp.any((distance < 0) != (distance + model.opt.timestep * rate < 0))

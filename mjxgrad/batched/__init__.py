@@ -1,4 +1,4 @@
-"""Arrays of many states, in the way that suits the device: layouts, sums, small factorisations, kernels of a GPU. No physics."""
+"""Arrays of many states: memory layouts, sums, small factorisations and GPU kernels, chosen per device. No physics."""
 
 from mjxgrad.batched.device import over_devices
 

@@ -1,11 +1,11 @@
-"""Solves with symmetric matrices of joint-space size, many at once, by Cholesky: in the way that suits the device.
+"""Batched Cholesky solves with symmetric matrices of joint-space size.
 
 Arrays may carry the batch as trailing axis, see `linear`. A CPU runs the factorisation column by column, each operation along
-the batch: written out, or, where that would take long to compile, block by block with a loop for the columns of a block. On a
-GPU starting these operations would take longer than all else in the solve: there it is one kernel.
+the batch. It is written out, or, where that would take long to compile, runs block by block with a loop over the columns of a
+block. On a GPU starting these operations would dominate the solve, so it is one kernel.
 
-LAPACK does not get batches on a CPU. It takes one matrix after the other, and jaxlib before 0.11 waits within the threads that
-the batch is shared out to: once as many programs do so as there are threads, all wait for ever.
+A CPU does not use LAPACK for batches. LAPACK takes one matrix after the other, and jaxlib before 0.11 waits within the
+threads that share the batch. When as many programs wait as there are threads, they deadlock.
 """
 
 from typing import Protocol, runtime_checkable
@@ -21,14 +21,14 @@ from mjxgrad.batched.linear import add, batch_last, dot, matvec, rmatvec
 
 _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
-# Larger factorisations are not written out: they would take longer to compile than they save.
+# Larger factorisations are not written out: compiling them would take longer than they save.
 _LARGEST = 16
-# Of a larger one the columns of a block, and at most how many blocks. 23 columns in six blocks take a third of LAPACK's time and
-# in two blocks nine tenths; each block is a tenth of a second to compile.
+# Least columns of a block and largest number of blocks. 23 columns in six blocks take a third of LAPACK's time, in two blocks
+# nine tenths; each block takes a tenth of a second to compile.
 _LEAST_BLOCK = 4
 _MOST_BLOCKS = 8
 SOLUTION = "solution"
-"""Name for `jax.checkpoint` of solutions: a rollout that recomputes its steps keeps them and spares itself the solves."""
+"""Name of solutions for `jax.checkpoint`: a rollout that recomputes its steps keeps them and skips the solves."""
 
 
 def cholesky_solve(matrix: _Matrix, vector: _Vector) -> _Vector:
@@ -52,7 +52,7 @@ def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n bat
 
 @runtime_checkable
 class Operator(Protocol):
-    """A symmetric matrix, by its entries and as a map."""
+    """A symmetric matrix, with its entries and as a map."""
 
     @property
     def matrix(self) -> Float[Array, "n n"]: ...
@@ -62,10 +62,10 @@ class Operator(Protocol):
 
 @jax.custom_jvp
 def solve_positive_definite(operator: Operator, vector: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return matrix⁻¹ vector, differentiable: its derivatives are solves too, and none goes through the factorisation.
+    """Return matrix⁻¹ vector, differentiable: derivatives are solves too and do not go through the factorisation.
 
-    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through the map, in place of
-    the entries. The solution has a name, `SOLUTION`, by which reverse mode can keep it.
+    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through the map, not through
+    the entries. The solution has the name `SOLUTION`, by which reverse mode can keep it.
     """
     return batch_last(cholesky_solve)(operator.matrix, vector)
 
@@ -81,8 +81,8 @@ def _solve_jvp(primals, tangents):
 
 
 def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
-    """Return matrix⁻¹ vector, column by column; the vector goes through the factorisation as one more row."""
-    columns: list[Array] = []  # of the factor, from the diagonal down
+    """Return matrix⁻¹ vector by columns; the vector is factored along as one more row."""
+    columns: list[Array] = []  # columns of the factor, from the diagonal down
     forward: list[Array] = []
     for k in range(len(vector)):
         column, value = matrix[k:, k], vector[k]
@@ -90,7 +90,7 @@ def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
             column = column - earlier[k - j :] * earlier[k - j]
             value = value - known * earlier[k - j]
         root = jnp.sqrt(column[0])
-        # XLA keeps what was divided; products it forms anew, and all that they are made of, wherever they are used.
+        # A division, not a product with the inverse root: XLA stores quotients, but repeats products wherever they are used.
         columns.append(column / root)
         forward.append(value / root)
     solution: list[Array] = []
@@ -102,11 +102,11 @@ def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
 
 
 def in_blocks(matrix: _Matrix, vector: _Vector) -> _Vector:
-    """Return matrix⁻¹ vector, block by block of columns; the vector goes through the factorisation as one more row."""
+    """Return matrix⁻¹ vector by blocks of columns; the vector is factored along as one more row."""
     size = len(vector)
     width = max(_LEAST_BLOCK, -(-size // _MOST_BLOCKS))
     columns = jnp.concatenate([matrix, vector[:, None]], axis=1)  # first the column, then the entry
-    blocks: list[Array] = []  # of the factor, from the first entry of a block's diagonal down
+    blocks: list[Array] = []  # columns of the factor, from the first row of a block down
     for start in range(0, size, width):
         own = columns[start : start + width, start:]
         for number, block in enumerate(blocks):
@@ -123,7 +123,7 @@ def in_blocks(matrix: _Matrix, vector: _Vector) -> _Vector:
 
 
 def _factor_of(columns: Float[Array, "width rows *batch"]) -> Float[Array, "width rows *batch"]:
-    """Return the columns of the factor, from those of a matrix whose first rows are square; above its diagonal is rounding."""
+    """Return a block of the factor from the same columns of the matrix; entries above its diagonal are rounding."""
 
     def turn(k: Array, factor: Array) -> Array:
         column = columns[k] - rmatvec(factor, factor[:, k])  # zero from the k-th on
@@ -133,7 +133,7 @@ def _factor_of(columns: Float[Array, "width rows *batch"]) -> Float[Array, "widt
 
 
 def _solution_above(factor: Float[Array, "width rows *batch"], value: _Vector) -> _Vector:
-    """Return what the transpose of the factor's first rows, which are square, makes of the value."""
+    """Return L⁻ᵀ value, L the square block of the factor's first rows."""
     last = len(value) - 1
 
     def turn(done: Array, solution: Array) -> Array:

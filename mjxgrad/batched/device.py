@@ -1,12 +1,12 @@
-"""Which device a program is for, and a batch shared out over several: the one place of the library that asks.
+"""The device that a program is for, and batches split over several devices. No other module asks for the device.
 
-A processor runs operations along the batch and likes loops; a GPU spends a microsecond on starting an operation, however short.
-So several parts have two ways, and ask here which of them to take.
+A CPU runs operations along the batch and handles loops well; a GPU spends a microsecond on starting any operation. So several
+parts of the library have two implementations and choose one here.
 
-XLA runs one small operation after another, and a processor's second core idles most of that time. As two devices
+XLA runs one small operation after another, and the second core of a CPU idles most of that time. As two devices
 (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
-the cores work side by side, and wait for the slowest member of half the batch, not of all. With several GPUs the same call uses
-them all.
+the cores work in parallel, and each waits only for the slowest member of its half of the batch. With several GPUs the same call
+uses them all.
 """
 
 import functools
@@ -36,17 +36,17 @@ def all_devices() -> list[jax.Device]:
 
 
 def own_device() -> jax.Device:
-    """Return the first device of this process: of several processes each has its own."""
+    """Return the first device of this process; each process has devices of its own."""
     return jax.local_devices()[0]
 
 
 def by_platform(*args: Any, gpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
-    """Call one function on NVIDIA's GPUs and another elsewhere: a program may yet be compiled for the CPU beside the GPU."""
+    """Return a function's result on NVIDIA's GPUs and another's elsewhere, chosen when the program is compiled."""
     return jax.lax.platform_dependent(*args, cuda=gpu, default=default)
 
 
 def set_lowerings(primitive: Primitive, *, default: Callable, cpu: Callable, gpu: Callable) -> None:
-    """Set what a primitive is compiled to: on a CPU that shares the program with no other device, on a GPU, and elsewhere."""
+    """Set the implementations of a primitive: on a single CPU device, on a GPU, and elsewhere."""
 
     def on_cpu(context: mlir.LoweringRuleContext, *factors, **parameters):
         way = default if _is_shared_out(context) else cpu
@@ -58,9 +58,9 @@ def set_lowerings(primitive: Primitive, *, default: Callable, cpu: Callable, gpu
 
 
 def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
-    """Return whether XLA shares out the program over devices: it would gather all that asks for a layout."""
+    """Return whether XLA partitions the program over devices; it would gather every array with a layout constraint."""
     axes = context.module_context.axis_context
-    if hasattr(axes, "mesh"):  # in `jax.shard_map`, which shares out by some axes itself
+    if hasattr(axes, "mesh"):  # in `jax.shard_map`, which partitions by its manual axes itself
         return any(size > 1 for name, size in axes.mesh.shape.items() if name not in axes.manual_axes)
     return getattr(axes, "num_devices", 1) > 1
 
@@ -70,15 +70,15 @@ def over_devices(
 ) -> Callable[..., Any]:
     """Return `jax.vmap(function)` whose batch is split evenly over devices.
 
-    Nothing is exchanged between them. With one device it is `jax.vmap(function)`.
+    The devices exchange nothing. With one device the result is `jax.vmap(function)`.
 
     Args:
-        function: of one member of the batch; its arguments are pytrees of arrays that have the batch as leading axis.
-        devices: all of the default platform, if none are named.
-        num_shared: how many of the first arguments all members share; they have no such axis.
+        function: a function of one member of the batch; its arguments are pytrees of arrays with the batch as leading axis.
+        devices: the devices to use; by default all of the default platform.
+        num_shared: number of leading arguments that all members share; they have no batch axis.
 
     Raises:
-        ValueError: when called with arguments without one common leading axis, or one that the devices do not divide.
+        ValueError: when called with arguments without a common leading axis, or with one that the devices do not divide.
     """
 
     @functools.wraps(function)
@@ -97,8 +97,8 @@ def over_devices(
         leaves, structure = jax.tree.flatten(args)
         num_whole = len(jax.tree.leaves(args[:num_shared]))
         specs = [jax.sharding.PartitionSpec(*() if i < num_whole else ("batch",)) for i in range(len(leaves))]
-        # XLA's partitioner crashes on inputs without a number that are used (jax 0.11.2): each device makes its own. Compiled as
-        # one, what the function closes over is no input.
+        # XLA's partitioner crashes on empty inputs that are used (jax 0.11.2), so each device makes its own. Under `jax.jit`
+        # the arrays that the function closes over are no inputs.
         empty = {
             i: x.shape if i < num_whole else (size // len(own), *x.shape[1:])
             for i, x in enumerate(leaves)

@@ -1,9 +1,9 @@
 """Linear algebra of joint-space size, for many small problems at once.
 
-Arrays may carry the batch as trailing axes. Then every operation runs along whole vectors of problems, which suits processors
-with vector units and GPUs alike: on 256 problems of 12 unknowns and 24 rows a product JᵀDJ and a Cholesky solve take a
-third and a fifth of the time of their batched counterparts, which work on one small matrix after another. Sums over short
-axes are written out, since XLA does not vectorise a reduction over the batch that is left.
+Arrays may carry the batch as trailing axes. Every operation then runs along whole vectors of problems, which is fast on CPUs
+with vector units and on GPUs. On 256 problems of 12 unknowns and 24 rows a product JᵀDJ takes a third of the time of
+its batched counterpart, and a Cholesky solve a fifth. Sums over short axes are written out, since XLA does not vectorise a
+reduction along the remaining batch axis.
 """
 
 import functools
@@ -19,10 +19,10 @@ from mjxgrad.batched import device
 
 _Items = Float[Array, "n *rest"]
 _Matrix = Float[Array, "n n *batch"]
-# Longer sums are left to a matrix product: written out they would take longer to compile than they save.
+# Longer sums are matrix products: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
-# What only some of a batch need is computed for this part of it at a time.
-_FEW = 8
+# A batch is divided into so many parts where only some members need a result.
+_NUM_PARTS = 8
 
 
 def matvec(matrix: Float[Array, "m n *batch"], x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
@@ -76,12 +76,12 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
 def batch_last(function: Callable) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are one axis, the product of all: longer vectors, and arrays of lower rank.
+    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank.
     """
 
     def flat(*args: PyTree) -> PyTree:
-        # Leaves alone: the forward mode of `custom_vmap` takes a None among its arguments for an array (jax 0.10.2), and
-        # `jax.hessian` is forward mode under `jax.vmap`.
+        # Leaves, not pytrees: the forward mode of `custom_vmap`, which `jax.hessian` uses, takes a None among its arguments
+        # for an array (jax 0.10.2).
         leaves, structure = jax.tree.flatten(args)
         return _batch_last(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), None)(*leaves)
 
@@ -89,14 +89,14 @@ def batch_last(function: Callable) -> Callable:
 
 
 def _batch_last(function: Callable, batch: int | None) -> Callable:
-    """Return what `batch_last` does for a function of arrays; `batch` is the size of the trailing axis that they have."""
-    # Compiled as one, so that constants stay inside: on its own `custom_vmap` refuses to batch them, which
-    # `jax.lax.cond` asks for where its condition differs between members of the batch.
+    """Return `batch_last` of a function of arrays; `batch` is the size of their trailing axis, None without one."""
+    # Under `jax.jit` constants stay inside. `custom_vmap` refuses to batch constants, which `jax.lax.cond` requires
+    # where its condition differs between members of the batch.
     batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
     @batched.def_vmap
     def rule(size, is_batched, *leaves):
-        if not any(is_batched):  # asked for by the forward mode of `custom_vmap` where tangents alone are batched
+        if not any(is_batched):  # in forward mode, where only the tangents are batched
             result = function(*leaves)
             return result, jax.tree.map(lambda _: False, result)
 
@@ -113,51 +113,51 @@ def _batch_last(function: Callable, batch: int | None) -> Callable:
     return batched
 
 
-def on_few(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
-    """Return what a function gives where it is needed, and the default elsewhere.
+def solve_subset(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
+    """Return the function's result for the members of a batch that need it, and the default for the others.
 
-    Of a batch, the trailing axis of all arrays, an eighth is taken at a time, until none is left: for what few of its
-    members need.
+    The batch is the trailing axis of all arrays. An eighth of it is computed at a time until no member is left, which pays
+    where few members need the result.
     """
     if not is_needed.ndim:
         return jax.lax.cond(is_needed, lambda: function(*args), lambda: default)
-    count = -(-is_needed.shape[0] // _FEW)
+    count = -(-is_needed.shape[0] // _NUM_PARTS)
 
     def turn(state):
         is_left, result = state
-        few = Few(is_left, count)
-        return is_left & ~few.is_taken, few.put(result, function(*few.take(args)))
+        subset = Subset(is_left, count)
+        return is_left & ~subset.is_taken, subset.put(result, function(*subset.take(args)))
 
     return jax.lax.while_loop(lambda state: jnp.any(state[0]), turn, (is_needed, default))[1]
 
 
-class Few:
-    """Some of a batch, the trailing axis of arrays, taken out and put back.
+class Subset:
+    """A subset of a batch, the trailing axis of arrays, that can be taken out and put back.
 
-    Of those chosen the first, in their order, then others as there is room; `is_taken` says who is among them of those chosen.
+    It holds the first chosen members in their order, then others if there is room; `is_taken` marks the chosen ones in it.
     """
 
     def __init__(self, is_chosen: Bool[Array, " batch"], count: int):
-        # Of equals the first come first.
+        # `top_k` keeps equal entries in order.
         _, self._index = jax.lax.top_k(is_chosen.astype(jnp.float32), count)
         self._place = jnp.cumsum(is_chosen) - 1
         self.is_taken = is_chosen & (self._place < count)
 
     def take(self, whole: PyTree) -> PyTree:
-        """Return arrays of these alone; an axis of length one serves all."""
+        """Return the arrays of the subset; an axis of length one stays, as all members share it."""
         return jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, self._index, axis=-1, mode="clip"), whole)
 
     def put(self, whole: PyTree, part: PyTree) -> PyTree:
-        """Return the whole with the parts of those chosen in their places."""
+        """Return the whole with the taken members replaced."""
 
-        def put(one: Array, few: Array) -> Array:
-            return jnp.where(self.is_taken, jnp.take(few, self._place, axis=-1, mode="clip"), one)
+        def put(one: Array, subset: Array) -> Array:
+            return jnp.where(self.is_taken, jnp.take(subset, self._place, axis=-1, mode="clip"), one)
 
         return jax.tree.map(put, whole, part)
 
 
 def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:
-    """Return arrays with the leading batch, if they have it, as trailing axis; those of one type are moved together."""
+    """Return arrays with the batch as trailing axis; batched arrays of one type are moved in one operation."""
     moved = [
         None if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))
         for x, has_batch in zip(leaves, is_batched, strict=True)
@@ -167,7 +167,7 @@ def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[
         if has_batch:
             by_type.setdefault(leaves[place].dtype, []).append(place)
     for places in by_type.values():
-        # One array under two names is moved once.
+        # An array that occurs twice is moved once.
         distinct = {id(leaves[place]): leaves[place] for place in places}
         rows = jnp.concatenate([leaf.reshape(size, -1) for leaf in distinct.values()], axis=1).T
         start, found = 0, {}
@@ -180,7 +180,7 @@ def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[
 
 
 def runs(chosen: tuple[int, ...]) -> list[tuple[slice, slice]]:
-    """Return ascending indices as few slices: their places among all entries, and among the chosen ones."""
+    """Return ascending indices as slices: pairs of places among all entries and among the chosen ones."""
     cuts = [k for k in range(1, len(chosen)) if chosen[k] != chosen[k - 1] + 1]
     ends = zip([0, *cuts], [*cuts, len(chosen)], strict=True)
     return [(slice(chosen[a], chosen[a] + b - a), slice(a, b)) for a, b in ends if b > a]
@@ -193,14 +193,14 @@ def take(x: _Items, chosen: tuple[int, ...]) -> Float[Array, "m *rest"]:
 
 
 def add_at(x: _Items, chosen: tuple[int, ...], part: Float[Array, "m *rest"]) -> _Items:
-    """Return x with something added to entries at ascending constant indices."""
+    """Return x with `part` added to the entries at ascending constant indices."""
     for target, source in runs(chosen):
         x = _add_block(x, (target,), part[source])
     return x
 
 
 def add_to_block(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m m *batch"]) -> _Matrix:
-    """Return a matrix with something added to some rows and the same columns."""
+    """Return a matrix with `part` added to the chosen rows and columns."""
     for down, left in runs(chosen):
         for across, right in runs(chosen):
             matrix = _add_block(matrix, (down, across), part[left, right])
@@ -208,17 +208,17 @@ def add_to_block(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m
 
 
 def add_to_diagonal(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array, "m *batch"]) -> _Matrix:
-    """Return a matrix with something added to some entries of the diagonal."""
+    """Return a matrix with `part` added to the chosen entries of the diagonal."""
     for place, k in enumerate(chosen):
         matrix = _add_block(matrix, (slice(k, k + 1), slice(k, k + 1)), part[place][None, None])
     return matrix
 
 
 def _add_block(x: Array, where: tuple[slice, ...], part: Array) -> Array:
-    """Return x with something added to a block.
+    """Return x with `part` added to a block.
 
-    A CPU adds in place, and touches nothing else. A GPU spends more on starting an operation than on a
-    whole array: padded, the sum of many blocks is one operation.
+    A CPU adds in place and touches no other entry. A GPU spends more on starting an operation than on a whole array, and
+    sums many padded blocks in one operation.
     """
     if part.shape == x.shape:
         return x + part

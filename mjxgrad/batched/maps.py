@@ -1,6 +1,6 @@
-"""Linear and bilinear maps and Einstein sums of many short vectors, whose derivatives are of the same kind; see `primitives`.
+"""Linear and bilinear maps and Einstein sums of many short vectors, with derivatives of the same kind; see `primitives`.
 
-Beside them their norms, whose derivative at zero is zero where the usual one has none.
+The norms here have a derivative of zero at zero, where the usual norm has none.
 """
 
 import jax
@@ -25,7 +25,7 @@ class Bilinear:
 
 
 def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *item"]:
-    """Return the sums over items that the rows of a constant matrix ask for."""
+    """Return the weighted sums of items, one for each row of a constant matrix."""
     if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(len(matrix))):
         return x
     return primitives.linear(x, np.asarray(matrix, float))
@@ -34,7 +34,7 @@ def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *
 def pick(
     index: Int[Array | np.ndarray, " m"], x: Float[Array, "n *item"], default: np.ndarray | float = 0.0
 ) -> Float[Array, "m *item"]:
-    """Return the items of an index, and of a constant one a default where it is negative."""
+    """Return the items at an index; where a constant index is negative, the default."""
     if not isinstance(index, np.ndarray):
         return choose(index, x)
     selected = combine(index[:, None] == np.arange(len(x)), x)
@@ -46,14 +46,14 @@ def pick(
 
 @jax.custom_jvp
 def choose(index: Int[Array, "*m"], x: Float[Array, "n *item"]) -> Float[Array, "..."]:
-    """Return the items of an index that only the running program knows."""
+    """Return the items at an index that is known only at run time."""
     return x[index]
 
 
 @choose.defjvp
 def _choose_jvp(primals, tangents):
     (index, x), (_, change) = primals, tangents
-    # A sum over all items, for its transpose is no scatter; what is not chosen may have no finite derivative.
+    # A sum over all items, since the transpose of a gather is a scatter; items not chosen may have infinite derivatives.
     is_chosen = index[..., None] == jnp.arange(len(x))
     of_any = is_chosen.any(axis=tuple(range(index.ndim))).reshape(-1, *(1,) * (x.ndim - 1))
     change = jnp.where(of_any, change, 0.0)
@@ -68,7 +68,7 @@ def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
 
 @jax.custom_jvp
 def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Return items times a factor each."""
+    """Return each item times its factor."""
     return factor[:, None] * x
 
 

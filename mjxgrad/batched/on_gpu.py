@@ -1,8 +1,8 @@
-"""What a GPU does in kernels of its own: a state's whole solve by one program, which stops when that state is done.
+"""GPU kernels: a program solves one state and stops when that state is done.
 
-Written as operations on arrays with a batch, Newton's method goes on until the last state is done, 5.7 iterations on an ant where
-the mean is 1.5, and starts some thirty kernels in each. Here every state has a program that keeps J and H in registers. The
-kernels are Triton's, by `jax.experimental.pallas`: they are written with whole matrices and no entries, and so are short.
+As operations on batched arrays, Newton's method runs until the last state is done: on an ant 5.7 iterations, where the mean is
+1.5. Each iteration starts some thirty kernels. Here every state has a program that keeps J and H in registers. The kernels
+are Triton's, by `jax.experimental.pallas`; they are short, since they operate on whole matrices.
 
 Arrays have the batch as trailing axis outside the kernels, see `linear`. `interpret` runs a kernel on any device, slowly.
 """
@@ -21,17 +21,17 @@ from mjxgrad.batched import device, linear
 _Part = Float[Array, " 16"]
 _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
 
-# Matrices are eliminated in blocks of so many columns: to take a row out of one a program adds up all of it.
+# Matrices are eliminated in blocks of so many columns: a program selects a row by a sum over the whole block.
 _BLOCK, _MOST_COLUMNS = 16, 32
-# Warps of a program by the entries of J that it keeps. More than one exchange through shared memory what they add up: on a
-# humanoid with room for 12 contacts (2048 entries) 100 steps take 590 ms by one, 640 by two.
+# Number of warps by the largest number of entries of J. Several warps exchange sums through shared memory: on a humanoid
+# with room for 12 contacts (2048 entries) 100 steps take 590 ms with one, 640 with two.
 _WARPS = {2048: 1, 4096: 2, 8192: 8}
 _MOST_ROWS = 1024
 
 
 @functools.cache
 def has_kernels() -> bool:
-    """Return whether there is a GPU, and a JAX that compiles Triton's kernels for it; those after 0.11 may not."""
+    """Return whether there is a GPU and JAX compiles Triton's kernels for it, as releases after 0.11 may not."""
     if not device.is_gpu():
         return False
     try:
@@ -42,17 +42,17 @@ def has_kernels() -> bool:
 
 
 def solves(num_rows: int, num_columns: int) -> bool:
-    """Return whether `solve` takes a system of this size, and there are kernels."""
+    """Return whether there are kernels, and `solve` takes a system of this size."""
     return num_columns <= _MOST_COLUMNS and num_rows <= _MOST_ROWS and has_kernels()
 
 
 def holds(num_rows: int, num_columns: int) -> bool:
-    """Return whether a program can keep J of this size, and there are kernels."""
+    """Return whether there are kernels, and a program can keep J of this size."""
     return solves(num_rows, num_columns) and padded(num_rows) * padded(num_columns) <= max(_WARPS)
 
 
 def padded(size: int) -> int:
-    """Return the length of vectors in a kernel, a power of two."""
+    """Return the length of a vector in a kernel, a power of two."""
     return max(_BLOCK, 1 << (size - 1).bit_length())
 
 
@@ -63,13 +63,13 @@ def solve(
     scale: Float[Array, "rows batch"] | None = None,
     right: Float[Array, "rows n batch"] | None = None,
     *,
-    most_mended: float = 0.0,
+    max_shift: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "n batch"], Float[Array, "n batch"]]:
-    """Return (mass + Σ scale left rightᵀ)⁻¹ vector, the sum over rows, and the diagonal of that matrix.
+    """Return (mass + Σ scale left rightᵀ)⁻¹ vector, with the sum over rows, and the diagonal of that matrix.
 
-    The solution is not finite where the matrix, which must be symmetric, is not positive definite, and a share of its diagonal
-    below `most_mended` does not mend that. The right rows are by default the left ones; a row whose scale is zero costs little.
+    The matrix must be symmetric. The solution is not finite where the matrix is not positive definite even with a share of its
+    diagonal below `max_shift` added. The right rows default to the left ones. A row whose scale is zero costs little.
     """
 
     def kernel(mass, vector, *refs):
@@ -78,7 +78,7 @@ def solve(
         if left is not None:
             matrix = add_rows(matrix, refs[0], refs[1][...], refs[2 if right is not None else 0])
         on_diagonal[...] = diagonal(matrix)
-        solution[...] = mended(matrix, vector[...], size, most_mended)
+        solution[...] = solve_regularised(matrix, vector[...], size, max_shift)
 
     size, inputs = len(vector), [x for x in (filled(mass), vector, left, scale, right) if x is not None]
     found = run(kernel, inputs, [(vector.dtype, padded(size))] * 2, interpret=interpret)
@@ -93,12 +93,12 @@ def run(
     *,
     interpret: bool,
 ) -> list[Array]:
-    """Run a program for every state on its part of the inputs, and return its outputs, of these types and lengths.
+    """Run a program for every state on its part of the inputs, and return the outputs of these types and lengths.
 
-    The inputs are filled up with zeros to powers of two: neighbours in memory can then be read at once, and are kept by one
-    thread. The program has registers for so many entries.
+    The inputs are padded with zeros to powers of two, so that one thread reads and keeps neighbours in memory. The program
+    has registers for `num_entries` entries.
     """
-    # Imported here: no other device needs it, and it takes half a second.
+    # Imported here: only a GPU needs it, and it takes half a second.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
@@ -126,21 +126,21 @@ def _padded_to(x: Float[Array, "*shape batch"], shape: Sequence[int]) -> Array:
 
 
 def filled(matrix: Float[Array, "n n batch"]) -> Float[Array, "width width batch"]:
-    """Return a matrix filled up by a unit matrix."""
+    """Return a matrix padded with a unit matrix."""
     size, width = len(matrix), padded(len(matrix))
     beyond = jnp.diag(jnp.arange(width) >= size).astype(matrix.dtype)
     return _padded_to(matrix, (width, width)) + beyond[:, :, None]
 
 
 def blocks(ref: Any) -> _Blocks:
-    """Return a symmetric matrix in blocks, on and above its diagonal."""
+    """Return the blocks of a symmetric matrix, on and above its diagonal."""
     return _above(
         ref.shape[0] // _BLOCK, lambda b, c: ref[b * _BLOCK : (b + 1) * _BLOCK, c * _BLOCK : (c + 1) * _BLOCK]
     )
 
 
 def add_rows(matrix: _Blocks, left: Any, scale: Float[Array, " rows"], right: Any) -> _Blocks:
-    """Return a matrix plus Σ scale left rightᵀ, the sum over rows of two inputs, those alone whose scale is not zero."""
+    """Return a matrix plus Σ scale left rightᵀ, summed over the rows whose scale is not zero."""
     number = jnp.arange(len(scale), dtype=jnp.int32)
 
     def after(row: Array) -> Array:
@@ -159,7 +159,7 @@ def add_rows(matrix: _Blocks, left: Any, scale: Float[Array, " rows"], right: An
 
 
 def add_to_diagonal(matrix: _Blocks, vector: Float[Array, " width"]) -> _Blocks:
-    """Return a matrix plus something on its diagonal."""
+    """Return a matrix with a vector added to its diagonal."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def block(b: int, c: int) -> Array:
@@ -180,10 +180,12 @@ def solve_blocks(matrix: _Blocks, vector: Float[Array, " width"], size: int) -> 
     return join(_solve(matrix, [_part(vector, b) for b in range(len(matrix))], size))
 
 
-def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mended: float) -> Float[Array, " width"]:
-    """Return matrix⁻¹ vector, with the least share of its diagonal added that makes it positive definite."""
+def solve_regularised(
+    matrix: _Blocks, vector: Float[Array, " width"], size: int, max_shift: float
+) -> Float[Array, " width"]:
+    """Return matrix⁻¹ vector, with the smallest share of the diagonal added that makes the matrix positive definite."""
     found, own = solve_blocks(matrix, vector, size), diagonal(matrix)
-    if not most_mended:
+    if not max_shift:
         return found
     can_be = is_finite(own) & is_finite(vector)
 
@@ -193,13 +195,13 @@ def mended(matrix: _Blocks, vector: Float[Array, " width"], size: int, most_mend
 
     def goes_on(carry):
         share, found = carry
-        return can_be & ~is_finite(found) & (next_share(share) < most_mended)
+        return can_be & ~is_finite(found) & (next_share(share) < max_shift)
 
     return jax.lax.while_loop(goes_on, attempt, (jnp.zeros((), vector.dtype), found))[1]
 
 
 def next_share(share: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the share of a diagonal to add next: rounding, then four times as much each time."""
+    """Return the next share of the diagonal to add: first rounding, then four times the last share."""
     return jnp.maximum(4 * share, float(jnp.finfo(share.dtype).eps))
 
 
@@ -246,7 +248,7 @@ def _solve(matrix: _Blocks, vector: list[_Part], size: int) -> list[_Part]:
 
 
 def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part:
-    """Return matrix⁻¹ vector by Gauss and Jordan's elimination."""
+    """Return matrix⁻¹ vector by Gauss-Jordan elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def eliminate(pivot, carry):
@@ -261,12 +263,12 @@ def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part
 
 
 def _inverse(matrix: Float[Array, "16 16"]) -> Float[Array, "16 16"]:
-    """Return the inverse by the same elimination."""
+    """Return the inverse by Gauss-Jordan elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def eliminate(pivot, entries):
         row, column, inverse = _cross(entries, pivot)
-        # They become those of the inverse.
+        # Row and column of the pivot become those of the inverse.
         rest = jnp.where((index == pivot)[:, None] | (index == pivot)[None], 0.0, entries)
         row, column = jnp.where(index == pivot, 1.0, row), jnp.where(index == pivot, -1.0, column)
         return rest - (column * inverse)[:, None] * row[None]
@@ -275,11 +277,11 @@ def _inverse(matrix: Float[Array, "16 16"]) -> Float[Array, "16 16"]:
 
 
 def _cross(matrix: Float[Array, "16 16"], pivot: Array) -> tuple[_Part, _Part, Array]:
-    """Return row and column of a pivot, and its inverse."""
+    """Return the row and the column of a pivot, and the pivot's inverse."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
     row = jnp.where((index == pivot)[:, None], matrix, 0.0).sum(axis=0)
     column = jnp.where((index == pivot)[None], matrix, 0.0).sum(axis=1)
-    # By the root, so that a pivot that is not positive spoils all.
+    # Through the root, so that a pivot that is not positive makes the result non-finite.
     return row, column, jax.lax.rsqrt(jnp.where(index == pivot, column, 0.0).sum()) ** 2
 
 

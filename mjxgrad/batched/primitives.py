@@ -1,17 +1,16 @@
-r"""Sums of products of many short vectors, as primitives of JAX that derive and compile well.
+r"""Sums of products of many short vectors, as JAX primitives with fast derivatives and short compilation.
 
-Their derivatives are sums of the same kind. A cross product is written in components: slices, products, one concatenation.
-JAX's derivative of a slice, though, is a padded array, and the sum of many of those is what makes reverse mode slow; and that of
-a gather is a scatter, which XLA's CPU back end does one by one.
+Their derivatives are sums of the same kind. Components written out would be slices, products and a concatenation. JAX's
+derivative of a slice, though, is a padded array, and sums of many of these make reverse mode slow. The derivative of a gather
+is a scatter, which XLA's CPU backend runs entry by entry.
 
-**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory: an operation then runs along whole vectors of
-states, and one of a state's numbers is one piece of memory. XLA takes over a layout from one operation to the next, so it is
-enough that all primitives ask for it, of what they take and of what they give: a hopper's gradient takes less than half the
-time. A product of matrices would want the batch first, so Einstein sums are written out.
+**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory. Operations then run along whole vectors of
+states, and each number of a state is contiguous over the batch. XLA propagates layouts, so it suffices that all primitives
+request this one for their inputs and outputs: a hopper's gradient takes less than half the time. A matrix product would need
+the batch first, so Einstein sums are written out.
 
-**On a GPU** an operation takes a microsecond however short it is, and a slice of an array that is used elsewhere, or the
-transpose that a product of matrices asks for, is one. There linear and bilinear maps are sums of gathers, which are fused with
-what is before and after.
+**On a GPU** any operation takes at least a microsecond, and so does a slice of an array with other uses, or the transpose that
+a matrix product needs. There linear and bilinear maps are sums of gathers, which XLA fuses with their neighbours.
 """
 
 import inspect
@@ -32,23 +31,23 @@ from mjxgrad.batched.linear import LONGEST_SUM, add
 
 # (entry of the result, entry of the first factor, entry of the second, coefficient)
 Term = tuple[int, int, int, float]
-# Terms of a sum up to which a GPU gathers them; more are a product of matrices.
+# Longest sum that a GPU gathers; a longer one is a matrix product.
 _MOST_GATHERED = 32
-# Terms of all sums together up to which they are slices, each with an operation of its own to compile.
+# Largest total number of terms that are sliced, since each slice is an operation to compile.
 _MOST_SLICED = 96
-# Terms of a gathered sum up to which what they are made of is computed within it, for each of them in turn.
+# Longest gathered sum that is fused with its inputs, which XLA then computes again for every term.
 _MOST_FUSED = 4
 
 
 def bilinear(
     a: Float[Array, "*n i"], b: Float[Array, "*n j"], terms: tuple[Term, ...], size: int
 ) -> Float[Array, "*n size"]:
-    """Return the sums of products along the last axis that `ordered` terms ask for; factors have the same leading axes."""
+    """Return sums of products along the last axis, as given by `ordered` terms; factors have the same leading axes."""
     return _bilinear.bind(a, b, terms=terms, size=size, batch=0)
 
 
 def linear(x: Float[Array, "n *item"], matrix: np.ndarray) -> Float[Array, "m *item"]:
-    """Return the sums over items that the rows of a constant matrix ask for."""
+    """Return the weighted sums of items, one for each row of a constant matrix."""
     return _linear.bind(x, matrix=_Matrix(np.asarray(matrix, float)), batch=0)
 
 
@@ -57,7 +56,7 @@ def contract(a: Array, b: Array, subscripts: str) -> Array:
     return _contract.bind(a, b, subscripts=_Subscripts(*subscripts.replace("->", ",").split(",")), batch=0)
 
 
-# What all have in common. The first `batch` axes of all arrays are those of `jax.vmap`.
+# Shared by all primitives. The first `batch` axes of all arrays are those of `jax.vmap`.
 
 
 def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
@@ -88,7 +87,7 @@ def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) ->
 
 
 def _batch_last(x: Array, batch: int) -> Array:
-    """Return the same, laid out in memory with the batch last."""
+    """Return the array, laid out in memory with the batch last."""
     if not 0 < batch < x.ndim:
         return x
     return with_layout_constraint(x, Layout(major_to_minor=(*range(batch, x.ndim), *range(batch))))
@@ -98,7 +97,7 @@ def _batch_last(x: Array, batch: int) -> Array:
 
 
 def ordered(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """Return the terms by entry of the result, those that are added before those that are subtracted."""
+    """Return the terms sorted by entry of the result, added terms before subtracted ones."""
     return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
 
 
@@ -119,11 +118,11 @@ def _bilinear_by_slices(a: Array, b: Array, *, terms: tuple[Term, ...], size: in
 
 
 def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
-    """Return the same: of all entries the first terms, then the second ones, and so on."""
+    """Return the same map as sums of gathers: the first terms of all entries, then the second ones, and so on."""
     by_entry = [[term for term in terms if term[0] == k] for k in range(size)]
     layers = []
     for layer in range(max(map(len, by_entry), default=0)):
-        # Filled up by what an entry has anyway: nothing else may spoil it.
+        # Missing terms repeat a term of the same entry with weight zero, so that no other entry can make it NaN.
         chosen = [
             of_one[layer] if layer < len(of_one) else (*(of_one or [(k, 0, 0)])[0][:3], 0.0)
             for k, of_one in enumerate(by_entry)
@@ -137,7 +136,7 @@ def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: i
 
 
 def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
-    """Return sums, zero where there is nothing to add up."""
+    """Return sums, zero where there are no terms."""
     return total if has_terms.all() else jnp.where(has_terms, total, 0.0)
 
 
@@ -204,14 +203,14 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
 
 
 def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
-    # The batch last, as it is in memory on a CPU.
+    # The batch last, as in a CPU's memory.
     x = jnp.moveaxis(x, range(batch), range(x.ndim - batch, x.ndim))
     product = jnp.tensordot(jnp.asarray(matrix.entries, x.dtype), x, axes=1, precision="highest")
     return jnp.moveaxis(product, range(x.ndim - batch, x.ndim), range(batch))
 
 
 def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
-    """Return the same: of all sums the first terms, then the second ones, and so on; those of many terms apart."""
+    """Return the same map as sums of gathers, as for bilinear maps; sums of many terms are formed separately."""
     rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
     count = (rows != 0).sum(axis=1)
     order = np.argsort(count, kind="stable")
@@ -224,14 +223,14 @@ def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
 
 
 def _where_longer(count: np.ndarray) -> list[int]:
-    """Return where to split sums, whose numbers of terms ascend, as all of a part take as long as its longest one."""
+    """Return where to split sums sorted by length, since every sum of a part costs as much as its longest one."""
     lengths = [n * count[n - 1] + (len(count) - n) * count[-1] for n in range(1, len(count))]
     best = int(np.argmin(lengths)) if lengths else 0
     return [best + 1] if lengths and 2 * lengths[best] <= len(count) * count[-1] else []
 
 
 def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
-    """Return sums of about as many terms each."""
+    """Return sums of similar lengths."""
     is_term = rows != 0
     count = int(is_term.sum(axis=1).max(initial=0))
     if not 0 < count <= _MOST_GATHERED:
@@ -264,7 +263,7 @@ ad.deflinear2(_linear, _transpose_linear)
 
 
 class _Subscripts(NamedTuple):
-    """One letter for each axis, but those of the batch, of both factors and of the result."""
+    """One letter for each axis of both factors and of the result, without the axes of the batch."""
 
     first: str
     second: str
@@ -275,7 +274,7 @@ class _Subscripts(NamedTuple):
         return "".join(letter for letter in self.first if letter not in self.result)
 
     def sizes(self, a: Any, b: Any, batch: int) -> dict[str, int]:
-        """Return how long the axis of each letter is."""
+        """Return the length of each letter's axis."""
         return dict(zip(self.first + self.second, (*a.shape[batch:], *b.shape[batch:]), strict=True))
 
 
@@ -286,7 +285,7 @@ def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch:
         return _contract_by_product(a, b, subscripts=subscripts, batch=batch)
 
     def at(x: Array, letters: str, place: dict[str, int]) -> Array:
-        """Return the entries at a place of the letters that are summed, with one axis for each letter of the result."""
+        """Return the entries at a place of the summed letters, with one axis for each letter of the result."""
         chosen = x[(..., *(place.get(letter, slice(None)) for letter in letters))]
         kept = [letter for letter in letters if letter not in place]
         order = [batch + kept.index(letter) for letter in subscripts.result if letter in kept]

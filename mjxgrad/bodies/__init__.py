@@ -1,4 +1,4 @@
-"""Rigid bodies: trees of joints, turns, masses and forces, with tendons and actuators; all of a step that is no constraint."""
+"""Rigid bodies: joint trees, orientations, inertia, forces, tendons and actuators; the unconstrained part of a step."""
 
 from mjxgrad.bodies.constants import set_const
 

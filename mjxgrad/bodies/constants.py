@@ -1,7 +1,7 @@
-"""What MuJoCo computes from masses, inertias, lengths and sizes when it compiles a model, computed again from the present ones.
+"""Constants that MuJoCo's compiler derives from masses, inertias, lengths and sizes, computed again from the present values.
 
-The regularisation of constraint rows is scaled by inverse weights at the reference pose: without them a derivative by a mass is
-that of half the model. MuJoCo's own is `mj_setConst`, and for the bounding radii its compiler.
+The regularisation of constraint rows is scaled by inverse weights at the reference pose. Without them a derivative by a mass
+would miss that part of the model. MuJoCo computes them in `mj_setConst`, and the bounding radii in its compiler.
 """
 
 import jax
@@ -13,32 +13,32 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import forces, kinematics, tree
 
-# What they follow from, `geom_size` excepted, which only the bounding radii do.
+# Fields that the constants depend on, without `geom_size`, which only the bounding radii depend on.
 CAUSES = {
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat", "dof_armature"),
     *("jnt_pos", "jnt_axis", "qpos0", "site_pos", "tendon_armature", "actuator_gear"),
 }
 _Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
-# MuJoCo's mark of a body that hangs on the world by slides along the axes and carries no other: it counts by its mass alone.
+# `body_simple` of a childless body on slides along the world's axes: only its mass counts.
 _SLIDING = 2
 
 
 def set_const(model: mjx.Model) -> mjx.Model:
     """Return the model with the constants that follow from its masses, inertias, lengths and sizes.
 
-    Those are `body_subtreemass`, `body_invweight0`, `dof_invweight0`, `dof_M0`, `tendon_invweight0`, `tendon_length0`,
-    `actuator_acc0` and, of primitive geoms, `geom_rbound`. Differentiable with respect to all that they follow from, traceable,
-    and for batches under `jax.vmap`. The masses and inertias that MuJoCo's compiler derives from a geom's size or density
-    are inputs here: a changed size changes no mass.
+    The constants are `body_subtreemass`, `body_invweight0`, `dof_invweight0`, `dof_M0`, `tendon_invweight0`, `tendon_length0`,
+    `actuator_acc0` and, for primitive geoms, `geom_rbound`. The function is traceable, differentiable with respect to all that
+    they depend on, and works under `jax.vmap`. Masses and inertias are inputs here, although MuJoCo's compiler may derive them
+    from a geom's size or density: a changed size changes no mass.
 
     Args:
-        model: of MJX's JAX implementation.
+        model: a model of MJX's JAX implementation.
     """
     return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
 
 
 def constants_of(model: mjx.Model) -> dict[str, Array]:
-    """Return these constants by name."""
+    """Return the constants of `set_const` by name."""
     with jax.default_matmul_precision("highest"):
         data = kinematics.up_to_inertia(model, mjx.make_data(model).replace(qpos=model.qpos0))
         mass = mjx.full_m(model, data)
@@ -61,7 +61,7 @@ def constants_of(model: mjx.Model) -> dict[str, Array]:
 
 
 def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"]) -> Float[Array, "nbody 2"]:
-    """Return what a unit force and a unit torque on each body's centre of mass accelerate it by, in the mean over directions."""
+    """Return each body's mean acceleration over directions, under a unit force and under a unit torque at its centre of mass."""
     moves = jnp.asarray(tree.moving_dofs(model), inverse.dtype)[:, :, None]
     turning, moving = data.cdof[None, :, :3] * moves, data.cdof[None, :, 3:] * moves
     lever = data.xipos - data.subtree_com[np.asarray(model.body_rootid)]
@@ -73,7 +73,7 @@ def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"])
 
 
 def _of_dofs(model: mjx.Model, inverse: Float[Array, "nv nv"]) -> Float[Array, " nv"]:
-    """Return the diagonal, of ball joints and of both halves of free joints in the mean."""
+    """Return the diagonal of the inverse, averaged over a ball joint and over each half of a free joint."""
     mean = np.zeros((model.nv, model.nv))
     for kind, first in zip(model.jnt_type, model.jnt_dofadr, strict=True):
         widths = {_Joint.mjJNT_FREE: (3, 3), _Joint.mjJNT_BALL: (3,)}.get(_Joint(kind), (1,))
@@ -83,7 +83,7 @@ def _of_dofs(model: mjx.Model, inverse: Float[Array, "nv nv"]) -> Float[Array, "
 
 
 def bounding_radii(model: mjx.Model) -> Float[Array, " ngeom"]:
-    """Return the radius of a sphere about each primitive geom (m), of others as it is; planes have none."""
+    """Return the bounding radius of each primitive geom (m); other geoms keep theirs."""
     radius, half, depth = model.geom_size.T
     of_kind = {
         _Geom.mjGEOM_SPHERE: radius,

@@ -1,7 +1,7 @@
-"""Actuation, passive and applied forces, for the models in which they are plain.
+"""Actuation, passive and applied forces of common models.
 
-Drop-ins for MJX's stages. Whatever a model has beyond actuators of hinges and slides without dynamics, joint springs
-and dampers, is left to MJX: each function says what.
+Drop-ins for MJX's stages. They compute actuators without dynamics on hinges and slides, joint springs and dampers. Each
+function says what it leaves to MJX.
 """
 
 import jax.numpy as jnp
@@ -22,14 +22,14 @@ _BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def _drives_axes(model: mjx.Model) -> bool:
-    """Whether all actuators act on hinges and slides."""
+    """Return whether all actuators act on hinges and slides."""
     if not np.isin(model.actuator_trntype, _ON_JOINTS).all():
         return False
     return bool(np.isin(model.jnt_type[model.actuator_trnid[:, 0]], _ON_AXES).all())
 
 
 def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find lengths and moments of actuators; as `mjx.transmission`, to which all but hinges and slides are left."""
+    """Compute lengths and moments of actuators; a drop-in for `mjx.transmission`, which takes all but hinges and slides."""
     if not model.nu or not _drives_axes(model):
         return mended.transmission(model, data)
     gear, joint = model.actuator_gear[:, 0], model.actuator_trnid[:, 0]
@@ -40,7 +40,7 @@ def transmission(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find velocities, passive forces and bias forces; a drop-in for `mjx.fwd_velocity`."""
+    """Compute velocities, passive forces and bias forces; a drop-in for `mjx.fwd_velocity`."""
     if model.nu:
         rate = contract("uv,v->u", data._impl.actuator_moment, data.qvel)
         data = data.tree_replace({"_impl.actuator_velocity": rate})  # pyright: ignore[reportAssignmentType]
@@ -52,13 +52,13 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find spring and damper forces; a drop-in for `mjx.passive` whose springs have their derivative at rest.
+    """Compute spring and damper forces; a drop-in for `mjx.passive` whose springs are differentiable at rest.
 
     Gravity compensation and media are left to MJX.
     """
     flags = model.opt.disableflags
     none = jnp.zeros_like(data.qvel)
-    # MJX leaves out all where either is disabled.
+    # MJX drops all passive forces where either is disabled.
     if flags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
         return data.replace(qfrc_passive=none, qfrc_gravcomp=none)
     force = _springs(model, data.qpos) - model.dof_damping * data.qvel
@@ -74,9 +74,9 @@ def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _tendon_forces(model: mjx.Model, data: mjx.Data) -> Float[Array, " tendons"]:
-    """Return the pull of springs and dampers; at an end of the lengths without force the spring's derivative is one-sided."""
+    """Return spring and damper forces; at an end of the slack interval the derivative is that of the stretched side."""
     shortest, longest = model.tendon_lengthspring.T
-    # Not MJX's strict comparison: where both ends are one, that leaves a spring at rest without stiffness.
+    # MJX compares strictly: with equal ends a spring at rest would have no stiffness.
     stretch = jnp.where(data.ten_length <= shortest, data.ten_length - shortest, 0.0)
     stretch = jnp.where(data.ten_length >= longest, data.ten_length - longest, stretch)
     return -model.tendon_stiffness * stretch - model.tendon_damping * data._impl.ten_velocity
@@ -100,9 +100,9 @@ def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]
 
 
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find actuator forces; a drop-in for `mjx.fwd_actuation`.
+    """Compute actuator forces; a drop-in for `mjx.fwd_actuation`.
 
-    For motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
+    It computes motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
     """
     if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION:
         return mended.fwd_actuation(model, data)
@@ -122,7 +122,7 @@ def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _with_tendon_limits(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find forces of which those on a tendon are limited together: MJX divides by their sum, though it be zero."""
+    """Compute forces under limits on the sum per tendon; MJX divides by that sum even where it is zero."""
     tendons = np.flatnonzero(model.tendon_actfrclimited)
     limits = ("tendon_actfrclimited", "actuator_forcelimited")
     data = mended.fwd_actuation(model.replace(**{x: np.zeros_like(getattr(model, x)) for x in limits}), data)
@@ -136,7 +136,7 @@ def _with_tendon_limits(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _actuated(model: mjx.Model, data: mjx.Data, force: Float[Array, " nu"]) -> mjx.Data:
-    """Return data with the forces of actuators within their limits, and what they do to joints within theirs."""
+    """Return data with clamped actuator forces, and clamped joint forces that result."""
     force = _clamp(force, model.actuator_forcelimited, model.actuator_forcerange)
     total = contract("uv,u->v", data._impl.actuator_moment, force)
     if model.flg_gravcomp:
@@ -149,7 +149,7 @@ def _actuated(model: mjx.Model, data: mjx.Data, force: Float[Array, " nu"]) -> m
 
 
 def _is_plain(model: mjx.Model) -> bool:
-    """Whether forces are those of motors or servos without dynamics."""
+    """Return whether all actuators are motors or servos without dynamics."""
     return bool(
         not model.na
         and not model.flg_gravcomp
@@ -167,7 +167,7 @@ def _clamp(x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "
 
 
 def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Add up all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
+    """Sum all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
 
     `xfrc_applied` acts at the bodies' centres of mass (N, N m). Derivatives go through the bodies, not through the entries of M.
     """

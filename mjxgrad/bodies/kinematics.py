@@ -1,13 +1,13 @@
 r"""Kinematics, inertia and bias forces: the smooth stages of a step, without recursion.
 
 MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
-Then nothing has to be transformed between bodies, and what is usually a recursion over the tree is a sum over
-ancestors or descendants: a product with a constant 0/1 matrix. Only orientations multiply; their products from the
-root are formed by doubling, in a number of rounds that is logarithmic in the depth of the tree.
+No quantity is transformed between bodies, so the usual recursion over the tree becomes a sum over ancestors or descendants:
+a product with a constant 0/1 matrix. Only orientations multiply. Their products from the root are formed by doubling, in a
+number of rounds that is logarithmic in the depth of the tree.
 
-MJX walks the tree level by level and gathers and scatters between levels, which reverse mode multiplies. The stages
-here fill the same fields of `mjx.Data` with the same values. One difference is meant: bodies fixed to a mocap body
-follow it, as in C MuJoCo.
+MJX walks the tree level by level and gathers and scatters between levels, which is slow in reverse mode. The stages here
+fill the same fields of `mjx.Data` with the same values. One difference is intended: bodies fixed to a mocap body follow it,
+as in C MuJoCo.
 
 References:
     Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.
@@ -37,7 +37,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def up_to_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Run the stages from the position to the mass matrix; those of tendons are MJX's."""
+    """Run the stages from the position to the mass matrix; the stages of tendons are MJX's."""
     data = com_pos(model, kinematics(model, data))
     if not model.ntendon:
         return crb(model, data)
@@ -66,7 +66,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     xpos, xanchor = positions[: model.nbody], positions[model.nbody :]
 
     def place(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
-        """Return world position and orientation of what is fixed to bodies."""
+        """Return world positions and orientations of frames fixed to bodies."""
         last = frames.of_body[body]
         return pick(body, xpos) + turned.rotate(last, pos), turned.compose(last, spatial.rotation_matrix(quat))
 
@@ -87,7 +87,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _joint_motion(
     model: mjx.Model, qpos: _Position
 ) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
-    """Return normalised positions and, for each joint, its quaternion, way along its axis, and position if free."""
+    """Return normalised positions and each joint's quaternion, displacement along its axis, and position if free."""
     dtype = qpos.dtype
     kept, turns, ways, origins = [], [], [], []
     for run in tree.joint_runs(model):
@@ -116,7 +116,7 @@ def _joint_motion(
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find `subtree_com`, `cinert` and `cdof` of posed bodies, with mass or without; a drop-in for `mjx.com_pos`."""
+    """Compute `subtree_com`, `cinert` and `cdof`, also of massless bodies; a drop-in for `mjx.com_pos`."""
     mass = model.body_mass
     moments = jnp.concatenate([maps.scale(mass, data.xipos), mass[:, None]], axis=1)
     sums = combine(tree.descendants(model), moments)
@@ -130,7 +130,7 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"]) -> Float[Array, "nv 6"]:
-    """Return the motion of unit joint velocities about the centre of mass of their tree."""
+    """Return the motions of unit joint velocities about the centre of mass of their tree."""
     angular, linear = [], []
     for run in tree.joint_runs(model):
         axis = data.xaxis[run.joints]
@@ -157,7 +157,7 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
 
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find velocities of bodies `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
+    """Compute body velocities `cvel` and rates of joint axes `cdof_dot`; a drop-in for `mjx.com_vel`."""
     motion = maps.scale(data.qvel, data.cdof)
     sums = combine(np.concatenate([tree.moving_dofs(model), tree.earlier_dofs(model)]), motion)
     velocity, before = sums[: model.nbody], sums[model.nbody :]
@@ -165,10 +165,10 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find the mass matrix from composite inertias; a drop-in for `mjx.crb`.
+    """Compute the mass matrix from composite inertias; a drop-in for `mjx.crb`.
 
-    M_ij = cdof_i · I_i cdof_j with I_i the inertia of all that joint i carries, for j an ancestor of i or i itself. `M` is in
-    whichever of MJX's two formats the data has.
+    M_ij = cdof_i · I_i cdof_j, with I_i the inertia of all bodies that joint i carries, for j an ancestor of i or i itself. `M`
+    keeps the format of the data, either of MJX's two.
     """
     if data._impl.M.ndim == 1:
         return mjx.crb(model, data)
@@ -186,7 +186,7 @@ def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find gravity, Coriolis and centrifugal forces, `qfrc_bias`, which keep the acceleration at zero; as `mjx.rne`."""
+    """Compute gravity, Coriolis and centrifugal forces, `qfrc_bias`; a drop-in for `mjx.rne`."""
     acceleration = combine(tree.moving_dofs(model), maps.scale(data.qvel, data.cdof_dot))
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         upwards = -jnp.asarray(model.opt.gravity, acceleration.dtype)
@@ -198,17 +198,16 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbody 6"]) -> _Vector:
-    """Return the joint forces that do the same work as forces on bodies, about the centre of mass of their tree."""
+    """Return the joint forces equivalent to forces on bodies, given about the centre of mass of their tree."""
     carried = combine(tree.moving_dofs(model).T, force)
     return maps.dot(data.cdof, carried)
 
 
 class Bodies(eqx.Module):
-    """Bodies in motion, by which the mass matrix is applied without being formed.
+    """The mass matrix as a product over bodies, applied without being formed.
 
-    M a is the force that gives the bodies of a tree the accelerations that joint accelerations a make of them: sums over
-    ancestors, a product with each body's inertia, sums over descendants, as in `rne`. Its derivative is of the same kind,
-    where that of the matrix is a matrix. `moves` has the joint velocities that move each body.
+    M a is computed as in `rne`: sums over ancestors give the bodies' accelerations, their inertias the forces, and sums over
+    descendants the joint forces. The derivative has the same form. `moves` lists the joint velocities that move each body.
     """
 
     inertia: Float[Array, "nbody 10 *batch"]
@@ -227,7 +226,7 @@ class Bodies(eqx.Module):
 
 
 class Inertia(eqx.Module):
-    """M: its entries, and the bodies it is made of, if nothing else adds to it. Derivatives go through these."""
+    """The mass matrix M: its entries and, unless tendons add to it, its bodies. Derivatives go through the bodies."""
 
     matrix: Float[Array, "nv nv *batch"]
     bodies: Bodies | None = None
@@ -247,10 +246,10 @@ class Inertia(eqx.Module):
 
 
 def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
-    """Return M of data with its mass matrix filled in."""
+    """Return M of data whose mass matrix is filled in."""
     matrix = mjx.full_m(model, data)
     if model.ntendon or data._impl.M.ndim == 1:
-        # Tendons have armature of their own; the sparse format is MJX's.
+        # The armature of tendons is not in `Bodies`, and the sparse format is MJX's.
         return Inertia(matrix)
     moves = tuple(tuple(int(dof) for dof in np.nonzero(row)[0]) for row in tree.moving_dofs(model))
     armature = jnp.asarray(model.dof_armature, matrix.dtype)
@@ -260,7 +259,7 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
 def integrate_position(
     model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
 ) -> _Position:
-    """Return the position after moving at constant joint velocity for a time (s); quaternions turn in their own frame."""
+    """Return the position after a duration (s) at constant joint velocity; quaternions turn in their own frame."""
     places = _places(model)
     if not places.quaternions.size:
         return qpos + duration * qvel
@@ -271,7 +270,7 @@ def integrate_position(
 
 
 def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
-    """Return the velocity that moves one position to another in unit time, by the shorter turns of quaternions.
+    """Return the velocity that moves one position to another in unit time; quaternions take the shorter turn.
 
     The inverse of `integrate_position`.
     """
@@ -284,9 +283,13 @@ def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vect
 
 
 class _Places(NamedTuple):
-    """Of each coordinate the joint velocity that adds to it and its entry among those of quaternions, -1 for none.
+    """Index arrays between coordinates, joint velocities and quaternions; -1 for none.
 
-    And of the entries of quaternions and of turning joints the places among coordinates and among joint velocities.
+    Attributes:
+        dof: joint velocity that adds to each coordinate.
+        entry: place of each coordinate among the entries of quaternions.
+        quaternions: coordinates of the entries of quaternions.
+        turns: joint velocities of ball joints and of the rotations of free joints.
     """
 
     dof: Int[np.ndarray, " nq"]
@@ -312,7 +315,7 @@ def _places(model: mjx.Model) -> _Places:
 
 
 def _inverse(index: Int[np.ndarray, " n"], size: int) -> Int[np.ndarray, " size"]:
-    """Return where in an index each place is, -1 where it is not."""
+    """Return the position of each place in an index, -1 where it is missing."""
     inverse = np.full(size, -1)
     inverse[index[index >= 0]] = np.flatnonzero(index >= 0)
     return inverse

@@ -1,17 +1,17 @@
-"""MJX's functions with what spoils their derivatives mended; MJX itself stays as it is.
+"""Copies of MJX's functions with finite derivatives; MJX itself is not changed.
 
-Guards that keep a value finite do not always keep its derivative. `x + eps * (x == 0)` lets 1e-21 through, and a quotient's
-derivative divides by its square: infinite in single precision, and infinity times the zero of a branch that is not taken is NaN.
-Such guards lie deep within MJX. This module makes copies of the modules that hold them, puts other functions in the place of a
-few of theirs, and has the copies call each other. That is less than to write their callers anew, and touches no program that
-uses MJX beside this library. Values are MJX's to the bit but where a guard acts, and where it says otherwise:
+Guards that keep a value finite do not always keep its derivative finite. `x + eps * (x == 0)` lets 1e-21 through, and the
+derivative of a quotient divides by its square, which overflows in single precision. Infinity times the zero of a branch not
+taken is NaN. Such guards lie deep within MJX. This module copies the modules that hold them, replaces a few functions, and lets
+the copies call each other. That is shorter than new callers, and leaves other users of MJX alone. Values are MJX's to the bit,
+except where a guard acts and where the list says otherwise:
 
-- `collision_convex`, in `contact.collision`: where an edge meets a plane, and one face another, two quotients.
-- `support.muscle_dynamics_timescale`: its soft switch, a quintic of a quotient by a width that is zero by default.
-- `support.wrap`: see `wrapping`, whose values are those of C MuJoCo.
-- `math.quat_to_axis_angle`: axis and angle apart have no derivative at rest, so that servos lost theirs. Rounding differs.
-- `math.safe_div`, `ray._ray_quad`: rays that run along a face, or miss a ball, have a distance without derivative.
-- `ray.ray`: fails in a scene without materials.
+- `collision_convex`, in `contact.collision`: two quotients, where an edge meets a plane and where a face meets another.
+- `support.muscle_dynamics_timescale`: the smooth switch, a quintic in a quotient by a width that is zero by default.
+- `support.wrap`: see `wrapping`, with the values of C MuJoCo.
+- `math.quat_to_axis_angle`: separate axis and angle have no derivative at rest, so servos lost theirs. Rounding differs.
+- `math.safe_div`, `ray._ray_quad`: the distance along rays that run along a face, or miss a ball, had no derivative.
+- `ray.ray`: it fails in a scene without materials.
 """
 
 import importlib.util
@@ -33,10 +33,10 @@ _Scalar = Float[Array, "..."]
 
 
 def copy_of(name: str, **replaced: Callable | ModuleType) -> ModuleType:
-    """Return a copy of one of MJX's modules in which names mean something else.
+    """Return a copy of one of MJX's modules with some names replaced.
 
     Raises:
-        ImportError: if the module has no such name: then this is not the MJX that was mended.
+        ImportError: if the module has no such name, as in another release of MJX.
     """
     spec = sys.modules[f"mujoco.mjx._src.{name}"].__spec__
     module = importlib.util.module_from_spec(spec)  # pyright: ignore[reportArgumentType]
@@ -48,7 +48,7 @@ def copy_of(name: str, **replaced: Callable | ModuleType) -> ModuleType:
 
 
 def _muscle_dynamics_timescale(dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Scalar, width: _Scalar) -> _Scalar:
-    """Return the time constant of a muscle (s), which switches at once or within a width of the control."""
+    """Return the time constant of a muscle (s), which switches at once or over a width of the control."""
     is_hard = width < mujoco.mjMINVAL
     x = jnp.clip(dctrl / jnp.where(is_hard, 1.0, width) + 0.5, 0, 1)
     smooth = tau_deact + (tau_act - tau_deact) * (x * x * x * (3 * x * (2 * x - 5) + 10))
@@ -56,12 +56,12 @@ def _muscle_dynamics_timescale(dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Sca
 
 
 def _safe_div(num: _Scalar, den: _Scalar) -> _Scalar:
-    """Return a quotient; denominators near zero are MuJoCo's smallest number, of their sign."""
+    """Return a quotient; a denominator near zero is replaced by MuJoCo's smallest number with its sign."""
     return num / jnp.where(jnp.abs(den) >= mujoco.mjMINVAL, den, jnp.where(den < 0, -1, 1) * mujoco.mjMINVAL)
 
 
 def _ray_quad(a: _Scalar, b: _Scalar, c: _Scalar) -> tuple[_Scalar, _Scalar]:
-    """Return the solutions of a x² + 2 b x + c = 0 that are not negative, infinity in place of others."""
+    """Return the non-negative solutions of a x² + 2 b x + c = 0, and infinity in place of others."""
     square = b * b - a * c
     is_real, root = square >= mujoco.mjMINVAL, safe_sqrt(square)
     found = (_safe_div(-b - root, a), _safe_div(-b + root, a))
@@ -69,12 +69,12 @@ def _ray_quad(a: _Scalar, b: _Scalar, c: _Scalar) -> tuple[_Scalar, _Scalar]:
 
 
 def _cast(ray: Callable, model: mjx.Model, *others: Any, **options: Any) -> Any:
-    """Cast a ray in a scene that need have no material: MJX looks one up for every geom."""
+    """Cast a ray, also in a scene without materials: MJX looks one up for every geom."""
     none = model if len(model.mat_rgba) else model.replace(mat_rgba=jnp.ones((1, 4)))
     return ray(none, *others, **options)
 
 
-# Nothing in these modules asks for more than the product of axis and angle.
+# These modules use only the product of axis and angle.
 _math = copy_of("math", quat_to_axis_angle=lambda q: (spatial.logarithm(q), 1.0), safe_div=_safe_div)
 _support = copy_of(
     "support", muscle_dynamics_timescale=_muscle_dynamics_timescale, _length_circle=wrapping.arc_length, math=_math

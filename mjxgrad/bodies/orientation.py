@@ -1,15 +1,15 @@
-r"""Orientations of bodies: products of turns or, where the turns of every chain share one axis, a sum of angles.
+r"""Orientations of bodies: products of turns, or sums of angles where all turns of a chain share one axis.
 
-A turn takes the frame before it by a fixed rotation F of its body and a joint's rotation about an axis that the frame carries.
-In general orientations are products of these from the root, formed by doubling.
+A turn is the fixed rotation of a body, then the joint's rotation about an axis fixed to the rotated frame. In general
+orientations are products of turns from the root, formed by doubling.
 
-Most legged robots and arms of the benchmarks are planar: seen from the world all hinges of a chain are parallel, whatever their
-angles. With the common axis a the orientation after a turn is
+Most legged robots and arms of the benchmarks are planar: all hinges of a chain stay parallel in the world, at any angles. With
+the common axis a the orientation after a turn is
 
     R_a(φ) C = cos φ (1 - a aᵀ) C + sin φ [a]ₓ C + a aᵀ C,
 
-C the constant product of the fixed rotations and φ the sum of the angles, which leaves one sine and cosine a turn, and no
-products. To know that, axes and fixed rotations must be known when the program is traced.
+where C is the constant product of the fixed rotations and φ the sum of the angles. Each turn then costs one sine and one
+cosine, and no products. Axes and fixed rotations must be known when the program is traced.
 """
 
 from dataclasses import dataclass
@@ -31,15 +31,14 @@ _Vectors = Float[Array, "n 3"]
 _Matrices = Float[Array, "n 3 3"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-# Axes count as parallel up to this many units of rounding of the numbers that they are made of.
+# Axes count as parallel up to this many units of rounding.
 _PARALLEL = 16
 
 
 class Products(eqx.Module):
-    """Products of the turns from the root: where frames point, one after each turn. An index of -1 is the world.
+    """Orientations after each turn, as products of turns from the root. An index of -1 is the world.
 
-    Both quaternions and matrices are carried through the products, so that XLA can remove the quaternions where nobody
-    reads them.
+    Both quaternions and matrices are carried through the products, so that XLA can remove unused quaternions.
     """
 
     quat: Float[Array, "turns 4"]
@@ -50,7 +49,7 @@ class Products(eqx.Module):
         return pick(index, self.quat, _IDENTITY)
 
     def compose(self, index: np.ndarray, matrices: _Matrices) -> _Matrices:
-        """Return the orientation of what is turned by matrices in chosen frames."""
+        """Return the orientations given by matrices in chosen frames."""
         return spatial.compose(pick(index, self.mat, np.eye(3)), matrices)
 
     def rotate(self, index: np.ndarray, vectors: _Vectors) -> _Vectors:
@@ -59,7 +58,7 @@ class Products(eqx.Module):
 
 
 class Angles(eqx.Module):
-    """Sums of angles about the axes of chains: φ after each turn (rad), and the constants of the formula."""
+    """Orientations after each turn, as sums φ of angles about the axes of chains (rad) and the formula's constants."""
 
     angle: Float[Array, " turns"]
     chain: "Chains" = eqx.field(static=True)
@@ -80,7 +79,7 @@ class Angles(eqx.Module):
         return self._sum(index, *(contract("nij,nj->ni", part, vectors) for part in self._parts(index)))
 
     def _parts(self, index: np.ndarray) -> list[Array]:
-        """Return what goes with the cosine, with the sine, and with neither."""
+        """Return the factors of the cosine and of the sine, and the constant term."""
         is_turned, nothing = (index >= 0)[:, None, None], np.zeros((3, 3))
         rests = (nothing, nothing, np.eye(3))
         parts = (self.chain.even, self.chain.odd, self.chain.constant)
@@ -96,15 +95,15 @@ class Angles(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Turns about one axis for each chain, as constants.
+    """Constants of chains that turn about one axis each.
 
     Attributes:
-        sums: of which joints' angles φ is the sum, 0 or ±1 (turns, joints).
+        sums: coefficients 0 or ±1 of the joints' angles in φ (turns, joints).
         even: (1 - a aᵀ) C of each turn.
         odd: [a]ₓ C.
         constant: a aᵀ C.
-        quaternion: that of C.
-        turned_quaternion: (0, a) times it.
+        quaternion: quaternion of C.
+        turned_quaternion: (0, a) times the quaternion of C.
     """
 
     sums: np.ndarray
@@ -118,7 +117,7 @@ class Chains:
 def orientation(
     model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
 ) -> Products | Angles:
-    """Return the orientations after all turns of a state, from the quaternion of each joint."""
+    """Return the orientations after all turns, from the quaternion of each joint."""
     found = chains(model, frames)
     if found is None:
         return _products(model, data, frames, turn)
@@ -145,7 +144,7 @@ def _products(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float
 
 
 def chains(model: mjx.Model, frames: tree.Frames) -> Chains | None:
-    """Return the constants of chains that turn about one axis each; None where one does not, or is not known to."""
+    """Return the constants of chains about one axis each; None unless every chain is known to have one axis."""
     axes, quats = known(model.jnt_axis), known(model.body_quat)
     turns_freely = np.isin(model.jnt_type, (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL)).any()
     if axes is None or quats is None or turns_freely or model.nmocap or not (frames.joint >= 0).any():

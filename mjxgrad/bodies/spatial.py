@@ -1,10 +1,10 @@
 """Rotations, cross products and inertias of many bodies at once.
 
 Motions are (angular, linear), forces (torque, force), about one point for a whole kinematic tree and in world axes. All
-functions but those of quaternions take one leading axis of items.
+functions except those of quaternions take one leading axis of items.
 
-**At rest.** The exponential map is analytic in the squared angle. Written so, with a series where the closed form divides by
-zero, it has its true derivative at zero angular velocity (half the time step), where dividing by a guarded norm gives none.
+**At rest.** The exponential map is analytic in the squared angle, and is written so, with a series where the closed form
+divides by zero. Its derivative at zero angular velocity is then exact (half the time step); a guarded norm would lose it.
 """
 
 import jax
@@ -21,10 +21,10 @@ _Vectors = Float[Array, "n 3"]
 # Below this squared angle the truncated series are exact to double precision: the first term left out of either is
 # smaller than (1e-4)**3 / 46080 = 2e-17.
 _SERIES = 1e-4
-# Square of a length without direction: its power of -3/2, which the derivative has, must be finite in single precision.
+# Squared length below which a vector has no direction: its power -3/2 in the derivative must be finite in single precision.
 _NOTHING = 1e-20
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-# Entries of a symmetric matrix in the order in which MuJoCo keeps those of an inertia.
+# Entries of a symmetric matrix in MuJoCo's order of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -46,7 +46,7 @@ def _quaternion_table() -> np.ndarray:
 
 
 def _rotation_table() -> np.ndarray:
-    """Return the table of the matrix of v ↦ q v q*, with each pair of entries of q once."""
+    """Return the table of the matrix of v ↦ q v q*; each pair of entries of q occurs once."""
     conjugate = np.array([1, -1, -1, -1])
     turned = np.einsum("man,nlb,b->malb", QUATERNION, QUATERNION, conjugate)
     table = turned[1:, :, 1:].transpose(0, 2, 1, 3).reshape(9, 4, 4)
@@ -103,16 +103,16 @@ def cross_matrix(a: _Vectors) -> _Matrices:
 
 
 def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
-    """Return matrix times vector of each item."""
+    """Return the product of matrix and vector, item by item."""
     return contract("nij,nj->ni", matrix, x)
 
 
 @jax.custom_jvp
 def compose(p: _Matrices, q: _Matrices) -> _Matrices:
-    """Return the matrix product of each item.
+    """Return the matrix product, item by item.
 
-    Written out for the value, as a sum of outer products that XLA fuses into one loop, where its product of small matrices
-    takes a tenth of a step longer (CPU); a product for the derivative, which written out is longer to compile.
+    The value is a sum of outer products, which XLA fuses into one loop; its product of small matrices would make a step a tenth
+    longer on a CPU. The derivative is a product, since it takes longer to compile when written out.
     """
     return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
@@ -124,24 +124,24 @@ def _compose_jvp(primals, tangents):
 
 
 def multiply(p: Float[Array, "*#batch 4"], q: Float[Array, "*#batch 4"]) -> Float[Array, "*#batch 4"]:
-    """Return the Hamilton product p q of quaternions (w, x, y, z); leading axes of any number are broadcast."""
+    """Return the Hamilton product p q of quaternions (w, x, y, z); leading axes are broadcast."""
     dtype = jnp.result_type(p, q)
     return _multiply(*jnp.broadcast_arrays(jnp.asarray(p, dtype), jnp.asarray(q, dtype)))
 
 
 def rotation_matrix(q: Float[Array, "n 4"]) -> _Matrices:
-    """Return the matrix of v ↦ q v q*, a rotation if q has norm one; quadratic in q whatever its norm."""
+    """Return the matrix of v ↦ q v q*, quadratic in q; a rotation if q has norm one."""
     return _rotation(q, q).reshape(-1, 3, 3)
 
 
 def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Return items of norm one; those shorter than 1e-10 stay as they are, with derivative one."""
+    """Return items scaled to norm one; items shorter than 1e-10 keep their value, with derivative one."""
     square = dot(q, q)
     return scale(jax.lax.rsqrt(jnp.where(square < _NOTHING, 1.0, square)), q)
 
 
 def inertia_about(offset: _Vectors, mass: Float[Array, " n"], central: _Matrices) -> Float[Array, "n 10"]:
-    """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset (from the point), and mass.
+    """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset from the point, and mass.
 
     `central` is the rotational inertia about the centre of mass, in world axes (kg m²).
     """
@@ -167,7 +167,7 @@ def exponential(rotation: Float[Array, "*batch 3"]) -> _Quaternions:
 
 
 def logarithm(q: _Quaternions) -> Float[Array, "*batch 3"]:
-    """Return the rotation vector (rad) of a unit quaternion, of the shorter of the two turns."""
+    """Return the rotation vector (rad) of a unit quaternion, by the shorter turn."""
     q = jnp.where(q[..., :1] < 0, -q, q)
     sine = jnp.sum(q[..., 1:] ** 2, axis=-1, keepdims=True)
     small = sine < _SERIES

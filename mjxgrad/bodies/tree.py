@@ -1,6 +1,6 @@
-"""Who moves whom: the structure of a model as constant arrays.
+"""The kinematic tree of a model as constant arrays.
 
-All of it is read off static fields of the model, so that lengths, masses and axes may be traced.
+Only static fields of the model are read, so lengths, masses and axes may be traced.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ _SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 
 @dataclass(frozen=True)
 class Run:
-    """Neighbouring joints of one type. Their coordinates are neighbours too, so a slice and a reshape gather them.
+    """Neighbouring joints of one type. Their coordinates are contiguous, so a slice and a reshape gather them.
 
     `width` is the number of positions per joint.
     """
@@ -30,21 +30,20 @@ class Run:
 
 @dataclass(frozen=True)
 class Frames:
-    """The turns of which the orientation of a body is made: one for each joint that rotates, one for each other body.
+    """Turns that compose the orientations of bodies: one for each rotating joint, one for each body without such a joint.
 
     An index of -1 stands for the world.
 
     Attributes:
-        body: frame that is turned by the body's own quaternion; the others have -1 (turns -> bodies).
-        joint: joint of a turn, -1 for bodies without (turns -> joints).
-        mocap: mocap body of a turn, -1 for the others (turns -> mocap).
-        jumps: for k = 0, 1, ... the turn that is 2ᵏ before; after multiplying by all of them in order every turn
-            holds the product from the root.
+        body: body whose own quaternion a turn includes, -1 for none (turns -> bodies).
+        joint: joint of a turn, -1 for none (turns -> joints).
+        mocap: mocap body of a turn, -1 for none (turns -> mocap).
+        jumps: for k = 0, 1, ... the turn 2ᵏ places before each; multiplied in order they give the product from the root.
         of_body: last turn of a body.
         before_body: turn that a body's position refers to.
         before_joint: turn that a joint's position and axis refer to.
-        is_first: whether no joint of the same body rotates before this one, so that the body's quaternion applies.
-        after_joint: turn of a joint that moves its body about its anchor, -1 for the others.
+        is_first: whether a joint is the first of its body to rotate, so that the body's quaternion applies.
+        after_joint: turn of a joint that moves its body about its anchor, -1 for other joints.
     """
 
     body: np.ndarray
@@ -59,7 +58,7 @@ class Frames:
 
 
 def joint_runs(model: mjx.Model) -> tuple[Run, ...]:
-    """Return the joints in order, neighbours of one type together."""
+    """Return the joints in order, as runs of one type."""
     runs, start = [], 0
     for end in range(1, model.njnt + 1):
         if end < model.njnt and model.jnt_type[end] == model.jnt_type[start]:
@@ -116,10 +115,10 @@ def joints_of(model: mjx.Model, body: int) -> range:
 
 
 def displacements(model: mjx.Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return of which steps the positions of bodies and of joint anchors are the sums.
+    """Return the matrices that sum displacements to the positions of bodies and of joint anchors.
 
-    The steps are, in order: from the parent to each body, from each body to its joints' anchors, and what each joint
-    adds: the way of a slide, the position of a free joint, or the way back from the anchor to the body.
+    The displacements are, in order: from the parent to each body, from each body to its joints' anchors, and one per joint. The
+    latter is the displacement of a slide, the position of a free joint, or the way back from the anchor to the body.
     """
     num_body, num_joint = model.nbody, model.njnt
     bodies = np.zeros((num_body, num_body + 2 * num_joint))
@@ -143,7 +142,7 @@ def displacements(model: mjx.Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moving_dofs(model: mjx.Model) -> np.ndarray:
-    """Return which joint velocities move which body, (nbody, nv)."""
+    """Return 1 where a joint velocity moves a body, else 0 (nbody, nv)."""
     moves = np.zeros((model.nbody, model.nv))
     for body in range(1, model.nbody):
         moves[body] = moves[model.body_parentid[body]]
@@ -153,10 +152,10 @@ def moving_dofs(model: mjx.Model) -> np.ndarray:
 
 
 def earlier_dofs(model: mjx.Model) -> np.ndarray:
-    """Return which joint velocities turn the axis of which other, (nv, nv).
+    """Return 1 where a joint velocity (column) moves the axis of another (row), else 0 (nv, nv).
 
-    Those of all joints before it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not the
-    total derivative); those of a free joint's rotation are counted after its translation.
+    All joints before an axis move it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not the
+    total derivative). The rotation of a free joint comes after its translation.
     """
     moves, earlier = moving_dofs(model), np.zeros((model.nv, model.nv))
     for dof in range(model.nv):
@@ -170,7 +169,7 @@ def earlier_dofs(model: mjx.Model) -> np.ndarray:
 
 
 def descendants(model: mjx.Model) -> np.ndarray:
-    """Return which bodies hang on which body, itself included, (nbody, nbody)."""
+    """Return 1 where a body (column) is a descendant of another (row) or the same, else 0 (nbody, nbody)."""
     below = np.eye(model.nbody)
     for body in range(model.nbody - 1, 0, -1):
         below[model.body_parentid[body]] += below[body]

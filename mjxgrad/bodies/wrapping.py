@@ -1,12 +1,12 @@
-"""Tendons on spheres and cylinders: where they touch, and how long they are on them.
+"""Tendons on spheres and cylinders: points of contact and wrapped lengths.
 
-MJX has this, with three faults. A tendon whose end lies on the axis has a derivative of NaN, by a square root. So has a short
-arc, by an arccosine of what rounding makes one. And inside a ring five steps of a search are taken that needs up to twenty.
+MJX computes these with three faults. A tendon whose end lies on the axis has a NaN derivative, from a square root. So has a
+short arc, from an arccosine that rounding puts at one. Inside a ring MJX takes five steps of a search that needs up to twenty.
 
-A tendon that passes through a ring (its sidesite lies within) bends, unless its straight line passes too, at the point e of the
-ring where the way is shortest. There a/|a - e| + b/|b - e|, with a and b its ends, points along e. That point is bracketed as
-far as both ends see it; two Newton steps, which are differentiated, then give the root with its first and second derivative.
-Within some 0.001 rad of where the tendon comes off the ring C MuJoCo gives up, and takes the middle of both ends instead.
+A tendon through a ring (its sidesite lies within) bends at the point e of the ring where its path is shortest, unless its
+straight line passes too. With a and b its ends, a/|a - e| + b/|b - e| points along e there. The point is bracketed between
+the limits of both ends' view. Two Newton steps, which are differentiated, give the root with its first and second derivative.
+Within some 0.001 rad of the tendon leaving the ring C MuJoCo gives up and takes the middle of both ends.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,14 @@ from mjxgrad.bodies.spatial import normalise
 _Point = Float[Array, "3"]
 _Scalar = Float[Array, ""]
 _HALVINGS = 40
-# Slope, a pure number of order one, from which on a tendon only just touches the ring: the point has no derivative there.
+# Slope (a pure number of order one) below which a tendon only grazes the ring: the point has no derivative there.
 _FLAT = 1e-6
 
 
 def wrap(wrap_circle: Callable, x0, x1, xpos, xmat, size, side, has_side, is_sphere, is_inside: bool, *_):
-    """Return the length on a geom, -1 where the tendon does not touch it, and where it begins and ends there.
+    """Return the length on a geom, -1 where the tendon does not touch it, and its first and last point there.
 
-    In place of MJX's `support.wrap`, with its arguments after the first; that is MJX's wrap round a circle in the plane.
+    A replacement of MJX's `support.wrap`, with its arguments after the first, which is MJX's wrap round a circle in the plane.
     """
     p0, p1, side = (xmat.T @ (x - xpos) for x in (x0, x1, side))
     if is_inside:
@@ -42,7 +42,7 @@ def wrap(wrap_circle: Callable, x0, x1, xpos, xmat, size, side, has_side, is_sph
         length, flat = wrap_circle(jnp.concatenate([axes @ p0, axes @ p1]), beside, has_side, size)
         length = length.reshape(())
         does_wrap, ends = length >= 0, (flat[:2] @ axes, flat[2:] @ axes)
-    # On a cylinder it climbs evenly.
+    # On a cylinder the tendon climbs at a constant rate.
     before, after = (safe_norm((p - end)[:2]) for p, end in zip((p0, p1), ends, strict=True))
     whole = jnp.where(does_wrap, before + length + after, 1.0)
     heights = [p0[2] + (p1[2] - p0[2]) * way / whole for way in (before, before + length)]
@@ -54,7 +54,7 @@ def wrap(wrap_circle: Callable, x0, x1, xpos, xmat, size, side, has_side, is_sph
 
 
 def _plane(p0: _Point, p1: _Point) -> Float[Array, "2 3"]:
-    """Return two axes of the plane through two points and the origin; of some plane where these are on one line."""
+    """Return two axes of the plane through two points and the origin; of any such plane where they are collinear."""
     first = _unit(p0)
     normal = jnp.cross(first, _unit(p1))
     is_line = jnp.sum(normal**2) < _FLAT**2
@@ -68,9 +68,9 @@ def _unit(x: _Point) -> _Point:
 
 
 def arc_length(p0: Float[Array, "2"], p1: Float[Array, "2"], ind: Array, rad: _Scalar) -> _Scalar:
-    """Return the length of an arc from one point of a circle to another, clockwise or, for `ind` 0, the other way.
+    """Return the length of an arc from one point of a circle to another, clockwise or, for `ind` 0, anticlockwise.
 
-    In place of MJX's `support._length_circle`.
+    A replacement of MJX's `support._length_circle`.
     """
     across, along = p0[1] * p1[0] - p0[0] * p1[1], p0 @ p1
     across = jnp.where(ind == 0, across, -across)
@@ -80,9 +80,9 @@ def arc_length(p0: Float[Array, "2"], p1: Float[Array, "2"], ind: Array, rad: _S
 
 
 def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[Bool[Array, ""], _Point]:
-    """Return whether a tendon inside a ring touches it, and where: at a point of the plane of both ends and the centre."""
+    """Return whether a tendon inside a ring touches it, and the point, in the plane of both ends and the centre."""
     does_touch = _bends(*jax.lax.stop_gradient((a, b, radius)))
-    # Elsewhere a case that has a solution, so that nothing is divided by zero.
+    # Where it does not touch, a solvable case avoids division by zero.
     a, b = (jnp.where(does_touch, p, 2 * radius * axis) for p, axis in zip((a, b), jnp.eye(3), strict=False))
     start = _unit(a)
     across = _unit(b) - start
@@ -91,7 +91,7 @@ def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[Bool[Array, ""], _Po
         return _unit(start + share * across)
 
     def gain(share: _Scalar) -> _Scalar:
-        """Return by how much the way gets shorter towards b."""
+        """Return the rate at which the path gets shorter as the point moves towards b."""
         e = at(share)
         pull = a / safe_norm(a - radius * e) + b / safe_norm(b - radius * e)
         return pull @ (across - e * (e @ across))
@@ -99,7 +99,7 @@ def _inside(a: _Point, b: _Point, radius: _Scalar) -> tuple[Bool[Array, ""], _Po
     def halve(_, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = 0.5 * (low + high)
-        # A point that an end does not see is too far from it.
+        # A point hidden from an end is too far from it.
         unseen = [p @ at(middle) < radius for p in (a, b)]
         is_short = unseen[1] | (~unseen[0] & (gain(middle) > 0))
         return jnp.where(is_short, middle, low), jnp.where(is_short, high, middle)

@@ -1,4 +1,4 @@
-"""Contacts: which geoms can touch and where they do, the law of the force, how soft it is, where a body rests."""
+"""Contacts: pairs of geoms and contact points, the force law and its softness, and the depth at rest."""
 
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness

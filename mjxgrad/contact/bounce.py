@@ -1,10 +1,10 @@
-r"""A ball that bounces once: what MuJoCo's contact does to it, in closed form and by quadrature.
+r"""A single bounce of a ball on MuJoCo's contact, in closed form and by quadrature.
 
 Without gravity and with a single sliding joint, contact at depth $-r$ is the oscillator
-$\ddot r = d(r)\, a_\text{ref}$, $a_\text{ref} = -B \dot r - K d(r) r$, as long as it pushes. For a constant impedance
-$d$ this is $\ddot r = -2 \zeta \omega_0 \dot r - \omega_0^2 r$ with $\omega_0 = 1 / (t_c \zeta)$, whatever $d$ is. It pushes
-from $r = 0$ until $\ddot r = 0$. Before and after, the ball flies, so the motion does not depend on where it started but
-for its timing, and $dz/dz_0 = -e$ for the height at any later time: the restitution is the derivative.
+$\ddot r = d(r)\, a_\text{ref}$, $a_\text{ref} = -B \dot r - K d(r) r$, while the force is repulsive. For a constant impedance
+$d$ this is $\ddot r = -2 \zeta \omega_0 \dot r - \omega_0^2 r$ with $\omega_0 = 1 / (t_c \zeta)$, for every $d$. The force acts
+from $r = 0$ until $\ddot r = 0$. Before and after, the ball flies freely, so its start only shifts the motion in time, and
+$dz/dz_0 = -e$ for the height at any later time: the restitution is the derivative.
 
 References:
     MuJoCo documentation, "Solver parameters" (the oscillator and its impedance).
@@ -25,8 +25,8 @@ class Bounce(eqx.Module):
 
     Attributes:
         time_constant: $t_c$, the first number of `solref`, in s.
-        damping_ratio: $\zeta$, the second; any positive number.
-        speed: of approach, in m/s.
+        damping_ratio: $\zeta$, the second number; any positive number.
+        speed: speed of approach, in m/s.
     """
 
     time_constant: Float[Array, "..."] = eqx.field(converter=as_float)
@@ -45,7 +45,7 @@ class Bounce(eqx.Module):
 
     @property
     def duration(self) -> Float[Array, "..."]:
-        r"""Return how long the ball is pushed, $2 \arccos\zeta / (\omega_0 \sqrt{1 - \zeta^2})$, in s."""
+        r"""Return the duration of the force, $2 \arccos\zeta / (\omega_0 \sqrt{1 - \zeta^2})$, in s."""
         return 2 * _angle(self.damping_ratio) / self.frequency
 
     def height(self, start: Float[ArrayLike, "..."], time: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -62,12 +62,12 @@ def integrated_restitution(
 
     Args:
         time_constant: first number of `solref`, in s.
-        damping_ratio: its second.
-        impedance: the first three numbers of `solimp`: $d_0$, $d_w$ and the width in m. The last two are the default ones.
-        speed: of approach, in m/s.
+        damping_ratio: second number of `solref`.
+        impedance: the first three numbers of `solimp`: $d_0$, $d_w$ and the width in m. The last two are MuJoCo's defaults.
+        speed: speed of approach, in m/s.
 
     Returns:
-        Restitution, which is $-dz/dz_0$ after the bounce, and how long the ball is pushed, in s.
+        The restitution, which is $-dz/dz_0$ after the bounce, and the duration of the force, in s.
 
     Raises:
         ValueError: if the ball is not released within a hundred time constants.

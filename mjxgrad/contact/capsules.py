@@ -1,12 +1,12 @@
-"""Contacts of planes, balls and capsules; a ball is a capsule of no length.
+"""Contacts of planes, balls and capsules; a ball is a capsule of length zero.
 
-MJX has a function for each pair of types. Here all pairs with a plane go through one formula, and all others through another:
-forty pairs of a robot are as many operations as one. Distances, positions and normals are those of C MuJoCo. Tangents are those
-of MJX, but at right angles on tilted planes, too.
+MJX has a function for each pair of types. Here all pairs with a plane share one formula, and all others another: forty pairs of
+a robot take as many operations as one. Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, and
+are also at right angles to the normal on tilted planes.
 
-Nearest points of two segments, from centres that are r apart, along unit axes a₁ and a₂: the first line is nearest to the
-second at s = (a₂·r a₁·a₂ - a₁·r) / (1 - (a₁·a₂)²), and t = a₂·r + s a₁·a₂ is nearest to s on the second. Kept within its
-segment, s gives t, which kept within its own gives s anew; another turn changes nothing.
+Nearest points of two segments, with unit axes a₁ and a₂ and centres r apart: the first line is nearest to the second at
+s = (a₂·r a₁·a₂ - a₁·r) / (1 - (a₁·a₂)²), and t = a₂·r + s a₁·a₂ is the point of the second line nearest to s. s is clamped
+to its segment and gives t; t is clamped and gives s again. A second round changes nothing.
 
 References:
     Ericson. Real-Time Collision Detection. Morgan Kaufmann 2005, section 5.1.9.
@@ -38,18 +38,18 @@ _STEEP = 0.75
 
 
 def has_formula(key: Any) -> bool:
-    """Return whether the contacts of pairs of two types are found here."""
+    """Return whether this module has a formula for a pair of types."""
     first, second = key.types
     return second in (_SPHERE, _CAPSULE) and first in (_PLANE, _SPHERE, _CAPSULE)
 
 
 def parallel_below(dtype: Any) -> float:
-    """Return the square of the sine from which on axes count as parallel, so that the middle of the first one is nearest."""
+    """Return the squared sine below which axes count as parallel, and the nearest point is the middle of the first."""
     return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def find(model: mjx.Model, data: mjx.Data, groups: Mapping[Any, _Group]) -> dict[Any, Found]:
-    """Return the contacts of groups of pairs; the pairs of a group are of the same two types."""
+    """Return the contacts of groups of pairs; all pairs of a group have the same two types."""
     found: dict[Any, Found] = {}
     for has_plane, contacts in ((True, _on_planes), (False, _between)):
         chosen = [key for key in groups if (key.types[0] == _PLANE) == has_plane]
@@ -61,7 +61,7 @@ def find(model: mjx.Model, data: mjx.Data, groups: Mapping[Any, _Group]) -> dict
 
 
 def _on_planes(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Found, list[int]]:
-    """Return a contact for each ball, and two for each capsule, first that of its head; and how many for each group."""
+    """Return one contact for each ball and two for each capsule, its head first, and the number of each group."""
     ends = [np.array([1.0, -1.0] if model.geom_type[pairs[0, 1]] == _CAPSULE else [0.0]) for pairs in groups]
     counts = [len(pairs) * len(of_one) for pairs, of_one in zip(groups, ends, strict=True)]
     pairs = np.concatenate([np.repeat(pairs, len(of_one), axis=0) for pairs, of_one in zip(groups, ends, strict=True)])
@@ -76,7 +76,7 @@ def _on_planes(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[
 
 
 def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Found, list[int]]:
-    """Return the contacts of balls and capsules, one for each pair; and how many for each group."""
+    """Return the contacts of balls and capsules, one for each pair, and the number of each group."""
     pairs = np.concatenate(groups)
     centre, axis, other, other_axis = _placed(data, pairs)
     (radius, half), (other_radius, other_half) = (_sizes(model, geoms) for geoms in pairs.T)
@@ -86,7 +86,7 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
     ).T
     across, parallel = cross(axis, other_axis), parallel_below(axis.dtype)
     sine2 = dot(across, across)
-    # 1 / sin² to the fourth power of a ratio, that of what counts as parallel to it; less than 4 over that.
+    # 1 / sin² up to the fourth power of parallel / (sin² + parallel), and bounded by 4 / parallel.
     ratio = parallel / (sine2 + parallel)
     sharpness = (1 + ratio) * (1 + ratio**2) / (sine2 + parallel)
     first = _kept(sharpness * (cosine * behind - ahead), half)
@@ -97,7 +97,7 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
     square, rounding = dot(towards, towards), 16 * float(jnp.finfo(axis.dtype).eps)
     is_same = square <= (rounding * (radius + half + other_radius + other_half)) ** 2
     length = jnp.sqrt(jnp.where(is_same, 1.0, square))
-    # Where axes cross, as those of planar robots can, it is the normal of both; where they are one, any will do.
+    # Where axes cross, as in planar robots, the normal is perpendicular to both; where they coincide, it is the x axis.
     is_crossing = sine2 > parallel
     x = jnp.array([1.0, 0.0, 0.0], axis.dtype)
     crossing = jnp.where(is_crossing[:, None], scale(jax.lax.rsqrt(jnp.where(is_crossing, sine2, 1.0)), across), x)
@@ -108,25 +108,25 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
 
 
 def _placed(data: mjx.Data, pairs: _Pairs) -> tuple[_Vectors, _Vectors, _Vectors, _Vectors]:
-    """Return where the first of each pair is and its third axis, a plane's normal, and the same of the second."""
+    """Return position and third axis (a plane's normal) of the first geom of each pair, then of the second."""
     places = jnp.concatenate([data.geom_xpos, data.geom_xmat[:, :, 2]], axis=1)
     of_pairs = pick(pairs.T.reshape(-1), places).reshape(2, len(pairs), 6)
     return of_pairs[0, :, :3], of_pairs[0, :, 3:], of_pairs[1, :, :3], of_pairs[1, :, 3:]
 
 
 def _sizes(model: mjx.Model, geoms: Int[np.ndarray, " pairs"]) -> tuple[_PerPair, _PerPair]:
-    """Return radii, and half-lengths of axes."""
+    """Return radii and half-lengths of axes."""
     sizes = pick(geoms, model.geom_size)
     return sizes[:, 0], jnp.where(model.geom_type[geoms] == _CAPSULE, sizes[:, 1], 0.0)
 
 
 def _kept(place: _PerPair, half: _PerPair) -> _PerPair:
-    """Return places kept within -half and half; what a ball has of them has no derivative."""
+    """Return places clamped to between -half and half; those of a ball, zero, have no derivative."""
     return jnp.where(jnp.abs(place) < half, place, jnp.where(place < 0, -half, half))
 
 
 def _sideways(normal: _Vectors) -> _Vectors:
-    """Return the axis, y or else z, that gives a contact its first tangent."""
+    """Return the axis, y or z, that defines a contact's first tangent."""
     is_y = (jnp.abs(normal[:, 1]) < 0.5)[:, None]
     y, z = jnp.eye(3, dtype=normal.dtype)[1:]
     return jnp.where(is_y, y, z)

@@ -1,22 +1,22 @@
-"""Contacts between geoms: MJX's pairs and slots, and in part its functions.
+"""Contacts between geoms: MJX's pairs and slots, and some of its functions.
 
-Those of planes, balls and capsules are in `capsules`. Of five more kinds of pair MJX finds the points in another way.
+Contacts of planes, balls and capsules are in `capsules`. Five more kinds of pair differ from MJX.
 
-A box on a plane. MJX searches the corners within 1 mm of the deepest one, so a box that tilts loses corners that still touch,
-and its contacts change places as it turns. C MuJoCo takes, of each of the four diagonals, the lower end. So does this library:
-there is nothing to search, and a contact belongs to one diagonal for good.
+A box on a plane. MJX searches corners within 1 mm of the deepest one. A tilted box loses corners that still touch, and its
+contacts change places as it turns. C MuJoCo and this library take the lower end of each of the four diagonals. No search is
+needed, and a contact always belongs to the same diagonal.
 
-Two faces, of boxes or meshes. MJX's contacts lie on the face that clips the other; C MuJoCo's, and ours, half way between both.
-Of a mesh that lies flat to rounding MJX takes two edges for what touches, and one contact at their far ends for all.
+Two faces, of boxes or meshes. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
+For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
 
-A ball on a box. MJX knows its distance only where they overlap; the nearest point of a box is known anywhere.
+A ball on a box. MJX knows the distance only where they overlap; the nearest point of a box is known everywhere.
 
-A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder is known, too.
+A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder has a closed form.
 
-A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and gives the other two the height that
-follows from the first. Standing upright there is no lowest point; it then picks a fixed one, and the heights of the other two
-no longer feel a tilt about it. The positions of the contacts do: each lies half its distance from the rim towards the plane,
-n·(p - o) + d/2 is the height of the rim above the plane, and its derivative is the right one in every pose.
+A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and derives the height of the other two
+from it. An upright cylinder has no lowest point: MJX picks a fixed one, and the heights of the other two do not depend on a tilt
+about it. Their positions do: each lies half its distance from the rim towards the plane. So n·(p - o) + d/2 is the height of
+the rim above the plane, and its derivative is correct in every pose.
 """
 
 import sys
@@ -42,26 +42,26 @@ _Frames = Float[Array, "pairs 3 3"]
 _Points = Float[Array, "pairs 3"]
 _Point, _Polygon = Float[Array, "3"], Float[Array, "_ 3"]
 _Pairs = Int[Array | np.ndarray, "pairs 2"]
-# Numbers, for MJX's keys hold NumPy's, which equal no member of an enumeration.
+# Plain integers: the numbers in MJX's keys do not equal members of an enumeration.
 _PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
 )
 CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
-"""What has no bounding sphere."""
+"""Types without a bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
-# How much sooner a ball outside an edge is too far from it to be pushed by both faces.
+# Weight of a ball's distance outside an edge: both faces act on it only close to the edge.
 _ROUND_EDGES = 4.0
-# In m² of an edge's length times a distance from a plane: less is rounding, in either precision.
+# Length of an edge times a distance from a plane (m²) below which the product is rounding, in either precision.
 _PARALLEL = 1e-12
-# Tilt of two edges (rad) below which a face touches: more than rounding in single precision, less than anything seen in a motion.
+# Angle of two edges (rad) below which a face touches: more than single-precision rounding, less than angles seen in motions.
 _ALIGNED = 1e-5
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill in the contacts; a drop-in for `mjx.collision`, with as many in the same order of pairs.
+    """Fill in the contacts; a drop-in for `mjx.collision`, with the same number of contacts and order of pairs.
 
-    Where data has fewer slots for contacts of one dimension than could touch, the nearest get them.
+    Where data has fewer slots for contacts of one dimension than there could be contacts, the nearest ones get them.
     """
     if not data._impl.ncon:
         return data
@@ -75,7 +75,7 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             gaps = jnp.linalg.norm(second - first, axis=1) - jnp.sum(model.geom_rbound[geoms], axis=1)
             contacts[key] = nearest = _greatest(contact, -gaps, most_pairs)
             pairs[key] = nearest.geom
-    # Of pairs that only the running program knows MJX finds the contacts.
+    # MJX finds the contacts of pairs that are known only at run time.
     known = {key: geoms for key, geoms in pairs.items() if isinstance(geoms, np.ndarray) and capsules.has_formula(key)}
     found = capsules.find(model, data, known)
     by_dim: dict[int, list] = {}
@@ -96,14 +96,14 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def slot_geoms(model: mjx.Model, data: mjx.Data) -> Int[np.ndarray, "contacts 2"] | None:
-    """Return the two geoms of each contact slot; None where it is decided at run time who gets a slot."""
+    """Return the two geoms of each contact slot; None where slots are assigned at run time."""
     every = candidates(model)
     found = np.concatenate([np.zeros((0, 2), int), *(every[dim] for dim in sorted(every))])
     return found if len(found) == len(data._impl.contact.dim) else None
 
 
 def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
-    """Return the two geoms of each contact that there could be, by dimension."""
+    """Return the two geoms of each possible contact, by dimension."""
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
         count = _MJX_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
@@ -112,7 +112,7 @@ def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
 
 
 def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
-    """Return the distance, less the margin, from which a contact may have found no slot (m); infinite if all have one."""
+    """Return the distance less the margin beyond which contacts may lack a slot (m); infinite if all have one."""
     contact, gap = data._impl.contact, data._impl.contact.dist - data._impl.contact.includemargin
     slots = {dim: np.flatnonzero(np.asarray(contact.dim) == dim) for dim in np.unique(contact.dim)}
     crowded = [gap[of_dim].max() for dim, of_dim in slots.items() if len(of_dim) < len(candidates(model)[dim])]
@@ -120,7 +120,7 @@ def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
 
 
 def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
-    """Return of which pairs the distance is known only where they overlap."""
+    """Return which pairs have a known distance only where they overlap."""
     is_plane, is_sphere, is_box, is_convex = (
         are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
     )
@@ -129,7 +129,7 @@ def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
 
 
 def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
-    """Return which geoms are of some kinds; known while tracing where the geoms are."""
+    """Return which geoms are of the given types; a constant if `geoms` is one."""
     table = np.isin(np.asarray(model.geom_type), kinds)
     return np.asarray(table[geoms]) if isinstance(geoms, np.ndarray) else jnp.asarray(table)[geoms]
 
@@ -137,11 +137,11 @@ def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> 
 def other_sides(
     model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
 ) -> tuple[Any, Float[Array, " contacts"]]:
-    """Return the contact that would take the place of each as bodies move on, and by how much the present one is nearer (m).
+    """Return the contact that would replace each one as bodies move on, and by how much the present one is nearer (m).
 
-    Where two centres pass each other along the normal that is the mirrored contact. Within a box it is the next face's
-    where that is nearer; outside its edge both directions trade places, so that no place is left where it jumps. Faces of
-    boxes change sides only where the geoms are constants.
+    Where two centres pass each other along the normal, that is the mirrored contact. For a ball within a box it is the contact
+    with the second nearest face. Outside an edge the components along both faces are exchanged, so that the contact is
+    continuous. Faces of boxes are considered only where the geoms are constants.
     """
     towards = pick(geoms[:, 1], data.geom_xpos) - pick(geoms[:, 0], data.geom_xpos)
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
@@ -155,7 +155,7 @@ def other_sides(
 
 
 def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points, _Frames, _PerPair]:
-    """Return position and frame of a ball's contact with the second nearest face of a box, and how much farther that is."""
+    """Return position and frame of a ball's contact with a box's second nearest face, and how much farther that is."""
     distance, outward, beyond, sign = _from_box(model, data, geoms)
     nearest = _largest(beyond)
     opposite = -beyond - 2 * pick(geoms[:, 1], model.geom_size)
@@ -166,7 +166,7 @@ def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points
     is_opposite = jnp.any(nearest & second, axis=1)
     pos, frame = _towards(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
     next_one = jnp.max(rest, axis=1)
-    # Round an edge the normal turns as the ball does: nothing to share.
+    # Round an edge the normal turns continuously with the ball, so the contact need not change sides.
     return pos, frame, jnp.max(beyond, axis=1) - next_one + _ROUND_EDGES * jnp.where(next_one > 0, next_one, 0.0)
 
 
@@ -177,7 +177,7 @@ def _joined(contacts: list):
 def _greatest(contact, score: Float[Array, " contacts"], count: int):
     index = jax.lax.top_k(score, k=count)[1]
     chosen = jax.tree.map(lambda x: x[index], contact)
-    if contact.dist is None:  # before they are found
+    if contact.dist is None:  # before distances are computed
         return chosen
     places = jnp.concatenate([contact.dist[:, None], contact.pos, contact.frame.reshape(-1, 9)], axis=1)
     dist, pos, frame = jnp.split(maps.choose(index, places), (1, 4), axis=1)
@@ -185,7 +185,7 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
 
 
 def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return the lower end of each diagonal of the box: it is |n·diagonal| below the centre."""
+    """Return contacts at the lower end of each diagonal of the box, |n·diagonal| below the centre."""
     plane, box = geoms.T
     normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
     height = dot(normal, centre - pick(plane, data.geom_xpos))
@@ -201,30 +201,30 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.F
 
 
 def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> capsules.Found:
-    """Return MJX's contacts with the derivative of the distance that it drops."""
+    """Return MJX's contacts, with the derivative of the distance that MJX drops."""
     dist, pos, frame = _MJX_FUNCTIONS[key.types](model, data, key, geoms)
     on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
     height = dot(frame[:, 0], pos - on_plane) + 0.5 * dist
-    # The value stays MJX's own; only the derivative is replaced.
+    # Only the derivative is replaced; the value is MJX's.
     return jax.lax.stop_gradient(dist - height) + height, pos, frame
 
 
 def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return the point of the box that is nearest to the ball's centre; from within, that of the nearest face."""
+    """Return contacts at the point of the box nearest to the ball's centre; on the nearest face if it is inside."""
     distance, outward, *_ = _from_box(model, data, geoms)
     pos, frame = _towards(model, data, geoms, distance, outward)
     return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
 
 
 def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return the point of the cylinder that is nearest to the ball's centre; from within, that of the nearer of side and end."""
+    """Return contacts at the point of the cylinder nearest to the ball's centre; on the nearer of side and end if inside."""
     sphere, cylinder = geoms.T
     away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
     centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
     radius = safe_norm(centre[:, :2])
-    on_axis = (radius < 1e-12)[:, None]  # m; nearer to it a turn about it is none, and its derivative overflows
+    on_axis = (radius < 1e-12)[:, None]  # m; below it the radial direction's derivative overflows
     radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
-    # In the half-plane of axis and centre: across, along.
+    # Coordinates in the half-plane of axis and centre: radial, axial.
     beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]
     sign = jnp.stack([jnp.ones_like(radius), jnp.where(centre[:, 2] < 0, -1.0, 1.0)], axis=1)
     gap = sign * jnp.where(beyond > 0, beyond, 0.0)
@@ -239,7 +239,7 @@ def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> caps
 
 
 def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
-    """Return how far a ball's centre lies outside a box, in which direction, and its distances and sides along the axes."""
+    """Return distance and direction of a ball's centre from a box, and its distances and signs along the axes."""
     sphere, box = geoms.T
     away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
     centre = contract("pji,pj->pi", pick(box, data.geom_xmat), away)
@@ -256,7 +256,7 @@ def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, A
 def _towards(
     model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
 ) -> tuple[_Points, _Frames]:
-    """Return position and frame of contacts, half-way between both surfaces."""
+    """Return position and frame of contacts, half way between both surfaces."""
     sphere, other = geoms.T
     normal = contract("pij,pj->pi", pick(other, data.geom_xmat), -outward)
     reach = 0.5 * (distance + pick(sphere, model.geom_size)[:, 0])
@@ -264,7 +264,7 @@ def _towards(
 
 
 def _largest(x: _Points) -> Array:
-    """Return which is the largest of three."""
+    """Return whether each of three numbers is the largest."""
     return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
 
 
@@ -277,19 +277,19 @@ _FUNCTIONS = {
 
 
 def _divisor(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return what to divide by, where MJX does so by anything but zero."""
+    """Return a divisor that is safe where MJX guards only against an exact zero."""
     return jnp.where(jnp.abs(x) >= _PARALLEL, x, 1e-6)
 
 
 def _closest_segment_point_plane(a: _Point, b: _Point, p0: _Point, plane_normal: _Point) -> _Point:
-    """Return where a segment meets a plane, or its nearer end; of a parallel one some point."""
+    """Return the point where a segment meets a plane, or its nearer end; some point if they are parallel."""
     along = jnp.sum(plane_normal * (b - a))
     share = (jnp.sum(p0 * plane_normal) - jnp.sum(plane_normal * a)) / _divisor(along)
     return a + jnp.clip(share, 0, 1) * (b - a)
 
 
 def _project_poly_onto_poly_plane(poly1: _Polygon, norm1: _Point, poly2: _Polygon, norm2: _Point) -> _Polygon:
-    """Return the first polygon moved along its normal onto the plane of the second."""
+    """Return the first polygon, projected along its normal onto the plane of the second."""
     way = (poly2[0].dot(norm2) - poly1.dot(norm2)) / _divisor(norm1.dot(norm2))
     return poly1 + way.reshape(-1, 1) * norm1
 
@@ -310,7 +310,7 @@ def _half_way(
 
 
 def _arcs_intersect(a: _Point, b: _Point, c: _Point, d: _Point) -> Bool[Array, ""]:
-    """Return whether arcs AB and CD of the unit sphere cross, and neither ends on the other but for rounding."""
+    """Return whether arcs AB and CD of the unit sphere cross by more than rounding."""
     first, second = jnp.cross(b, a), jnp.cross(d, c)
     sides = jnp.stack([c.dot(first), -d.dot(first), b.dot(second), -a.dot(second)])
     return jnp.all(sides > _ALIGNED) | jnp.all(sides < -_ALIGNED)
@@ -324,5 +324,5 @@ _convex = copy_of(
 )
 _convex._create_contact_manifold = partial(_half_way, _convex._create_contact_manifold)
 _own = {f: getattr(_convex, name) for name, f in vars(sys.modules[_convex.__name__]).items() if hasattr(f, "ncon")}
-# MJX's for each pair of types, of boxes, capsules, meshes and height fields with quotients that have a derivative.
+# MJX's function for each pair of types; those of boxes, capsules, meshes and height fields are copies with safe quotients.
 _MJX_FUNCTIONS = {kinds: _own.get(f, f) for kinds, f in _PLAIN.items()}

@@ -1,15 +1,15 @@
-r"""The law of a contact or limit: stiffness, damping, impedance, and how deep it rests.
+r"""The law of a contact or limit: stiffness, damping, impedance, and depth at rest.
 
-A row at the violation $r$ that changes at the rate $v$ asks for the acceleration $a_\text{ref} = -B v - K d(r) r$, and its
-impedance $d(r)$ says how much of it it gets: $d_0$ at $r = 0$, $d_w$ from the width on. `solref` holds $K$ and $B$, `solimp`
-the impedance.
+A row with violation $r$ and rate $v$ has the reference acceleration $a_\text{ref} = -B v - K d(r) r$. The impedance $d(r)$
+is the share of it that is realised: $d_0$ at $r = 0$, $d_w$ from the width on. `solref` gives $K$ and $B$, `solimp` the
+impedance.
 
 Under a force that would give its bodies the acceleration $a_0$ towards each other, a contact at rest has
 $K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and
 $K = k / d_w^2$.
-The factor $c$ is 1 for frictionless contacts and elliptic cones; in a pyramid the normal force is the sum of its edges,
-whose regularisation MuJoCo scales with friction, and $c = \mu^2 (1 + \mu^2) / ((n - 1)\,\text{impratio})$, $n$ the
-dimension of the contact: 1 only for $\mu = 1$, $n = 3$.
+The factor $c$ is 1 for frictionless contacts and elliptic cones. A pyramid's normal force is the sum over its edges, whose
+regularisation MuJoCo scales with friction: $c = \mu^2 (1 + \mu^2) / ((n - 1)\,\text{impratio})$, $n$ the dimension of
+the contact. With the default impratio of 1, $c = 1$ at $\mu = 1$, $n = 3$.
 The left side grows with the depth, so there is one solution. Where $a_0$ is the force over MuJoCo's own estimate of
 the contact's mass, at the reference pose, it is exact.
 
@@ -32,10 +32,10 @@ _HALVINGS = 50
 
 
 class Impedance(eqx.Module):
-    """Impedance of rows; arrays of their own, since two of the three do not depend on the state.
+    """Impedances of rows, as separate arrays, since two of the three do not depend on the state.
 
     Attributes:
-        present: d(r).
+        present: d(r), at the present violation.
         full: dw, from the width on.
         onset: d0, at r = 0.
     """
@@ -46,12 +46,12 @@ class Impedance(eqx.Module):
 
 
 def is_square(*solimps: Float[Array | np.ndarray, "_ 5"]) -> bool:
-    """Return whether the power laws of a model's rows are known to be parabolas."""
+    """Return whether the powers of all `solimp` are known to be two."""
     return all(is_known_to_be(2.0, solimp, column=4) for solimp in solimps)
 
 
 def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is_square: bool = False) -> Impedance:
-    """Return d at the violation r (m or rad): from d0 at r = 0 to dw at the width, by two power laws that meet at the midpoint.
+    """Return d at the violation r (m or rad), which rises from d0 to dw by two power laws that meet at the midpoint.
 
     `is_square` says that the power is known to be two, MuJoCo's default; a square takes a tenth of the time.
     """
@@ -60,7 +60,7 @@ def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is
     width = jnp.maximum(solimp[..., 2], mujoco.mjMINVAL)
     middle = jnp.clip(solimp[..., 3], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     power = jnp.maximum(solimp[..., 4], 1.0)
-    # Beyond the width the powers are evaluated where they are finite and thrown away.
+    # Beyond the width the powers are evaluated at a harmless point and not used.
     is_inside = jnp.abs(violation) < width
     x = jnp.where(is_inside, jnp.abs(violation) / width, 0.5)
     is_lower = x < middle
@@ -74,11 +74,10 @@ def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is
 def stiffness_damping(
     model: mjx.Model, solref: Float[Array, "*n 2"], full: Float[ArrayLike, "..."] = 1.0
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return K (1/s²) and B (1/s) from `full`, the impedance dw; 1 gives k = K dw² and b = B dw, which do not depend on it.
+    """Return K (1/s²) and B (1/s) from `full`, the impedance dw; with 1, k = K dw² and b = B dw, independent of dw.
 
-    Each format is evaluated on numbers that are its own, so that no infinity of the other enters the derivative. Under
-    refsafe the time constant is clamped from below at two time steps; at the clamp itself the derivative is that of the
-    unclamped side, since from there every larger value counts.
+    Each format is evaluated on valid numbers of its own, so that no infinity of the other enters the derivative. Under
+    refsafe the time constant is at least two time steps. At this bound the derivative is that of larger time constants.
     """
     first, second = solref[..., 0], solref[..., 1]
     time_constant = jnp.where(first > 0, first, 1.0)
@@ -100,7 +99,7 @@ def rest_depth(
     """
     acceleration = jnp.broadcast_to(jnp.asarray(acceleration, stiffness.dtype), stiffness.shape)
     largest = impedance(solimp, jnp.zeros_like(stiffness)).full
-    # From the width on the impedance is constant, and the depth known.
+    # Beyond the width the impedance is constant, and the depth has a closed form.
     beyond = (1 - largest) * acceleration / stiffness
     upper = jnp.maximum(solimp[..., 2], beyond)
 
@@ -131,11 +130,11 @@ def compensated_stiffness(
     margin: Float[Array, "*shape"],
     acceleration: Float[ArrayLike, "..."],
 ) -> Float[Array, "*shape"]:
-    r"""Return the stiffness at which a contact with a margin rests where it would without.
+    r"""Return the stiffness at which a contact with a margin rests where it would rest without.
 
-    Without margin it rests at depth $\rho_0$; with margin $m$ the same place is at depth $m + \rho_0$ below the beginning of
-    the force, so the stiffness must fall by the ratio of `static_response` at both. For a constant impedance $d$ that
-    is $k' = (1 - d) a_0 / (m + \rho_0)$, in 1/s², never above the one given. `acceleration` is $c\,a_0$ (m/s²).
+    Without margin the depth at rest is $\rho_0$. With margin $m$ the same place is $m + \rho_0$ below the start of the
+    force, so the stiffness must fall by the ratio of `static_response` at both. For a constant impedance $d$ that
+    is $k' = (1 - d) a_0 / (m + \rho_0)$, in 1/s², never above the given one. `acceleration` is $c\,a_0$ (m/s²).
     """
     depth = rest_depth(acceleration, stiffness, solimp)
     return stiffness * static_response(depth, solimp) / static_response(depth + margin, solimp)

@@ -1,10 +1,11 @@
-r"""Which geoms can touch, and how soft their contact effectively is.
+r"""Pairs of geoms that can touch, and their effective contact parameters.
 
-MuJoCo derives the parameters of a contact from those of its two geoms (or of an explicit `<pair>`), clamps some of them and
-reads `solref` in either of two formats. What the dynamics sees is brought here to one form, in which pairs can be compared and
-swept: the law of `contact.law` with $K = k / d_w^2$ and $B = b / d_w$, $k = \omega_0^2$ the stiffness and $b$ the damping, both
+MuJoCo derives the parameters of a contact from its two geoms (or from an explicit `<pair>`), clamps some of them and reads
+`solref` in either of two formats. Here the effective values are brought to one form, in which pairs can be compared and swept.
+It is the law of `contact.law` with $K = k / d_w^2$ and $B = b / d_w$, $k = \omega_0^2$ the stiffness and $b$ the damping, both
 per unit of the contact's effective mass. At full impedance the contact is the oscillator
-$\ddot r = -k r - b \dot r + (1 - d_w) a_0$, $a_0$ being the acceleration without contact, and rests at depth $(1 - d_w) a_0 / k$.
+$\ddot r = -k r - b \dot r + (1 - d_w) a_0$, with $a_0$ the acceleration without contact. It rests at depth
+$(1 - d_w) a_0 / k$.
 
 References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
@@ -34,7 +35,7 @@ class ContactPair:
         geom2: index of the second geom.
         explicit: index of the `<pair>` that holds the parameters, -1 if the geoms hold them.
         condim: dimension of the contact: 1, 3, 4 or 6.
-        names: of the two geoms.
+        names: names of the two geoms.
     """
 
     geom1: int
@@ -44,12 +45,12 @@ class ContactPair:
     names: tuple[str, str]
 
     def __str__(self) -> str:
-        """The two names, as messages print them."""
+        """Return the two names as printed in messages."""
         return " – ".join(self.names)
 
 
 class ContactParameters(eqx.Module):
-    r"""Effective contact parameters of some pairs, one row each.
+    r"""Effective contact parameters, one row per pair.
 
     Attributes:
         stiffness: $k = \omega_0^2$, in 1/s².
@@ -58,10 +59,10 @@ class ContactParameters(eqx.Module):
         width: penetration over which the impedance rises, in m.
         friction: two sliding, one torsional (m) and two rolling (m) coefficients.
         margin: distance at which contact begins, in m.
-        pyramid: $c$ of `contact.law`, by which the normal direction of a pyramid yields more or less; else 1.
-        solref: as MuJoCo mixes it, before `refsafe` and before formats are resolved.
-        solimp: as MuJoCo mixes it, before it is clamped.
-        timestep: of the model, in s.
+        pyramid: $c$ of `contact.law`, the relative compliance of a pyramid's normal direction; 1 for other cones.
+        solref: `solref` as mixed by MuJoCo, before `refsafe` and before formats are resolved.
+        solimp: `solimp` as mixed by MuJoCo, before it is clamped.
+        timestep: time step of the model, in s.
     """
 
     stiffness: Float[Array, "*batch pairs"]
@@ -97,16 +98,16 @@ class ContactParameters(eqx.Module):
         return timestep**2 * self.stiffness + 2.0 * timestep * self.damping
 
     def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
-        """Depth at rest below the distance at which contact begins (m); $(1 - d_w) a_0 / k$ for constant impedance.
+        """Return the depth at rest below the distance at which contact begins (m); $(1 - d_w) a_0 / k$ for constant impedance.
 
         Args:
-            acceleration: $a_0$ at which the bodies would approach without contact, in m/s²; for one body on the ground
-                gravity's, for a stack of n alike n times that. See `contact.law` for when this is exact.
+            acceleration: the acceleration $a_0$ at which the bodies would approach without contact, in m/s². For one body on
+                the ground it is gravity, for a stack of n equal ones n times that. `contact.law` says when this is exact.
         """
         return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
 
     def rest_distance(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
-        """Distance of the geoms at rest, margin less `rest_depth`: positive where they hover (m)."""
+        """Return the distance of the geoms at rest (m), the margin less `rest_depth`: positive where they hover."""
         return self.margin - self.rest_depth(acceleration)
 
 
@@ -126,7 +127,7 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
     """List the pairs of geoms that MJX tests for contact, in no particular order.
 
     Args:
-        model: of C MuJoCo or of MJX. Only its static structure is read.
+        model: a model of C MuJoCo or of MJX. Only its static structure is read.
 
     Returns:
         The pairs; none if contacts or constraints are disabled.
@@ -148,7 +149,7 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
 def named_pairs(
     pairs: tuple[ContactPair, ...], wanted: tuple[tuple[str, str], ...], what: str
 ) -> tuple[ContactPair, ...]:
-    """Return the pairs of these names, in the order of `pairs`; refuse unknown names as those of `what`."""
+    """Return the pairs with these names, in the order of `pairs`; refuse unknown names in a message about `what`."""
     known = {frozenset(pair.names) for pair in pairs}
     for names in wanted:
         if frozenset(names) not in known:
@@ -160,7 +161,7 @@ def named_pairs(
 
 
 def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tuple[int, ...]:
-    """Geoms whose parameters decide those of a pair: none if explicit, one if it has priority."""
+    """Return the geoms that determine the parameters of a pair: none if it is explicit, one if that has priority."""
     return () if pair.explicit >= 0 else _of_most_priority(model, pair.geom1, pair.geom2)
 
 
@@ -169,16 +170,16 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
     return tuple(geom for geom in geoms if model.geom_priority[geom] == highest)
 
 
-# One program: operation by operation, each compiled on its own, it takes seconds for the first scene of a kind.
+# Compiled as one program: one operation after another takes seconds for the first scene of a kind.
 @eqx.filter_jit
 def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
-    """Compute what the dynamics makes of the contact parameters in a model.
+    """Compute the effective contact parameters of a model.
 
     Differentiable with respect to the model's leaves, and traceable.
 
     Args:
-        model: of MJX; leaves may be traced.
-        pairs: of that model; all that can touch, if left out.
+        model: a model of MJX; leaves may be traced.
+        pairs: pairs of that model; by default all that can touch.
 
     Returns:
         One row per pair, in the order given.
@@ -221,7 +222,7 @@ def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
     weight = _mix_weight(model, geom1, geom2)[:, None]
     solref1, solref2 = model.geom_solref[geom1], model.geom_solref[geom2]
     both_standard = (solref1[:, :1] > 0) & (solref2[:, :1] > 0)
-    # Numbers of the direct format are negative, so the smaller one is the stiffer one.
+    # Numbers of the direct format are negative, so the smaller one is stiffer.
     solref = jnp.where(both_standard, weight * solref1 + (1 - weight) * solref2, jnp.minimum(solref1, solref2))
     solimp = weight * model.geom_solimp[geom1] + (1 - weight) * model.geom_solimp[geom2]
     friction = jnp.maximum(model.geom_friction[geom1], model.geom_friction[geom2])
@@ -246,7 +247,7 @@ def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
 
 
 def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array:
-    """Weight of the first geom: its share of `solmix`, one half if both are zero."""
+    """Return the weight of the first geom: its share of `solmix`, one half if both are zero."""
     solmix1, solmix2 = model.geom_solmix[geom1], model.geom_solmix[geom2]
     smallest = mujoco.mjMINVAL
     neither = (solmix1 < smallest) & (solmix2 < smallest)

@@ -1,7 +1,7 @@
-r"""How soft contacts are, set alike on every pair of geoms that can touch.
+r"""Contact softness, set equally on every pair of geoms that can touch.
 
-The numbers are those of `contact.parameters`, with $b = 2 \zeta \omega_0$. Raising $k$ makes contact stiffer; raising $d$ makes
-it yield less to a sustained force. With a margin the force begins at that distance from the surface.
+The parameters are those of `contact.parameters`, with $b = 2 \zeta \omega_0$. A larger $k$ makes contact stiffer; a larger $d$
+makes it yield less to a sustained force. With a margin the force begins at that distance from the surface.
 """
 
 import dataclasses
@@ -32,12 +32,12 @@ from mjxgrad.contact.parameters import (
 
 _PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
 _SUBSETS = ("geoms", "pairs", "bodies", "groups")
-# What is positive by nature is interpolated by ratios.
+# Positive quantities that are interpolated geometrically.
 _GEOMETRIC = ("stiffness", "width", "rest_acceleration")
 _Pairs = tuple[ContactPair, ...]
-# As numbers: an integer of numpy does not compare with MuJoCo's enumerations.
+# Plain integers: NumPy's integers do not equal MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
-_ROUNDING = 1e-9  # of the pseudo-inverse of a matrix of zeros and ones
+_ROUNDING = 1e-9  # error of the pseudo-inverse of a matrix of zeros and ones
 
 
 _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
@@ -51,35 +51,34 @@ _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 
 class Softness(eqx.Module):
-    r"""Contact softness, set consistently on all pairs of geoms or on some of them.
+    r"""Contact softness, set consistently on all pairs of geoms or on a subset.
 
-    Stiffness and damping are written in MuJoCo's direct format, solref $= (-k, -b)$ with
-    $b = 2 \zeta \sqrt k$: in the standard format `refsafe` silently replaces a time constant
-    below two time steps, and the direct one it leaves alone. They are written to both geoms of
-    a pair, so that neither mixing nor priority changes them.
+    Stiffness and damping are written in MuJoCo's direct format, solref $= (-k, -b)$ with $b = 2 \zeta \sqrt k$. In the
+    standard format `refsafe` silently replaces a time constant below two time steps; it leaves the direct format alone. Both
+    geoms of a pair get the values, so that neither mixing nor priority changes them.
 
-    A margin moves the place where force begins away from the surface, and with it the place of rest: bodies hover by
-    the margin less their depth. `rest_acceleration` gives the height back, exactly under one load, by a softer
-    spring, $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Shrinking the geoms by
-    the margin would undo it, for a margin is nothing but larger geoms; a lower impedance runs out at $d = 0$
-    where $k m > a_0$. The price: n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
+    A margin moves the start of the force away from the surface, and with it the place of rest: bodies hover by the margin less
+    their depth. `rest_acceleration` restores the height, exactly under one load, by a softer spring:
+    $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Two other ways fail. Geoms that shrink by
+    the margin cancel it, since a margin only enlarges geoms. A lower impedance reaches $d = 0$ where $k m > a_0$. But under a
+    softer spring n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
 
-    A part left as `None` stays as it is in the model; of stiffness and damping ratio the one not
-    given keeps its present effective value. Every part is a leaf of a pytree, so that a sweep is
-    one `jax.vmap` over a `Softness` with a leading axis (see `sweep`).
+    A part that is `None` stays as it is in the model. If only one of stiffness and damping ratio is given, the other keeps its
+    present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` over a `Softness` with a
+    leading axis (see `sweep`).
 
     Attributes:
-        stiffness: $k = \omega_0^2$, in 1/s²; positive. With `rest_acceleration`, that without margin.
+        stiffness: $k = \omega_0^2$, in 1/s²; positive. With `rest_acceleration` it is the stiffness without margin.
         damping_ratio: $\zeta$; 1 is critical.
         impedance: a constant $d$, or $(d_0, d_w)$ at the surface and at depth `width`. MuJoCo
             keeps it between 1e-4 and 0.9999.
         width: depth over which the impedance rises from $d_0$ to $d_w$, in m.
-        margin: distance at which force begins, in m; at least 0. It is that of the pair, shared among its geoms.
+        margin: distance at which force begins, in m; at least 0. The margin of a pair is shared among its geoms.
         rest_acceleration: $a_0$ under which bodies rest as high as without margin, in m/s²; None lets them hover.
-        geoms: change only pairs with at least one of these geoms, by name.
-        pairs: change only these pairs, by the names of their geoms.
-        bodies: change only pairs with at least one geom of these bodies, by name.
-        groups: change only pairs with at least one geom of these groups (MJCF's `group`, 0 to 5).
+        geoms: names of geoms; only pairs with at least one of them change.
+        pairs: pairs of geom names; only these pairs change.
+        bodies: names of bodies; only pairs with at least one of their geoms change.
+        groups: geom groups (MJCF's `group`, 0 to 5); only pairs with at least one geom of these change.
     """
 
     stiffness: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
@@ -110,13 +109,13 @@ class Softness(eqx.Module):
 
     @classmethod
     def sweep(cls, **parts: Any) -> "Softness":
-        """Stack several values of softness for `jax.vmap`, broadcasting what stays the same.
+        """Stack several values of softness for `jax.vmap`; parts with a single value are broadcast.
 
         `Softness.sweep(stiffness=[1e2, 1e4], damping_ratio=1.0)` has two values of each.
 
         Args:
-            **parts: as for `Softness`, each with or without a leading axis; an impedance
-                $(d_0, d_w)$ has its pair of numbers on the last axis.
+            **parts: the arguments of `Softness`, each with or without a leading axis; an impedance $(d_0, d_w)$ has its pair
+                on the last axis.
 
         Returns:
             One `Softness` whose leaves share their leading axis.
@@ -133,16 +132,16 @@ class Softness(eqx.Module):
 
     @classmethod
     def between(cls, start: "Softness", end: "Softness", progress: Float[ArrayLike, ""]) -> "Softness":
-        """Go a part of the way from one softness to another; traceable.
+        """Interpolate between two values of softness; traceable.
 
-        Stiffness, width and rest acceleration change by equal factors, the rest by equal amounts. Where a smoothing of
+        Stiffness, width and rest acceleration change by equal factors, other parts by equal amounts. Where a smoothing of
         `optimise` lowers a scale from 1, `lambda scale: objective(Softness.between(hard, soft, scale))` hardens the
         contact with it; `progress = step / num_steps` makes a schedule.
 
         Args:
-            start: at progress 0.
-            end: at progress 1; with the same parts and the same subset.
-            progress: clipped to between 0 and 1.
+            start: the softness at progress 0.
+            end: the softness at progress 1, with the same parts and the same subset.
+            progress: share of the way, clipped to between 0 and 1.
 
         Raises:
             ValueError: if the two differ in the parts that they give or in their subset.
@@ -165,7 +164,7 @@ class Softness(eqx.Module):
         return cls(**parts)
 
     def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
-        """Return the pairs that this changes, all without a subset.
+        """Return the pairs that this softness changes; all pairs without a subset.
 
         Raises:
             ValueError: if a name is unknown or can touch nothing.
@@ -186,15 +185,14 @@ class Softness(eqx.Module):
     def apply(self, model: mjx.Model) -> mjx.Model:
         r"""Write this softness into a model.
 
-        That is `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp`, `pair_margin`. Traceable and
+        It writes `geom_solref`, `geom_solimp`, `geom_margin`, `pair_solref`, `pair_solimp` and `pair_margin`. Traceable and
         differentiable with respect to every part and to the model's leaves. If only one of stiffness and damping ratio is given,
-        a geom that takes part in several pairs can keep the other's present value only if those pairs agree in it.
+        a geom of several pairs can keep the other's present value only if these pairs have the same.
 
         Raises:
-            ValueError: if a part has a leading axis; if a name is unknown; if a geom to be changed
-                also decides the contact of a pair that was not selected; if the present values
-                to be kept disagree; if a margin is asked of a mesh or height field, or a height to be kept of a contact
-                that has a margin already and no stiffness given.
+            ValueError: if a part has a leading axis; if a name is unknown; if a changed geom also determines the contact of a
+                pair that was not selected; if present values to be kept disagree; if a margin is set on a mesh or height
+                field; if a height is to be kept for a contact that already has a margin, without a given stiffness.
         """
         for name in _PARTS:
             shape = np.shape(getattr(self, name))
@@ -211,7 +209,7 @@ class Softness(eqx.Module):
         if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
             return model
         _refuse_shared_geoms(model, selected)
-        # For each place to be written, the pair that it belongs to.
+        # The pair of each geom to write.
         geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
 
         model = model.replace(
@@ -227,7 +225,7 @@ class Softness(eqx.Module):
         return model
 
     def _with_nan_for_what_is_refused(self) -> "Softness":
-        """Return the same with NaN in place of traced values out of range, by which a rollout is flagged as diverged."""
+        """Return the softness with NaN in place of traced values out of range, so that a rollout is flagged as diverged."""
         parts = {}
         for name, (is_valid, _) in _REQUIREMENTS.items():
             value = getattr(self, name)
@@ -236,7 +234,7 @@ class Softness(eqx.Module):
         return dataclasses.replace(self, **parts)
 
     def _solref(self, model: mjx.Model, pairs: tuple[ContactPair, ...], before: ContactParameters) -> Array:
-        """The direct format for each pair, from a model that has the other parts."""
+        """Return solref in the direct format for each pair; the model has the other parts already."""
         refuse = functools.partial(_refuse_disagreement, model, pairs)
         stiffness, damping_ratio = self.stiffness, self.damping_ratio
         if stiffness is None:
@@ -261,7 +259,7 @@ class Softness(eqx.Module):
         return jnp.stack([-stiffness, -jnp.broadcast_to(damping, stiffness.shape)], axis=-1)
 
     def _set_margin(self, model: mjx.Model, pairs: tuple[ContactPair, ...], explicit: list[int]) -> mjx.Model:
-        """Write the margin to explicit pairs, and share it among the geoms of the others."""
+        """Write the margin to explicit pairs, and share it among the geoms of other pairs."""
         geoms, shares, kept = _margin_shares(model, pairs)
         geom_margin, pair_margin = model.geom_margin, model.pair_margin
         if geoms.size:
@@ -272,7 +270,7 @@ class Softness(eqx.Module):
         return model.replace(geom_margin=geom_margin, pair_margin=pair_margin)
 
     def _set_solimp(self, solimp: Array, rows: list[int]) -> Array:
-        """Write impedance and width; they mix linearly, so the rest keeps its mixed value."""
+        """Write impedance and width; `solimp` mixes linearly, so its other numbers keep their mixed values."""
         if not rows:
             return solimp
         if self.impedance is not None:
@@ -289,7 +287,7 @@ def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
 
 
 def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
-    """Refuse to change pairs whose geoms also decide the contact of others."""
+    """Refuse to change pairs whose geoms also determine the contacts of other pairs."""
     decided_by = {geom: pair for pair in selected for geom in deciding_geoms(model, pair)}
     for other in contact_pairs(model):
         if other in selected:
@@ -300,7 +298,7 @@ def _refuse_shared_geoms(model: mjx.Model, selected: _Pairs) -> None:
 
 
 def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part: str, remedy: str) -> None:
-    """Refuse to write one value per pair where pairs with different ones share a geom; not looked at if traced."""
+    """Refuse different known values for pairs that share a geom; traced values are not checked."""
     if not is_known(values):
         return
     known, first = np.asarray(values), {}
@@ -315,12 +313,13 @@ def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part
 
 
 def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    r"""Say how a margin of pairs becomes margins of geoms, which MuJoCo adds, and leaves other pairs alone.
+    r"""Return how margins of pairs become margins of geoms, which MuJoCo adds, without a change to other pairs.
 
-    A geom of a pair that was not selected keeps its margin; the others of a pair take what is missing, two of them half
-    each. That is the solution of least norm of $S x = m - P x_\text{kept}$, with a row for each pair. Pairs with parameters of
-    their own have no part in it. Returned are the geoms to write, the matrix from what each pair misses to their margins, and P
-    over all geoms.
+    A geom of a pair that was not selected keeps its margin. The other geoms of a pair take the difference, two of them half
+    each. That is the least-norm solution of $S x = m - P x_\text{kept}$, with one row per pair; explicit pairs are left out.
+
+    Returns:
+        The geoms to write, the matrix from the pairs' missing margins to the geoms' margins, and P over all geoms.
     """
     for pair in selected:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
@@ -343,7 +342,7 @@ def _margin_shares(model: mjx.Model, selected: _Pairs) -> tuple[np.ndarray, np.n
         if not shares[row].any():
             raise ValueError(_shared(pair, taken[pair.geom1], pair.geom1))
     solution = np.linalg.pinv(shares)
-    # Whether they can be met must not depend on values, which may be traced: every right-hand side has to be in reach.
+    # Values may be traced, so solvability must not depend on them: every right-hand side must be in the range of S.
     wanted = np.column_stack([np.ones(len(implicit)), kept])
     unmet = np.abs(shares @ solution @ wanted - wanted).max(axis=1, initial=0.0)
     if unmet.max(initial=0.0) > _ROUNDING:

@@ -1,4 +1,4 @@
-"""What contacts do otherwise than their numbers say: altered by MuJoCo, too stiff for the time step, hovering, without effect."""
+"""Warnings about contact parameters that MuJoCo alters, that are unstable, that let bodies hover, or that have no effect."""
 
 from collections.abc import Iterable, Iterator
 
@@ -13,16 +13,16 @@ from mjxgrad._text import format_number, name_pairs
 from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
 
-_ABOVE_NOTHING = 1e-6  # m; a body that hovers by less rests where it should
+_ABOVE_NOTHING = 1e-6  # m; bodies that hover by less are taken to touch
 
 
 def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:
     r"""Return the largest $h \omega_0$ at which a contact at full impedance does not gain energy.
 
-    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit Euler, as
-    which `implicitfast` treats contact too, is stable while $h^2 k + 2 h b < 4$, that is up to
-    $2 (\sqrt{1 + \zeta^2} - \zeta)$. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The limit of
-    $h b$ is $2 \zeta$ times this.
+    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit Euler is
+    stable while $h^2 k + 2 h b < 4$, that is up to $2 (\sqrt{1 + \zeta^2} - \zeta)$; `implicitfast` treats contact in the same
+    way. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The limit of $h b$ is $2 \zeta$ times
+    the result.
     """
     if integrator != mujoco.mjtIntegrator.mjINT_RK4:
         # The difference of two large numbers, in a form that does not cancel.
@@ -44,7 +44,7 @@ def _runge_kutta_growth(step: float, damping_ratio: float) -> float:
 
 
 def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[str]:
-    """Say which contacts of a model with known values are altered by `refsafe` or too stiff for the time step."""
+    """Return warnings about contacts that `refsafe` alters or that are too stiff for the time step; values must be known."""
     if not pairs:
         return []
     # Inside jit, operations on known values would be traced, too.
@@ -64,7 +64,7 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
 
 
 def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
-    """Say where MJX finds other contact points than C MuJoCo does, in one sentence per kind of difference."""
+    """Return one sentence per kind of pair for which MJX and C MuJoCo find different contact points."""
     geom = mujoco.mjtGeom
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
     known = (
@@ -77,10 +77,10 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
 def steepest(
     stiffness: float, damping: float, impedance: Float[np.ndarray, "2"] | tuple[float, float], width: float
 ) -> tuple[float, float]:
-    r"""Return stiffness and damping where the impedance is largest, which is at first touch if it falls with depth.
+    r"""Return stiffness and damping at the largest impedance, which is at first touch if it falls with depth.
 
-    Both are given at full depth (1/s², 1/s). The force on a body is $d(r)$ of the acceleration that is asked for, so that
-    stiffness goes as the square of the impedance and damping as the impedance; without a width that is $d_w$ everywhere.
+    The arguments hold at full depth (1/s², 1/s). The force is the share $d(r)$ of the reference acceleration, so stiffness
+    scales with the square of the impedance and damping with the impedance. Without a width the impedance is $d_w$ everywhere.
     """
     share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
     return float(share**2 * stiffness), float(share * damping)
@@ -118,9 +118,9 @@ def beyond_stability(stiffness: float, damping: float, timestep: float, integrat
 
 
 def softness_warnings(softness: Softness, model: mjx.Model, mj_model: mujoco.MjModel | None = None) -> list[str]:
-    """Say which parts of a softness have no effect on a model, and where bodies rest otherwise than they touch.
+    """Return warnings about parts of a softness without effect, and about bodies that rest apart or inside each other.
 
-    Parts that are traced are not looked at, nor distances at the reference pose without the C model.
+    Traced parts are not checked. Distances at the reference pose are checked only with the C model.
     """
     if not contact_pairs(model):
         return ["softness has no effect: no two geoms of the scene can touch"]
@@ -174,7 +174,7 @@ def _resting_otherwise(
 def _pushed_apart(
     model: mjx.Model, mj_model: mujoco.MjModel, pairs: tuple[ContactPair, ...]
 ) -> Iterator[tuple[ContactPair, str]]:
-    """Find geoms that do not touch at the reference pose, but are closer than their margin."""
+    """Yield geoms that do not touch at the reference pose but are closer than their margin."""
     data = mujoco.MjData(mj_model)
     mujoco.mj_kinematics(mj_model, data)
     margins = np.asarray(contact_parameters(model, pairs).margin, float)
@@ -202,7 +202,7 @@ def _smaller_size(model: mjx.Model, pair: ContactPair) -> float:
 
 
 def _grouped(found: Iterable[tuple[ContactPair, str]]) -> list[str]:
-    """Return one sentence for all pairs of which the same is said."""
+    """Return one sentence for all pairs with the same message."""
     messages: dict[str, list[ContactPair]] = {}
     for pair, text in found:
         messages.setdefault(text, []).append(pair)

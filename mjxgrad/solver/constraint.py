@@ -10,15 +10,15 @@ T = |u₁..|:
   (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
-Rows under noise (see `smoothing`) have the mean of these costs: of x + c w over noise w on the distance, where it makes
-contact. That of ½ min(x, 0)² is convex in x with the derivative -`_mean_push`. For the cone it is as simple, since its
-three zones are the sum of two such terms,
+Rows under noise (see `smoothing`) have the mean of these costs, at x + c w over noise w on the distance, where it makes
+contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_violation`. The cone is as simple: its three zones
+are the sum of two such terms,
 
     ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
 
 at the top both vanish, in the middle the second does, at the bottom they add up to ½ Σ D x². Noise shifts N by μcw, so
-each term is the simple one with its own spread: exact, whatever the kernel, and convex. At T = 0 the pulls of both
-along the tangent cancel.
+each term is the simple one with a spread of its own. This is exact for every kernel, and convex. At T = 0 the tangential
+forces of the two terms cancel.
 
 Arrays may carry the batch as trailing axes, see `linear`.
 
@@ -57,7 +57,7 @@ class ConeGroup:
 
 @dataclasses.dataclass(frozen=True)
 class RowLayout:
-    """Which law holds on which rows. Static: it shapes the compiled program."""
+    """The law of each constraint row. Static: it shapes the compiled program."""
 
     num_equality: int
     num_friction: int
@@ -72,26 +72,26 @@ class RowLayout:
 
     @property
     def simple_stop(self) -> int:
-        """End of the rows that stand for themselves."""
+        """End of the uncoupled rows, those outside elliptic cones."""
         return self.cones[0].start if self.cones else self.num_rows
 
     @property
     def is_piecewise_quadratic(self) -> bool:
-        """Whether the cost along a line is."""
+        """Whether the cost along a line is piecewise quadratic."""
         return not self.cones and self.kernel is None
 
     @property
     def hard_stop(self) -> int:
-        """End of the rows among them that have no noise; those from here on have it, cones included."""
+        """End of the uncoupled rows without noise; all later rows have noise, cones included."""
         return self.simple_stop if self.kernel is None else self.first_noisy
 
 
 class Noise(eqx.Module):
-    """What noise on the distance r does to x of a contact's or limit's rows; of cones the first row counts.
+    """The effect of noise on the distance r on x of the rows of contacts and limits; a cone uses its first row.
 
     Attributes:
-        spread: by how much x moves if r does by one length of the kernel (m/s² or rad/s²); positive.
-        gate: x at which contact ends by distance alone and not by acceleration; -inf if it never does (m/s² or rad/s²).
+        spread: change of x when r changes by one length of the kernel (m/s² or rad/s²); positive.
+        gate: x at which contact ends by distance and not by acceleration; -inf if it never does (m/s² or rad/s²).
     """
 
     spread: _PerRow
@@ -102,11 +102,11 @@ class Rows(eqx.Module):
     """Parameters of the constraint rows of one state.
 
     Attributes:
-        reference: a_ref, the acceleration that a row asks for (m/s² or rad/s²).
+        reference: the reference acceleration a_ref (m/s² or rad/s²).
         weight: D, the inverse of the regularisation R (kg or kg m²).
-        bound: largest force of a friction loss row (N or N m); elsewhere unused.
-        scales: per elliptic group (μ, f₁, ..., f_dim-1) of each contact; μ = f₁/√impratio.
-        noise: of the rows, where the layout has a kernel.
+        bound: largest force of a friction loss row (N or N m); unused by other rows.
+        scales: (μ, f₁, ..., f_dim-1) of each contact, one array per elliptic group; μ = f₁/√impratio.
+        noise: noise on the rows, if the layout has a kernel.
     """
 
     reference: _PerRow
@@ -130,41 +130,41 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
     ]
     if layout.kernel is not None:
         noisy = slice(layout.hard_stop, layout.simple_stop)
-        parts.append(rows.weight[noisy] * _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
+        parts.append(rows.weight[noisy] * _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
     for k in range(len(layout.cones)):
         parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
 def bounds(layout: RowLayout, rows: Rows) -> tuple[_PerRow, _PerRow]:
-    """Return least and largest force of rows that stand for themselves without noise: where it lies between, it is -D x."""
+    """Return the least and the largest force of uncoupled rows without noise; between them the force is -D x."""
     bound, one_sided = rows.bound[layout.friction], jnp.zeros_like(rows.bound[layout.friction.stop :])
     equality = jnp.full_like(rows.bound[: layout.num_equality], jnp.inf)
     low = jnp.concatenate([-equality, -bound, one_sided])
     return low, jnp.concatenate([equality, bound, jnp.full_like(one_sided, jnp.inf)])
 
 
-class Bend(eqx.Module):
-    """The second derivative of the cost by x: of rows that stand for themselves, and a matrix for each elliptic contact."""
+class RowHessian(eqx.Module):
+    """The second derivative of the cost by x: one number per uncoupled row, one matrix per elliptic contact."""
 
     simple: Float[Array, "_ *batch"]
     cones: tuple[Float[Array, "_ _ _ *batch"], ...]
 
 
-def bend(layout: RowLayout, rows: Rows, x: _PerRow) -> Bend:
+def hessian(layout: RowLayout, rows: Rows, x: _PerRow) -> RowHessian:
     """Return the second derivative of the cost with respect to x."""
     cones = []
     for k, group in enumerate(layout.cones):
         unit = jnp.eye(group.dim, dtype=x.dtype).reshape(1, group.dim, group.dim, *(1,) * (x.ndim - 1))
         unit = jnp.broadcast_to(unit, (group.count, group.dim, group.dim, *x.shape[1:]))
         cones.append(_cone(layout, k, rows, x).curvature_product(unit))
-    return Bend(_simple_curvature(layout, rows, x), tuple(cones))
+    return RowHessian(_simple_curvature(layout, rows, x), tuple(cones))
 
 
-def bend_product(layout: RowLayout, bend: Bend, x: _PerRow) -> _PerRow:
-    """Return a second derivative of the cost times a vector."""
-    parts = [bend.simple * x[: layout.simple_stop]]
-    for group, matrix in zip(layout.cones, bend.cones, strict=True):
+def hessian_product(layout: RowLayout, row_hessian: RowHessian, x: _PerRow) -> _PerRow:
+    """Return the second derivative of the cost times a vector."""
+    parts = [row_hessian.simple * x[: layout.simple_stop]]
+    for group, matrix in zip(layout.cones, row_hessian.cones, strict=True):
         own = _blocks(group, x)
         both = add(matrix[:, :, k] * own[:, None, k] for k in range(group.dim))
         parts.append(both.reshape(-1, *x.shape[1:]))
@@ -191,12 +191,12 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array,
     if layout.kernel is None:
         return curvature
     noisy = slice(layout.hard_stop, layout.simple_stop)
-    share = _mean_push(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
+    share = _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
     return jnp.concatenate([curvature, rows.weight[noisy] * share])
 
 
 class _Cone(eqx.Module):
-    """An elliptic group seen in the coordinates u, with its zones."""
+    """An elliptic group in the coordinates u, with its zones."""
 
     group: ConeGroup = eqx.field(static=True)
     weight: _PerRow
@@ -230,18 +230,18 @@ class _Cone(eqx.Module):
 
 
 class _NoisyCone(eqx.Module):
-    """An elliptic group under noise: both terms of its cost in the coordinates u."""
+    """An elliptic group under noise: the two terms of its cost in the coordinates u."""
 
     scale: _Directions
     stiffness: _PerContact
     tangential: Float[Array, "contacts tangents *batch"]
     slip: _PerContact
-    pushes: tuple[_PerContact, _PerContact]
+    violations: tuple[_PerContact, _PerContact]
     shares: tuple[_PerContact, _PerContact]
     hold: _PerContact
 
     def force(self, _: _PerRow) -> _Directions:
-        press = self.pushes[0] + self.scale[:, 0] * self.pushes[1]
+        press = self.violations[0] + self.scale[:, 0] * self.violations[1]
         both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
         return self.stiffness[:, None] * self.scale * both
 
@@ -276,18 +276,17 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
     first = Noise(mu * noise.spread, mu * noise.gate)
     second = Noise(mu * first.spread, mu * first.gate)
-    push1, share1 = _mean_push(layout.kernel, normal - mu * slip, first)
-    push2, share2 = _mean_push(layout.kernel, mu * normal + slip, second)
-    # The pull along the tangent, per slip. Where slip is small both pushes nearly cancel; there it is the mean over
-    # the slip of its derivative, by the trapezoidal rule, whose error (of second order) meets that of rounding at the
-    # cube root of eps.
-    still = _mean_push(layout.kernel, normal, first)[1]
+    violation1, share1 = _mean_violation(layout.kernel, normal - mu * slip, first)
+    violation2, share2 = _mean_violation(layout.kernel, mu * normal + slip, second)
+    # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the
+    # slip is taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
+    still = _mean_violation(layout.kernel, normal, first)[1]
     smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
     is_small = slip < smallest
-    moving = (mu * push1 - push2) / jnp.where(is_small, 1.0, slip)
+    moving = (mu * violation1 - violation2) / jnp.where(is_small, 1.0, slip)
     resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
     hold = jnp.where(is_small, resting, moving)
-    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (push1, push2), (share1, share2), hold)
+    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (violation1, violation2), (share1, share2), hold)
 
 
 def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
@@ -299,13 +298,13 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
     return Noise(rows.noise.spread[which], rows.noise.gate[which])
 
 
-def _mean_push(
+def _mean_violation(
     kernel: Kernel, x: Float[Array, "n *batch"], noise: Noise
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
-    """Return the mean of max(-x - c w, 0) where noise makes contact, and the probability of a push, its slope but for the sign.
+    """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
 
-    Above the gate the acceleration ends the push before the distance does, and the mean is the softened ramp. Below it
-    the distance alone decides, so the probability stays as it is at the gate, and the mean goes on along its tangent.
+    Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the
+    gate the distance alone decides: the probability keeps its value at the gate, and the mean continues along its tangent.
     """
     held = jnp.where(x > noise.gate, x, noise.gate)
     near = held / noise.spread

@@ -1,7 +1,7 @@
-"""The system of one Newton step, (M + Jᵀ s'' J) x = v: assembled and solved in the way that suits the device.
+"""Linear solves of Newton's method, (M + Jᵀ s'' J) x = v, assembled and factored per device.
 
-Arrays may carry the batch as trailing axis, see `linear`. A CPU assembles the matrix and factors it, operation by operation along
-the batch. On a GPU the matrix of many states would go to memory and back many times; there one kernel does it all.
+Arrays may carry the batch as trailing axis, see `linear`. A CPU assembles the matrix and factors it, each operation along the
+batch. A GPU would move the matrices of many states to memory and back many times, so it uses a single kernel.
 """
 
 from collections.abc import Callable
@@ -11,39 +11,41 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad.batched import cholesky, device, linear, on_gpu
-from mjxgrad.solver.constraint import Bend, RowLayout
+from mjxgrad.solver.constraint import RowHessian, RowLayout
 from mjxgrad.solver.sparse import SparseRows
 
 _Vector = Float[Array, "nv *batch"]
 _Matrix = Float[Array, "nv nv *batch"]
 
 
-# Of the diagonal of a matrix: what is added where rounding has made it indefinite stays below.
-_MOST_MENDED = 0.01
+# Upper bound on the regularisation of an indefinite matrix, as a share of its diagonal.
+_MAX_SHIFT = 0.01
 
 
 def solve(
-    mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: Bend, vector: _Vector
+    mass: _Matrix, jacobian: SparseRows, layout: RowLayout, row_hessian: RowHessian, vector: _Vector
 ) -> tuple[_Vector, _Vector]:
-    """Return (M + Jᵀ s'' J)⁻¹ vector, non-finite where that is not positive definite, and the diagonal of the matrix."""
+    """Return (M + Jᵀ s'' J)⁻¹ vector, non-finite where the matrix is not positive definite, and the matrix's diagonal."""
 
-    def step_by_step(mass, jacobian, bend, vector):
-        hessian = jacobian.gram(mass, layout, bend)
+    def step_by_step(mass, jacobian, row_hessian, vector):
+        hessian = jacobian.gram(mass, layout, row_hessian)
         return cholesky.cholesky_solve(hessian, vector), linear.diagonal(hessian)
 
-    return _on_device(in_one_kernel, step_by_step, mass, jacobian, layout, bend, vector)
+    return _on_device(in_one_kernel, step_by_step, mass, jacobian, layout, row_hessian, vector)
 
 
-def solve_mended(mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: Bend, vector: _Vector) -> _Vector:
-    """Return (M + Jᵀ s'' J)⁻¹ vector, also where rounding has made that indefinite.
+def solve_regularised(
+    mass: _Matrix, jacobian: SparseRows, layout: RowLayout, row_hessian: RowHessian, vector: _Vector
+) -> _Vector:
+    """Return (M + Jᵀ s'' J)⁻¹ vector, regularised where rounding has made the matrix indefinite.
 
-    In single precision s'' may exceed M so far (impedance near 1) that M is lost. Then the least share of its diagonal that mends
-    it, by powers of four from rounding on, is added: there less moves.
+    At an impedance near 1, s'' may exceed M so far that M is lost in single precision. Then the smallest share of the
+    diagonal that suffices is added, tried in powers of four from rounding on, which makes the step shorter.
     """
     unit = jnp.eye(len(vector), dtype=vector.dtype).reshape(len(vector), -1, *(1,) * (vector.ndim - 1))
 
-    def step_by_step(mass, jacobian, bend, vector):
-        hessian = jacobian.gram(mass, layout, bend)
+    def step_by_step(mass, jacobian, row_hessian, vector):
+        hessian = jacobian.gram(mass, layout, row_hessian)
         diagonal = linear.diagonal(hessian)
         can_be = jnp.isfinite(jnp.stack([diagonal, vector])).all(axis=(0, 1))
 
@@ -54,37 +56,37 @@ def solve_mended(mass: _Matrix, jacobian: SparseRows, layout: RowLayout, bend: B
             return jnp.where(is_known, known, found), is_known | ~is_lost, on_gpu.next_share(share)
 
         first = jnp.zeros_like(vector), jnp.zeros(vector.shape[1:], bool), jnp.zeros((), vector.dtype)
-        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[2] < _MOST_MENDED), attempt, first)[0]
+        return jax.lax.while_loop(lambda s: ~s[1].all() & (s[2] < _MAX_SHIFT), attempt, first)[0]
 
     def at_once(*args):
-        return in_one_kernel(*args, most_mended=_MOST_MENDED)[0]
+        return in_one_kernel(*args, max_shift=_MAX_SHIFT)[0]
 
-    return _on_device(at_once, step_by_step, mass, jacobian, layout, bend, vector)
+    return _on_device(at_once, step_by_step, mass, jacobian, layout, row_hessian, vector)
 
 
-def _on_device(at_once: Callable, step_by_step: Callable, mass, jacobian, layout: RowLayout, bend, vector):
-    """Solve by one kernel where there are some, else by operations."""
+def _on_device(at_once: Callable, step_by_step: Callable, mass, jacobian, layout: RowLayout, row_hessian, vector):
+    """Solve by one kernel where kernels are available, else operation by operation."""
     if vector.ndim == 2 and on_gpu.solves(layout.num_rows, len(vector)):
         return device.by_platform(
-            *(mass, jacobian, bend, vector),
-            gpu=lambda mass, jacobian, bend, vector: at_once(mass, jacobian, layout, bend, vector),
+            *(mass, jacobian, row_hessian, vector),
+            gpu=lambda mass, jacobian, row_hessian, vector: at_once(mass, jacobian, layout, row_hessian, vector),
             default=step_by_step,
         )
-    return step_by_step(mass, jacobian, bend, vector)
+    return step_by_step(mass, jacobian, row_hessian, vector)
 
 
 def in_one_kernel(
     mass: Float[Array, "nv nv batch"],
     jacobian: SparseRows,
     layout: RowLayout,
-    bend: Bend,
+    row_hessian: RowHessian,
     vector: Float[Array, "nv batch"],
     *,
-    most_mended: float = 0.0,
+    max_shift: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "nv batch"], Float[Array, "nv batch"]]:
-    """Do what `solve` does, or `solve_mended` with at most so much; `interpret` runs on any device, slowly."""
-    together = jacobian.together()
-    factors, bent, diagonal = jacobian.bent(together, layout, bend)
+    """Compute `solve`, or `solve_regularised` up to `max_shift`, in one kernel; `interpret` runs on any device, slowly."""
+    rows = jacobian.dense_rows()
+    factors, right, diagonal = jacobian.hessian_factors(rows, layout, row_hessian)
     mass = mass + jnp.eye(len(vector), dtype=mass.dtype)[:, :, None] * diagonal
-    return on_gpu.solve(mass, vector, together, factors, bent, most_mended=most_mended, interpret=interpret)
+    return on_gpu.solve(mass, vector, rows, factors, right, max_shift=max_shift, interpret=interpret)

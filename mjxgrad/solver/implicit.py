@@ -4,17 +4,17 @@ At the minimum g(a, p) = M a - f_smooth - Jᵀ f(J a - a_ref) = 0 for all parame
 
     da = -H⁻¹ (∂g/∂p) dp,        H = ∂g/∂a = M + Jᵀ s'' J.
 
-This is the exact derivative of the converged solve: the iterations are not differentiated, and the warm start has no part in
-it. The rule is linear in dp, so the same line serves forward mode and, transposed, reverse mode. It calls the solve itself
-again, so derivatives of any order nest; one more Newton step with H held fixed would be shorter, but its second derivative is
-wrong, finite and silent, since there H and a do not move with p.
+This is the exact derivative of the converged solve. The iterations are not differentiated, and the warm start has no
+effect. The rule is linear in dp, so it serves forward mode and, transposed, reverse mode. It calls the solve itself, so
+derivatives of any order nest. One more Newton step with fixed H would be shorter, but its second derivative is wrong and
+gives no warning, since H and a do not move with p there.
 
-The residual g is evaluated without M and J: M a is the force that accelerates the bodies, J a the acceleration of one body
-against another. So reverse mode passes through some vectors per body and contact, where the derivative of a Jacobian would be a
-Jacobian. Only the solve and the factor of H need entries, and both are formed with the batch as trailing axis.
+The residual g is evaluated without forming M and J: M a is the force that accelerates the bodies, J a the relative
+acceleration of two bodies. Reverse mode then passes through a few vectors per body and contact, not through a derivative of
+J. Only the solve and the factorisation of H need entries. Both are formed with the batch as trailing axis.
 
-The acceleration is named for `jax.checkpoint`, see `cholesky.SOLUTION`: a rollout that recomputes its steps keeps this vector and
-spares itself the iterations.
+The acceleration has a name for `jax.checkpoint`, see `cholesky.SOLUTION`. A rollout that recomputes its steps keeps this
+vector and skips the iterations.
 """
 
 import functools
@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mjxgrad.batched import device, linear
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.solver import constraint, hessian, newton
-from mjxgrad.solver.constraint import Bend, RowLayout
+from mjxgrad.solver.constraint import RowHessian, RowLayout
 from mjxgrad.solver.newton import System, Variant
 
 _Truth = Bool[Array, ""]
@@ -40,20 +40,20 @@ _Vector = Float[Array, " nv"]
 def solve(
     layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar
 ) -> tuple[_Vector, Int[Array, ""]]:
-    """Return what `newton.minimise` does, differentiable with respect to the system."""
+    """Return the result of `newton.minimise`, differentiable with respect to the system."""
     return linear.batch_last(functools.partial(newton.minimise, layout, max_iterations))(system, start, tolerance)
 
 
 @solve.defjvp
 def _solve_jvp(layout, max_iterations, primals, tangents):
     system, start, tolerance = primals
-    # Named here, where reverse mode reads it: a name inside the call is not seen from outside.
+    # Named here, where reverse mode reads it: `jax.checkpoint` does not see names inside the call.
     acceleration, num_iterations = solve(layout, max_iterations, system, start, tolerance)
     acceleration = checkpoint_name(acceleration, SOLUTION)
     _, change = jax.jvp(lambda s: s.gradient(layout, acceleration), (system,), (tangents[0],))
-    bend = constraint.bend(layout, system.rows, system.rates(acceleration) - system.rows.reference)
-    no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)  # what JAX takes for the tangent of an integer
-    return (acceleration, num_iterations), (-respond(layout, system, bend, change), no_change)
+    row_hessian = constraint.hessian(layout, system.rows, system.mv(acceleration) - system.rows.reference)
+    no_change = np.zeros(num_iterations.shape, jax.dtypes.float0)  # JAX's tangent of an integer
+    return (acceleration, num_iterations), (-solve_linearised(layout, system, row_hessian, change), no_change)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -66,22 +66,24 @@ def solve_both(
     start: _Vector,
     tolerance: _Scalar,
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
-    """Solve in two variants, on CPUs the second time only where they differ.
+    """Solve two variants of a system; a CPU solves the second only where it differs from the first.
 
-    Where they do not, the second solution is the first one, and its derivative must not count, for it is zero. The number of
-    iterations is the larger one.
+    Elsewhere the second solution is the first, and its derivative, which is zero, must not be used. The larger number of
+    iterations is returned.
     """
     minimise = functools.partial(newton.minimise, layout, max_iterations)
 
     def second(system, differ, start, tolerance):
         none = jnp.zeros(differ.shape, jnp.int32)
-        return linear.on_few(minimise, differ, (start, none), system, start, tolerance)
+        return linear.solve_subset(minimise, differ, (start, none), system, start, tolerance)
 
-    if not _takes_few():
-        both, counts = jax.vmap(lambda v: linear.batch_last(minimise)(system.varied(v), start, tolerance))(variants)
+    if not _solves_subset():
+        both, counts = jax.vmap(lambda v: linear.batch_last(minimise)(system.with_variant(v), start, tolerance))(
+            variants
+        )
         return both, jnp.max(counts)
-    found, count = linear.batch_last(minimise)(system.varied(variants[0]), start, tolerance)
-    other, more = linear.batch_last(second)(system.varied(variants[1]), differ, found, tolerance)
+    found, count = linear.batch_last(minimise)(system.with_variant(variants[0]), start, tolerance)
+    other, more = linear.batch_last(second)(system.with_variant(variants[1]), differ, found, tolerance)
     return jnp.stack([found, other]), jnp.maximum(count, more)
 
 
@@ -92,15 +94,15 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
     both = checkpoint_name(both, SOLUTION)
 
     def residual(system: System, variants: Variant) -> Array:
-        return jax.vmap(lambda variant, a: system.varied(variant).gradient(layout, a))(variants, both)
+        return jax.vmap(lambda variant, a: system.with_variant(variant).gradient(layout, a))(variants, both)
 
     def response(variant: Variant, acceleration: Array, force: Array, is_needed: Array | None = None) -> Array:
-        varied = system.varied(variant)
-        bend = constraint.bend(layout, varied.rows, varied.rates(acceleration) - varied.rows.reference)
-        return respond(layout, varied, bend, force, is_needed)
+        varied = system.with_variant(variant)
+        row_hessian = constraint.hessian(layout, varied.rows, varied.mv(acceleration) - varied.rows.reference)
+        return solve_linearised(layout, varied, row_hessian, force, is_needed)
 
     _, change = jax.jvp(residual, (system, variants), (tangents[0], tangents[1]))
-    if _takes_few():
+    if _solves_subset():
         moved = [response(variants[k], both[k], change[k], needed) for k, needed in enumerate((None, differ))]
         moved = -jnp.stack(moved)
     else:
@@ -109,30 +111,32 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
     return (both, count), (moved, no_change)
 
 
-def _takes_few() -> bool:
-    """Whether it pays to solve again for those few of a batch that need it: a GPU is done sooner with all of them at once."""
+def _solves_subset() -> bool:
+    """Return whether to solve only for the members of a batch that need it: a GPU solves all of them sooner."""
     return device.is_cpu()
 
 
-def respond(layout: RowLayout, system: System, bend: Bend, force: _Vector, is_needed: _Truth | None = None) -> _Vector:
-    """Return (M + Jᵀ S J)⁻¹ force for some curvature S of the rows; differentiable, and linear in the force.
+def solve_linearised(
+    layout: RowLayout, system: System, row_hessian: RowHessian, force: _Vector, is_needed: _Truth | None = None
+) -> _Vector:
+    """Return (M + Jᵀ S J)⁻¹ force for a curvature S of the rows; differentiable, and linear in the force.
 
-    Where it is not needed it is zero.
+    The result is zero where it is not needed.
     """
 
     def apply(x: _Vector) -> _Vector:
-        return system.inertia.apply(x) + system.pull(constraint.bend_product(layout, bend, system.rates(x)))
+        return system.inertia.apply(x) + system.rmv(constraint.hessian_product(layout, row_hessian, system.mv(x)))
 
-    def run(system, bend, force):
+    def run(system, row_hessian, force):
         problem = system.problem(layout)
-        return hessian.solve_mended(problem.mass, problem.jacobian, layout, bend, force)
+        return hessian.solve_regularised(problem.mass, problem.jacobian, layout, row_hessian, force)
 
-    def run_where(system, bend, force, is_needed):
-        return linear.on_few(run, is_needed, jnp.zeros_like(force), system, bend, force)
+    def run_where(system, row_hessian, force, is_needed):
+        return linear.solve_subset(run, is_needed, jnp.zeros_like(force), system, row_hessian, force)
 
     def invert(_, force):
         if is_needed is None:
-            return linear.batch_last(run)(system, bend, force)
-        return linear.batch_last(run_where)(system, bend, force, is_needed)
+            return linear.batch_last(run)(system, row_hessian, force)
+        return linear.batch_last(run_where)(system, row_hessian, force, is_needed)
 
     return jax.lax.custom_linear_solve(apply, force, invert, symmetric=True)

@@ -1,9 +1,8 @@
 r"""The constraint Jacobian as a linear map, applied without being formed.
 
-A derivative of the solve needs J only times a vector, and the reverse mode of a product that was never spelled out is as
-cheap as the product: a contact's rows are the relative velocity of two bodies at a point, six numbers per body, whatever the
-number of joints. The solve needs the entries, see `sparse`; a map gives them group by group, a pyramid's edges n ± μ t
-as its directions n, t.
+A derivative of the solve needs only products of J and a vector, and their reverse mode is as cheap as the products. A
+contact's rows are the relative velocity of two bodies at a point: six numbers per body, whatever the number of joints. The
+solve needs the entries, see `sparse`. A map returns them group by group, and a pyramid's edges n ± μ t as its directions n, t.
 
 The entries are formed with or without the batch as trailing axes, see `linear`; a map is applied to one state.
 """
@@ -23,20 +22,20 @@ from mjxgrad.bodies import spatial
 
 _PerRow = Float[Array, " rows"]
 _Vector = Float[Array, " nv"]
-# By how much the entries of a Hessian may grow where contacts are kept together.
+# Largest growth of a Hessian's entries when neighbouring contacts are joined in one group.
 _WASTE = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Items, contacts or single rows, that act on the same joint velocities.
+    """Contacts or single rows (items) that act on the same joint velocities.
 
     Attributes:
-        dofs: which, ascending.
+        dofs: indices of these joint velocities, ascending.
         num: number of items.
-        dim: directions of each.
-        is_pyramid: whether their rows are the edges n ± μ t of a pyramid, two for each direction but the first.
-        is_diagonal: whether each item acts on one of the joint velocities alone, in their order.
+        dim: number of directions of each item.
+        is_pyramid: whether the rows are the edges n ± μ t of a pyramid, two for each direction but the first.
+        is_diagonal: whether each item acts on a single joint velocity, in the order of `dofs`.
     """
 
     dofs: tuple[int, ...]
@@ -55,36 +54,36 @@ class Group:
 
 
 class RowMap(eqx.Module):
-    """Some constraint rows as a linear map from joint velocities."""
+    """Constraint rows as a linear map from joint velocities."""
 
     @property
     @abc.abstractmethod
     def groups(self) -> tuple[Group, ...]:
-        """The rows in order, by the joint velocities that they see."""
+        """The rows in order, grouped by the joint velocities that they act on."""
 
     @abc.abstractmethod
-    def rates(self, velocity: _Vector) -> _PerRow:
+    def mv(self, velocity: _Vector) -> _PerRow:
         """Return J v."""
 
     @abc.abstractmethod
-    def pull(self, force: _PerRow) -> _Vector:
+    def rmv(self, force: _PerRow) -> _Vector:
         """Return Jᵀ f."""
 
     @abc.abstractmethod
     def directions(self) -> Sequence[Float[Array, "num dim dofs *batch"]]:
-        """Return the entries, one array per group; pyramids by their directions."""
+        """Return the entries, one array per group; a pyramid has those of its directions."""
 
-    def tilts(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
-        """Return μ of each tangent of a pyramid, one array per group; None where there is none."""
+    def friction_by_group(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
+        """Return μ of each tangent of a pyramid, one array per group; None for other rows."""
         return [None] * len(self.groups)
 
     def matrix(self, num_dofs: int) -> Float[Array, "rows nv *batch"]:
         """Return J."""
-        return dense(self.groups, self.directions(), self.tilts(), num_dofs)
+        return dense(self.groups, self.directions(), self.friction_by_group(), num_dofs)
 
 
 class DenseRows(RowMap):
-    """Rows that are few, or that may move every joint: J, and number and dimension of its elliptic contacts, which are last."""
+    """Rows with all entries of J; `cones` has number and dimension of the elliptic contacts, which come last."""
 
     entries: Float[Array, "rows nv *batch"]
     cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
@@ -95,10 +94,10 @@ class DenseRows(RowMap):
         single = len(self.entries) - coupled
         return (*([Group(dofs, single)] if single else []), *(Group(dofs, *cone) for cone in self.cones))
 
-    def rates(self, velocity):
+    def mv(self, velocity):
         return contract("rv,v->r", self.entries, velocity)
 
-    def pull(self, force):
+    def rmv(self, force):
         return contract("rv,r->v", self.entries, force)
 
     def directions(self):
@@ -111,7 +110,7 @@ class DenseRows(RowMap):
 
 
 class SlotRows(RowMap):
-    """Rows of contacts of one dimension between bodies that are known at run time: entries and, of pyramids, μ of tangents."""
+    """Rows of contacts of one dimension whose bodies are known only at run time; `friction` has μ of a pyramid's tangents."""
 
     entries: Float[Array, "contacts dim nv *batch"]
     friction: Float[Array, "contacts tangents *batch"] | None
@@ -121,21 +120,21 @@ class SlotRows(RowMap):
         count, dim, num_dofs = self.entries.shape[:3]
         return (Group(tuple(range(num_dofs)), count, dim, is_pyramid=self.friction is not None),)
 
-    def rates(self, velocity):
+    def mv(self, velocity):
         return edges(contract("cdv,v->cd", self.entries, velocity), self.friction).reshape(-1)
 
-    def pull(self, force):
+    def rmv(self, force):
         return contract("cdv,cd->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
 
     def directions(self):
         return [self.entries]
 
-    def tilts(self):
+    def friction_by_group(self):
         return [self.friction]
 
 
 class AxisRows(RowMap):
-    """Rows of one joint velocity each, `dofs` of all `num_dofs`, with entries `sign`."""
+    """Rows that act on one joint velocity each, with one entry `sign` per row."""
 
     sign: Float[Array, "rows *batch"]
     dofs: tuple[int, ...] = eqx.field(static=True)
@@ -145,10 +144,10 @@ class AxisRows(RowMap):
     def groups(self) -> tuple[Group, ...]:
         return (Group(self.dofs, len(self.dofs), is_diagonal=True),)
 
-    def rates(self, velocity):
+    def mv(self, velocity):
         return self.sign * maps.pick(np.array(self.dofs), velocity)
 
-    def pull(self, force):
+    def rmv(self, force):
         return combine(_selection(self.dofs, self.num_dofs).T, self.sign * force)
 
     def directions(self):
@@ -159,7 +158,7 @@ class AxisRows(RowMap):
 class Side:
     """One of the two bodies of a contact: its sign, 1 for the second body, and the joint velocities that move it alone.
 
-    What moves both bodies does nothing to a contact.
+    Joint velocities that move both bodies do not act on a contact.
     """
 
     sign: float
@@ -169,15 +168,14 @@ class Side:
 class ContactRows(RowMap):
     """Rows of contacts of one dimension.
 
-    A unit force along a frame axis, taken as a wrench about the centre of mass that the joint axes refer to, does work
-    on a joint velocity at the rate (axis · wrench). All contacts have as many sides, those that do not move without joint
-    velocities.
+    An entry of J is (axis · wrench): the power of a unit force along a frame axis at a unit joint velocity. The wrench is about
+    the centre of mass that the joint axes refer to. All contacts have the same number of sides; one at rest has no dofs.
 
     Attributes:
-        lever: from that centre of each side to the point of contact (m).
+        lever: vector from that centre to the contact point, for each side (m).
         frame: normal and tangents.
-        axes: motion of unit joint velocities.
-        friction: μ of each tangent of a pyramid, n ± μ t its edges; None for frictionless and elliptic contacts.
+        axes: motions of unit joint velocities.
+        friction: μ of each tangent of a pyramid with the edges n ± μ t; None for frictionless and elliptic contacts.
     """
 
     lever: Float[Array, "contacts sides 3 *batch"]
@@ -193,14 +191,14 @@ class ContactRows(RowMap):
         return tuple(Group(dofs, stop - start, self.dim, has_edges) for start, stop, dofs in self._runs())
 
     def _runs(self) -> list[tuple[int, int, tuple[int, ...]]]:
-        """Return neighbouring contacts that are kept together: first, one after the last, dofs.
+        """Return runs of neighbouring contacts with common dofs: (first, one after the last, dofs).
 
-        Every run is some operations more, and every column that one contact of a run does not need is computed for
-        nothing: they are joined while that no more than doubles the entries of the Hessian.
+        Every run costs some operations, and every column that one contact of a run does not need is wasted. So contacts
+        are joined while that no more than doubles the entries of the Hessian.
         """
         runs: list[tuple[int, int, tuple[int, ...], int]] = []
         for contact, sides in enumerate(self.sides):
-            # A contact that nothing moves keeps a column of zeros.
+            # A contact of bodies at rest keeps a column of zeros.
             dofs = {dof for side in sides for dof in side.dofs} or {0}
             least = len(dofs) ** 2
             if runs:
@@ -213,7 +211,7 @@ class ContactRows(RowMap):
         return [run[:3] for run in runs]
 
     def _moves(self, contacts: slice, dofs: tuple[int, ...]) -> np.ndarray:
-        """Return with which sign joint velocities move the sides of contacts."""
+        """Return the signs with which joint velocities move the sides of contacts."""
         chosen = self.sides[contacts]
         moves = np.zeros((len(chosen), len(chosen[0]), self.axes.shape[0]))
         for contact, sides in enumerate(chosen):
@@ -224,7 +222,7 @@ class ContactRows(RowMap):
     def _all_moves(self) -> np.ndarray:
         return self._moves(slice(None), tuple(range(self.axes.shape[0]))).reshape(-1, self.axes.shape[0])
 
-    def rates(self, velocity):
+    def mv(self, velocity):
         motion = combine(self._all_moves(), maps.scale(velocity, self.axes))
         turning, moving = motion[:, :3], motion[:, 3:]
         relative = self._sum(moving + spatial.cross(turning, self.lever.reshape(-1, 3)))
@@ -238,15 +236,17 @@ class ContactRows(RowMap):
         by_contact = of_sides.reshape(self.lever.shape)
         return linear.add(by_contact[:, side] for side in range(by_contact.shape[1]))
 
-    def pull(self, force):
+    def rmv(self, force):
         force = fold(force.reshape(len(self.frame), -1), self.friction)
         num_axes, num_sides = min(self.dim, 3), self.lever.shape[1]
-        push = jnp.repeat(contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0)
-        torque = spatial.cross(self.lever.reshape(-1, 3), push)
+        force_at_point = jnp.repeat(
+            contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0
+        )
+        torque = spatial.cross(self.lever.reshape(-1, 3), force_at_point)
         if self.dim > 3:
             twist = contract("ckx,ck->cx", self.frame[:, : self.dim - 3], force[:, 3:])
             torque += jnp.repeat(twist, num_sides, axis=0)
-        wrench = jnp.concatenate([torque, push], axis=1)
+        wrench = jnp.concatenate([torque, force_at_point], axis=1)
         return maps.dot(self.axes, combine(self._all_moves().T, wrench))
 
     def directions(self):
@@ -257,28 +257,28 @@ class ContactRows(RowMap):
         force, num_batch = frame[:, : min(self.dim, 3)], frame.ndim - 3
         moves = jnp.asarray(self._moves(contacts, dofs), frame.dtype)
         moves = moves.reshape(*moves.shape, *(1,) * num_batch)
-        pushes, parts = [force[:, :, i] for i in range(3)], []
+        forces, parts = [force[:, :, i] for i in range(3)], []
         for side in range(moves.shape[1]):
             lever = [self.lever[contacts, side, i, None] for i in range(3)]
-            torques = [lever[i] * pushes[j] - lever[j] * pushes[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-            rows = _along(torques + pushes, axes)
+            torques = [lever[i] * forces[j] - lever[j] * forces[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+            rows = _along(torques + forces, axes)
             if self.dim > 3:
                 twists = [frame[:, : self.dim - 3, i] for i in range(3)]
                 rows = jnp.concatenate([rows, _along(twists, axes[:, :3])], axis=1)
             parts.append(moves[:, side, None] * rows)
         return linear.add(parts)
 
-    def tilts(self):
+    def friction_by_group(self):
         return [None if self.friction is None else self.friction[start:stop] for start, stop, _ in self._runs()]
 
 
 class JoinedRows(RowMap):
-    """Rows of several maps, one after the other."""
+    """The rows of several maps, concatenated."""
 
     parts: tuple[RowMap, ...]
 
     def with_parts(self, others: tuple[RowMap | None, ...] | None) -> "JoinedRows":
-        """Return the same with other parts where there are some."""
+        """Return the map with some parts replaced; None leaves a part as it is."""
         if others is None:
             return self
         pairs = zip(self.parts, others, strict=True)
@@ -288,71 +288,71 @@ class JoinedRows(RowMap):
     def groups(self) -> tuple[Group, ...]:
         return tuple(group for part in self.parts for group in part.groups)
 
-    def rates(self, velocity):
-        return jnp.concatenate([part.rates(velocity) for part in self.parts])
+    def mv(self, velocity):
+        return jnp.concatenate([part.mv(velocity) for part in self.parts])
 
-    def pull(self, force):
+    def rmv(self, force):
         total, start = jnp.zeros((), force.dtype), 0
         for part in self.parts:
             stop = start + sum(group.num_rows for group in part.groups)
-            total, start = total + part.pull(force[start:stop]), stop
+            total, start = total + part.rmv(force[start:stop]), stop
         return total
 
     def directions(self):
         return [piece for part in self.parts for piece in part.directions()]
 
-    def tilts(self):
-        return [tilt for part in self.parts for tilt in part.tilts()]
+    def friction_by_group(self):
+        return [mu for part in self.parts for mu in part.friction_by_group()]
 
 
 def dense(
     groups: Sequence[Group],
     pieces: Sequence[Float[Array, "_ _ _ *batch"]],
-    tilts: Sequence[Float[Array, "_ _ *batch"] | None],
+    friction: Sequence[Float[Array, "_ _ *batch"] | None],
     num_dofs: int,
 ) -> Float[Array, "rows nv *batch"]:
     """Return J from its entries, group by group."""
     rows = []
-    for group, entries, tilt in zip(groups, pieces, tilts, strict=True):
+    for group, entries, mu in zip(groups, pieces, friction, strict=True):
         if group.is_diagonal:
             selection = _selection(group.dofs, num_dofs)
             own = entries[:, 0] * selection.reshape(*selection.shape, *(1,) * (entries.ndim - 3))
         else:
-            own = edges(_spread(entries, group.dofs, num_dofs), None if tilt is None else tilt[:, :, None])
+            own = edges(_spread(entries, group.dofs, num_dofs), None if mu is None else mu[:, :, None])
         rows.append(own.reshape(group.num_rows, num_dofs, *entries.shape[3:]))
     return jnp.concatenate(rows)
 
 
-def edges(along: Float[Array, "n dim *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
-    """Return the edges n ± μ t of pyramids; without μ the directions themselves."""
-    if tilt is None:
+def edges(along: Float[Array, "n dim *rest"], friction: Float[Array, "n tangents *#rest"] | None) -> Array:
+    """Return the edges n ± μ t of pyramids, or the directions themselves without μ."""
+    if friction is None:
         return along
-    normal, tangent = along[:, :1], tilt * along[:, 1:]
+    normal, tangent = along[:, :1], friction * along[:, 1:]
     both = jnp.stack([normal + tangent, normal - tangent], axis=2)
     return both.reshape(len(along), -1, *along.shape[2:])
 
 
-def fold(force: Float[Array, "n rows *rest"], tilt: Float[Array, "n tangents *#rest"] | None) -> Array:
-    """Return the forces along directions that forces along edges add up to; the transpose of `edges`."""
-    if tilt is None:
+def fold(force: Float[Array, "n rows *rest"], friction: Float[Array, "n tangents *#rest"] | None) -> Array:
+    """Return the forces along directions, the sums of those along edges; the transpose of `edges`."""
+    if friction is None:
         return force
     pairs = force.reshape(len(force), -1, 2, *force.shape[2:])
     plus, minus = pairs[:, :, 0], pairs[:, :, 1]
-    return jnp.concatenate([linear.sum_of_few(plus + minus), tilt * (plus - minus)], axis=1)
+    return jnp.concatenate([linear.sum_of_few(plus + minus), friction * (plus - minus)], axis=1)
 
 
 def flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
-    """Return items and directions as rows."""
+    """Return an array with items and directions merged into rows."""
     return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
 
 
 def _along(
     parts: list[Float[Array, "n k *batch"]], axes: Float[Array, "dofs entries *batch"]
 ) -> Float[Array, "n k dofs *batch"]:
-    """Return products of vectors, given entry by entry, with axes.
+    """Return the products of vectors, given entry by entry, with axes.
 
-    Written out, and no vector put together of its entries: XLA's CPU backend runs along the batch only where nothing
-    is concatenated on the way. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
+    The sum is written out over separate entries: XLA's CPU backend runs along the batch only where nothing is
+    concatenated. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
     """
     return linear.add(part[:, :, None] * axes[:, i] for i, part in enumerate(parts))
 
@@ -360,7 +360,7 @@ def _along(
 def _spread(
     entries: Float[Array, "num dim dofs *batch"], dofs: tuple[int, ...], num_dofs: int
 ) -> Float[Array, "num dim nv *batch"]:
-    """Return entries with zeros for all other joint velocities."""
+    """Return the entries, with zeros for all other joint velocities."""
     if len(dofs) == num_dofs:
         return entries
     columns, at = [], 0
@@ -373,5 +373,5 @@ def _spread(
 
 
 def _selection(dofs: tuple[int, ...], num_dofs: int) -> np.ndarray:
-    """Return the matrix that picks some joint velocities."""
+    """Return the matrix that selects joint velocities."""
     return (np.array(dofs, int)[:, None] == np.arange(num_dofs)).astype(float)

@@ -1,15 +1,15 @@
-r"""Noise whose average over a contact has a closed form, and the barrier that each stands for.
+r"""Noise distributions for which the mean force of a contact has a closed form.
 
-A contact pushes like the ramp $\max(-r, 0)$ of its distance $r$. Noise $w$ of density $\rho$ on the distance makes of
-it
+The force of a contact is the ramp $\max(-r, 0)$ of its distance $r$. Under noise $w$ of density $\rho$ on the distance it
+becomes
 
 $$S(r) = \mathbb{E} \max(-r - w, 0), \qquad S'(r) = -P(w < -r), \qquad S''(r) = \rho(r),$$
 
-so that a kernel is given as well by its density as by its softened ramp, the profile of its force at a distance.
+so a kernel is defined by its density or by its softened ramp, the force over the distance.
 
 All three are even and in units of the *length*, the standard deviation of the Gaussian. The others are scaled to its
-mean $|w|$, $\sqrt{2/\pi}$, and with that to the same push at the surface, $S(0) = \mathbb{E}|w| / 2$. Standard
-deviations could not be matched, since that of the log barrier is infinite.
+mean $|w|$, $\sqrt{2/\pi}$, and so to the same force at the surface, $S(0) = \mathbb{E}|w| / 2$. Standard
+deviations could not be matched, since the log barrier's is infinite.
 
 | kernel | softened ramp | density | standard deviation |
 |---|---|---|---|
@@ -17,9 +17,9 @@ deviations could not be matched, since that of the log barrier is infinite.
 | `logistic` | $b\,\mathrm{softplus}(-r/b)$, $b = 0.576$ | logistic | $\pi b / \sqrt 3 = 1.044$ |
 | `log_barrier` | $(-r + \sqrt{r^2 + 4/\kappa}) / 2$, $\kappa = 2\pi$ | Student's t, 2 degrees of freedom | infinite |
 
-The name of the last: the ramp is the $f$ that minimises $f^2/2 + fr$ over $f \ge 0$, and with the barrier
-$-\log(f)/\kappa$ in place of the bound the minimiser is this $S(r)$. Its force falls off as $1/r$: it reaches
-everything in the scene.
+The log barrier has its name from optimisation. The ramp is the $f$ that minimises $f^2/2 + fr$ over $f \ge 0$. With the
+barrier $-\log(f)/\kappa$ in place of the bound, the minimiser is $S(r)$. Its force falls off only as $1/r$, so it acts
+across the whole scene.
 
 References:
     Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic
@@ -39,28 +39,28 @@ from jaxtyping import Array, Float
 from scipy import special
 
 _Shape = Float[Array, "*shape"]
-# The mean of |w| that all kernels share.
+# Mean of |w| under every kernel.
 _MEAN_SIZE = math.sqrt(2 / math.pi)
 _LOGISTIC_SCALE = _MEAN_SIZE / (2 * math.log(2))
 # 4/κ, the square of twice the softened ramp at zero.
 _BARRIER_SQUARE = _MEAN_SIZE**2
-# Of the normal distribution's tail, by the size of a number in bytes: to 9e-8 and 1e-14 of it.
+# Fit of the normal tail: degree by the size of a number in bytes, with relative errors of 9e-8 and 1e-14.
 _TAIL_SCALE = 3.0
 _TAIL_DEGREE = {4: 10, 8: 24}
 
 
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    r"""A density of noise with the averages of a contact under it. Distances are in units of the length.
+    r"""A noise density and the mean force of a contact under it. Distances are in units of the length.
 
-    Static and hashable: which kernel it is shapes the compiled program.
+    Static and hashable: the kernel shapes the compiled program.
 
     Attributes:
         reach: distance beyond which `share` is below 1e-8, and `depth` is held.
         stddev: standard deviation.
-        ramp: from distances r to the mean push, $\mathbb{E} \max(-r - w, 0)$.
-        share: from distances to the probability of contact, that r + w is negative.
-        density: of the noise, the derivative of `share` but for its sign.
+        ramp: the mean force at a distance r, $\mathbb{E} \max(-r - w, 0)$.
+        share: the probability of contact at a distance, P(r + w < 0).
+        density: the density of the noise, minus the derivative of `share`.
     """
 
     reach: float
@@ -70,7 +70,7 @@ class Kernel:
     density: Callable[[_Shape], _Shape]
 
     def depth(self, distance: _Shape) -> _Shape:
-        """Return the mean penetration, given that there is contact; held beyond `reach`, where there is next to none."""
+        """Return the mean penetration given contact; constant beyond `reach`, where contact is improbable."""
         near = jnp.minimum(distance, self.reach)
         return self.ramp(near) / self.share(near)
 
@@ -88,10 +88,10 @@ def _tail_coefficients(degree: int) -> tuple[float, ...]:
 
 @jax.custom_jvp
 def _normal_share(r: _Shape) -> _Shape:
-    """Return Φ(-r), to rounding relative to itself on both sides.
+    """Return Φ(-r), to relative rounding for either sign of r.
 
-    Not by `jax.lax.erfc`: that ends in polynomials, which XLA takes for so cheap that it evaluates them again for every
-    entry of the Hessian that they go into. An exponential is computed once and stored.
+    Not by `jax.lax.erfc`, which ends in polynomials: XLA considers them cheap and evaluates them again for every entry of
+    the Hessian. An exponential is computed once and stored.
     """
     size = jnp.abs(r)
     t = 1 / (1 + size / _TAIL_SCALE)
@@ -108,7 +108,7 @@ def _normal_share_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _normal_ramp(r: _Shape) -> _Shape:
-    """Return φ(r) - r Φ(-r), which holds its digits to a few units of rounding times r²."""
+    """Return φ(r) - r Φ(-r), to a few units of relative rounding times r²."""
     return _normal_density(r) - r * _normal_share(r)
 
 
@@ -134,7 +134,7 @@ def _logistic_density(w: _Shape) -> _Shape:
 
 
 def _barrier_ramp(r: _Shape) -> _Shape:
-    # Written so that nothing cancels.
+    # In a form without cancellation.
     root = jnp.sqrt(r**2 + _BARRIER_SQUARE)
     return jnp.where(r > 0, 0.5 * _BARRIER_SQUARE / (root + jnp.abs(r)), 0.5 * (root - r))
 
@@ -153,6 +153,6 @@ KERNELS: dict[str, Kernel] = {
     "logistic": Kernel(
         11.0, math.pi * _LOGISTIC_SCALE / math.sqrt(3), _logistic_ramp, _logistic_share, _logistic_density
     ),
-    # What a log barrier averages over: Student's t distribution of two degrees of freedom.
+    # Student's t distribution with two degrees of freedom.
     "log_barrier": Kernel(1e4, math.inf, _barrier_ramp, _barrier_share, _barrier_density),
 }

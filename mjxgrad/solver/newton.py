@@ -4,20 +4,21 @@ Minimise over a
 
     ½ (a - a_s)ᵀ M (a - a_s) + Σ_i s_i(J_i a - a_ref,i),
 
-with the laws s_i of `constraint`. The problem is strictly convex, so the starting point affects the time taken and not the
-answer. Along a search line the derivative of the cost is monotone and, but for elliptic rows and rows under noise, piecewise
-linear: Newton's method on it, kept inside a bracket, ends at the exact minimiser after as many steps as it crosses pieces. (The
-minimiser can also be read off the values at all breakpoints at once, without iterating; that takes rows² work and was
-three times slower at 24 rows.) Elliptic cones need the loop: near the apex their curvature belongs to one side only, so that
-the minimiser may lie at a thousandth of the step that it promises, and what is not known to lower the cost may raise it.
+with the laws s_i of `constraint`. The problem is strictly convex: the start affects the time taken, not the solution.
 
-The solve ends by the Newton decrement, gᵀ H⁻¹ g: the step left to go, in the norm of kinetic energy. It does not depend on the
-units of joints, nor on how light one body is beside another.
+**Line search.** Along a line the derivative of the cost is monotone and, without elliptic rows and noise, piecewise linear.
+Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (The values at
+all breakpoints give the minimiser without iterating, but take rows² work: three times slower at 24 rows.) Elliptic cones
+need the loop. Near the apex their curvature holds on one side only, so the minimiser may lie at a thousandth of the Newton
+step, and a step that was not checked may raise the cost.
 
-The same steps serve a batch, operation by operation, and one state in a GPU's program; what differs is a `Problem`.
+**Convergence.** The solve ends by the Newton decrement gᵀ H⁻¹ g, the remaining step in the norm of kinetic energy. It does
+not depend on the units of joints or on the ratios of masses.
 
-The gradient is formed afresh in each iteration rather than updated along the line: in single precision an update keeps
-the rounding errors of a poor start.
+The same steps solve a batch, operation by operation, and a single state in a GPU's program; `Problem` holds the difference.
+
+The gradient is formed anew in each iteration: in single precision an update along the line would keep rounding errors from
+a poor start.
 """
 
 import abc
@@ -37,7 +38,7 @@ from mjxgrad.bodies.kinematics import Inertia
 from mjxgrad.solver import constraint, hessian
 from mjxgrad.solver.constraint import RowLayout, Rows
 from mjxgrad.solver.jacobian import JoinedRows, RowMap
-from mjxgrad.solver.sparse import SparseRows, num_together
+from mjxgrad.solver.sparse import SparseRows, num_dense_rows
 
 _Vector = Float[Array, "nv *batch"]
 _OfRows = PyTree[Float[Array, "_ *batch"]]
@@ -45,37 +46,37 @@ _Scalar = Float[Array, "*batch"]
 _Truth = Bool[Array, "*batch"]
 _Result = tuple[_Vector, Int[Array, "*batch"]]
 
-# Newton steps along the search line that all of a batch take: to ask whether they are needed takes as long as they do.
+# Newton steps along the search line for the whole batch: testing whether they are needed takes as long as the steps.
 _LINE_STEPS = 4
-# Bound of the steps after that, and of those for elliptic cones. Halving alone gets to 1e-12 of the bracket; 25 were seen.
+# Bound on all steps. Halving alone reaches 1e-12 of the bracket; at most 25 steps were seen.
 _MAX_LINE_STEPS = 40
 # A line search has converged where the slope has fallen to this part of its value at the start. On 512 stiff elliptic
 # problems 0.1, 0.01 and 0.001 took the same number of outer iterations.
 _LINE_TOLERANCE = 1e-2
-# A look this near, as part of the bracket, to where the slope was seen to be too great is one back to there.
+# Next lengths keep this share of the bracket as distance from its upper end, where the slope is known to be positive.
 _LINE_MARGIN = 0.01
-# A batch is iterated as a whole until this part of it is left: of 256 states of two bodies that slide about the slowest takes 5.0
-# iterations in the mean over steps, the average one 1.3. It is a second loop to compile, which smaller batches are not worth: a
-# fifth more for the gradient of a hopper, a third for that of elliptic cones.
+# A batch is iterated as a whole until one part in so many is left. Of 256 states of two sliding bodies the slowest takes 5.0
+# iterations in the mean over steps, the average one 1.3. The second loop lengthens compilation by a fifth (a hopper's
+# gradient) to a third (elliptic cones), too much for smaller batches.
 _SHARE = 8
 _LEAST_BATCH = 256
-# Sums of a few terms are known to about this many units of rounding.
+# Rounding error of a sum of a few terms, in units of rounding.
 _ROUNDING = 4
-# The estimate of rounding leaves out what cancels within M a and J a. On a humanoid in single precision the decrement goes from
-# 10⁷ times it in one iteration to 5 to 70 times it, and then stays there, up and down, for as long as one lets it. From this
-# multiple on the step is the last one: taken, what it leaves is rounding.
+# The estimate of rounding omits cancellation within M a and J a. On a humanoid in single precision the decrement falls in one
+# iteration from 10⁷ times the estimate to 5 to 70 times it, and then stays there. Below this multiple the step is the last
+# one: only rounding is left after it.
 _LAST = 1e3
-# A solve that rounding ends counts as none where it leaves this part of the acceleration unknown.
+# A solve has failed where rounding leaves this share of the acceleration unknown.
 _RESOLVED = 1e-3
 
 
 class Variant(eqx.Module):
-    """In what a second solve of the same state may differ. For two solves arrays have a leading axis of two.
+    """The differences between two solves of one state. For two solves arrays have a leading axis of two.
 
     Attributes:
-        weight: of the rows.
-        reference: a_ref of the rows; None for that of the system.
-        parts: of J, where contacts may push from another side.
+        weight: weights D of the rows.
+        reference: a_ref of the rows; None keeps the system's.
+        parts: parts of J to replace, where contacts may act from another side.
     """
 
     weight: Float[Array, "*two rows"]
@@ -83,18 +84,18 @@ class Variant(eqx.Module):
     parts: tuple[RowMap | None, ...] | None = None
 
     def __getitem__(self, number: int) -> "Variant":
-        """Return that of one solve."""
+        """Return the variant of one solve."""
         return jax.tree.map(lambda x: x[number], self)
 
 
 class System(eqx.Module):
-    """What determines the acceleration of one state, as its derivative wants it.
+    """The equations of motion of one state, in a form that can be differentiated.
 
     Attributes:
         inertia: M.
-        force: f_smooth, all forces but those of constraints (N or N m).
-        map: J, also of rows that are inactive.
-        is_active: which rows are not.
+        force: f_smooth, all forces except those of constraints (N or N m).
+        map: J, inactive rows included.
+        is_active: whether each row is active.
         rows: parameters of the rows' laws.
     """
 
@@ -104,39 +105,39 @@ class System(eqx.Module):
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
 
-    def rates(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
+    def mv(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
-        return jnp.where(self.is_active, self.map.rates(velocity), 0.0)
+        return jnp.where(self.is_active, self.map.mv(velocity), 0.0)
 
-    def pull(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
+    def rmv(self, force: Float[Array, " rows"]) -> Float[Array, " nv"]:
         """Return Jᵀ f."""
-        return self.map.pull(jnp.where(self.is_active, force, 0.0))
+        return self.map.rmv(jnp.where(self.is_active, force, 0.0))
 
     def row_force(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return the constraint forces at an acceleration."""
-        return constraint.force(layout, self.rows, self.rates(acceleration) - self.rows.reference)
+        return constraint.force(layout, self.rows, self.mv(acceleration) - self.rows.reference)
 
     def gradient(self, layout: RowLayout, acceleration: Float[Array, " nv"]) -> Float[Array, " nv"]:
         """Return M a - f_smooth - Jᵀ f, zero at the solution."""
-        pull = self.pull(self.row_force(layout, acceleration))
-        return self.inertia.apply(acceleration) - self.force - pull
+        constraint_force = self.rmv(self.row_force(layout, acceleration))
+        return self.inertia.apply(acceleration) - self.force - constraint_force
 
-    def varied(self, variant: Variant) -> "System":
-        """Return the same with what is different in one solve."""
+    def with_variant(self, variant: Variant) -> "System":
+        """Return the system of one solve."""
         reference = self.rows.reference if variant.reference is None else variant.reference
         rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
         return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
 
-    def problem(self, layout: RowLayout) -> "Entries":
-        """Return the same with entries; arrays may carry the batch as trailing axes here."""
+    def problem(self, layout: RowLayout) -> "ArrayProblem":
+        """Return the problem with the entries of M and J; arrays may carry the batch as trailing axes."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return Entries(self.force, self.rows, self.inertia.matrix, jacobian, layout)  # pyright: ignore[reportCallIssue]
+        return ArrayProblem(self.force, self.rows, self.inertia.matrix, jacobian, layout)  # pyright: ignore[reportCallIssue]
 
 
 class Problem(eqx.Module):
-    """What is minimised. Arrays may carry the batch as trailing axes, or belong to the one state of a GPU's program.
+    """The minimisation problem. Arrays carry the batch as trailing axes, or belong to the single state of a GPU's program.
 
-    What belongs to the rows is one array, or in such a program several.
+    Quantities of the rows are one array, or several in such a program.
     """
 
     force: _Vector
@@ -144,23 +145,23 @@ class Problem(eqx.Module):
     weight: eqx.AbstractVar[_OfRows]
 
     @abc.abstractmethod
-    def weigh(self, acceleration: _Vector) -> _Vector:
+    def mass_mv(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
 
     @abc.abstractmethod
-    def rates(self, acceleration: _Vector) -> _OfRows:
+    def mv(self, acceleration: _Vector) -> _OfRows:
         """Return J a."""
 
     @abc.abstractmethod
-    def pull(self, force: _OfRows) -> _Vector:
+    def rmv(self, force: _OfRows) -> _Vector:
         """Return Jᵀ f."""
 
     @abc.abstractmethod
-    def push(self, x: _OfRows) -> _OfRows:
+    def row_force(self, x: _OfRows) -> _OfRows:
         """Return the forces of the rows."""
 
     @abc.abstractmethod
-    def bent(self, x: _OfRows, along: _OfRows) -> _OfRows:
+    def hessian_product(self, x: _OfRows, along: _OfRows) -> _OfRows:
         """Return the second derivative of the cost by x, times a vector."""
 
     @abc.abstractmethod
@@ -175,24 +176,23 @@ class Problem(eqx.Module):
     @property
     @abc.abstractmethod
     def is_piecewise_quadratic(self) -> bool:
-        """Whether the cost along a line is."""
+        """Whether the cost along a line is piecewise quadratic."""
 
     @abc.abstractmethod
     def is_finite(self, vector: _Vector) -> _Truth:
-        """Return whether all of a vector is finite."""
+        """Return whether all entries of a vector are finite."""
 
     def at(self, acceleration: _Vector) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = jax.tree.map(jnp.subtract, self.rates(acceleration), self.reference)
-        row_force = self.push(x)
-        inertia, pull = self.weigh(acceleration), self.pull(row_force)
-        return Point(acceleration, x, row_force, inertia, pull, inertia - self.force - pull)
+        x = jax.tree.map(jnp.subtract, self.mv(acceleration), self.reference)
+        row_force = self.row_force(x)
+        inertia, constraint_force = self.mass_mv(acceleration), self.rmv(row_force)
+        return Point(acceleration, x, row_force, inertia, constraint_force, inertia - self.force - constraint_force)
 
     def rounding(self, point: "Point") -> _Scalar:
-        """Return the size that the decrement at a point has by rounding alone.
+        """Return the rounding error of the decrement at a point.
 
-        In its norm rows may be as stiff as they like: an error of their x by e adds Jᵀ D e to the gradient, which is large,
-        and at most e D e to the decrement.
+        An error e of a row's x adds Jᵀ D e to the gradient, which is large for stiff rows, but at most e D e to the decrement.
         """
 
         def energy(x: Array, reference: Array, force: Array, weight: Array) -> Array:
@@ -206,39 +206,39 @@ class Problem(eqx.Module):
     def is_resolved(self, point: "Point") -> _Truth:
         """Return whether rounding leaves less than a thousandth of the acceleration unknown.
 
-        In single precision it leaves more where rows weigh 10⁷ times the bodies: the edges of a pyramid do, as 1/μ², at little
-        friction.
+        In single precision it leaves more where rows weigh 10⁷ times the bodies. The edges of a pyramid, with weights of
+        1/μ², do so at low friction.
         """
         own, free = linear.dot(point.acceleration, point.inertia), linear.dot(self.force / self.diagonal, self.force)
         return self.rounding(point) <= _RESOLVED**2 * (own + free)
 
 
-class Entries(Problem):
-    """A problem whose M and J are entries."""
+class ArrayProblem(Problem):
+    """A problem with the entries of M and J as arrays."""
 
     rows: Rows
     mass: Float[Array, "nv nv *batch"]
     jacobian: SparseRows
     layout: RowLayout = eqx.field(static=True)
 
-    def weigh(self, acceleration):
+    def mass_mv(self, acceleration):
         return linear.matvec(self.mass, acceleration)
 
-    def rates(self, acceleration):
+    def mv(self, acceleration):
         return self.jacobian.matvec(acceleration)
 
-    def pull(self, force):
+    def rmv(self, force):
         return self.jacobian.rmatvec(force)
 
-    def push(self, x):
+    def row_force(self, x):
         return constraint.force(self.layout, self.rows, x)
 
-    def bent(self, x, along):
+    def hessian_product(self, x, along):
         return constraint.curvature_product(self.layout, self.rows, x, along[:, None])[:, 0]
 
     def newton(self, point):
-        bend = constraint.bend(self.layout, self.rows, point.x)
-        return hessian.solve(self.mass, self.jacobian, self.layout, bend, point.gradient)
+        row_hessian = constraint.hessian(self.layout, self.rows, point.x)
+        return hessian.solve(self.mass, self.jacobian, self.layout, row_hessian, point.gradient)
 
     @property
     def reference(self):
@@ -263,40 +263,40 @@ class Entries(Problem):
 _Parts = tuple[Float[Array, " height"], *tuple[Float[Array, " width"], ...]]
 
 
-class _InRegisters(Problem):
-    """A problem whose M and J a GPU's program keeps, and whose rows stand for themselves: their force is -D x between bounds.
+class _KernelProblem(Problem):
+    """A problem of uncoupled rows whose M and J a GPU's program keeps in registers; forces are -D x between bounds.
 
-    What belongs to the rows comes in parts: of those of J, and of limits and the like, which see one joint velocity each, by
-    that joint velocity. They would double J, which has a power of two as number of rows.
+    Quantities of the rows come in parts: one for the rows of J, and one by joint velocity for each group of rows that act on
+    a single one, such as limits. As rows of J, whose number is a power of two, they would double it.
     """
 
     reference: _Parts
     weight: _Parts
     mass: Float[Array, "width width"]
     jacobian: Float[Array, "height width"]
-    signs: tuple[Float[Array, " width"], ...]  # of the rows that see one joint velocity
+    signs: tuple[Float[Array, " width"], ...]  # entries of the rows that act on one joint velocity
     bounds: tuple[_Parts, _Parts]
     on_diagonal: _Vector
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
 
-    def weigh(self, acceleration):
-        return (self.mass * acceleration[:, None]).sum(axis=0)  # by symmetry; along a row it takes more registers
+    def mass_mv(self, acceleration):
+        return (self.mass * acceleration[:, None]).sum(axis=0)  # M is symmetric; a sum along rows takes more registers
 
-    def rates(self, acceleration):
+    def mv(self, acceleration):
         return (self.jacobian * acceleration[None]).sum(axis=1), *(sign * acceleration for sign in self.signs)
 
-    def pull(self, force):
+    def rmv(self, force):
         first, *others = force
         own = (sign * other for sign, other in zip(self.signs, others, strict=True))
         return linear.add([(self.jacobian * first[:, None]).sum(axis=0), *own])
 
-    def push(self, x):
-        def push(x: Array, weight: Array, low: Array, high: Array) -> Array:
+    def row_force(self, x):
+        def clipped(x: Array, weight: Array, low: Array, high: Array) -> Array:
             force = -weight * x
             return jnp.where(force < low, low, jnp.where(force > high, high, force))
 
-        return jax.tree.map(push, x, self.weight, *self.bounds)
+        return jax.tree.map(clipped, x, self.weight, *self.bounds)
 
     def curvature(self, x: _Parts) -> _Parts:
         """Return the second derivative of the cost by x."""
@@ -307,7 +307,7 @@ class _InRegisters(Problem):
 
         return jax.tree.map(curvature, x, self.weight, *self.bounds)
 
-    def bent(self, x, along):
+    def hessian_product(self, x, along):
         return jax.tree.map(jnp.multiply, self.curvature(x), along)
 
     def newton(self, point):
@@ -338,21 +338,20 @@ class Point(eqx.Module):
     x: _OfRows
     row_force: _OfRows
     inertia: _Vector
-    pull: _Vector
+    constraint_force: _Vector
     gradient: _Vector
 
     def rounding(self) -> _Vector:
-        """Return the size that the gradient has by rounding alone."""
-        terms = jnp.abs(self.inertia) + jnp.abs(self.pull)
+        """Return the rounding error of the gradient."""
+        terms = jnp.abs(self.inertia) + jnp.abs(self.constraint_force)
         return _ROUNDING * jnp.finfo(terms.dtype).eps * terms
 
 
 class _Iterate(eqx.Module):
     """The loop's carry.
 
-    The question whether it is done is asked of the carry: a carried array is computed once and stored, while XLA would write
-    the sums that form it out again wherever they are used. (The Hessian needs no such help since its blocks are added in
-    place; carried along, it was one more than the iterations use.)
+    Convergence is tested on the carry: a carried array is computed once and stored, while XLA would repeat the sums that form
+    it wherever they are used. (The Hessian is not carried: its blocks are added in place, and the last one is not needed.)
     """
 
     point: Point
@@ -361,20 +360,20 @@ class _Iterate(eqx.Module):
 
 
 def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
-    """Return the acceleration of least cost, NaN where the problem is not finite, and the number of iterations that it took.
+    """Return the acceleration of least cost, NaN where the problem is not finite, and the number of iterations.
 
-    It goes on until every member of the batch is done; those that are do not move any more. Once an eighth of them are left,
-    they are taken out and finished among themselves. A start that is not finite is replaced by zero.
+    The loop runs until every member of the batch is done; members that are done stay where they are. The last eighth is taken
+    out and finished on its own. A start that is not finite is replaced by zero.
 
-    The tolerance is on the step that is left to go, in the norm of kinetic energy over the trace of the mass matrix: of a
-    single body the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
-    number is one more than `max_iterations` where these, or the digits of this precision, were too few.
+    The tolerance bounds the remaining step, in the norm of kinetic energy over the trace of the mass matrix; for a single
+    body this is the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
+    number is `max_iterations` + 1 where the iterations, or the digits of the precision, did not suffice.
     """
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
-    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(num_together(system.map), len(start)):
-        ways = (functools.partial(way, layout, max_iterations) for way in (in_one_kernel, _in_turns))
-        return device.by_platform(system, start, tolerance, gpu=next(ways), default=next(ways))
-    return _in_turns(layout, max_iterations, system, start, tolerance)
+    if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(num_dense_rows(system.map), len(start)):
+        solvers = (functools.partial(solver, layout, max_iterations) for solver in (in_one_kernel, _over_batch))
+        return device.by_platform(system, start, tolerance, gpu=next(solvers), default=next(solvers))
+    return _over_batch(layout, max_iterations, system, start, tolerance)
 
 
 def in_one_kernel(
@@ -386,29 +385,29 @@ def in_one_kernel(
     *,
     interpret: bool = False,
 ) -> _Result:
-    """Do what `minimise` does for rows that stand for themselves; `interpret` runs on any device, slowly."""
+    """Compute `minimise` for uncoupled rows in one kernel; `interpret` runs on any device, slowly."""
     problem, size = system.problem(layout), len(start)
     jacobian, rows = problem.jacobian, problem.rows
-    together = jacobian.together()
-    apart = (jacobian.apart(x) for x in (rows.reference, rows.weight, *constraint.bounds(layout, rows)))
-    by_row, structure = jax.tree.flatten((tuple(apart), jacobian.signs()))
+    dense_rows = jacobian.dense_rows()
+    split = (jacobian.split(x) for x in (rows.reference, rows.weight, *constraint.bounds(layout, rows)))
+    by_row, structure = jax.tree.flatten((tuple(split), jacobian.signs()))
     smallest = tolerance**2 * linear.add(problem.diagonal)
 
     def kernel(mass, jacobian, force, diagonal, start, smallest, *refs):
         *refs, acceleration, num_iterations = refs
         (reference, weight, *bounds), signs = jax.tree.unflatten(structure, [ref[...] for ref in refs])
         parts = (reference, weight, mass[...], jacobian[...], signs, tuple(bounds))
-        problem = _InRegisters(force[...], *parts, diagonal[...], (mass, jacobian), size)
+        problem = _KernelProblem(force[...], *parts, diagonal[...], (mass, jacobian), size)
         solver = _Solver(problem, smallest[...], max_iterations)
         first = solver.measure(start[...], jnp.array(False), jnp.int32(0))
         acceleration[...], num_iterations[0] = solver.result(solver.run(first, 0))
 
     mass = on_gpu.filled(problem.mass)
     diagonal = jnp.maximum(linear.diagonal(mass), mujoco.mjMINVAL)
-    width, height = on_gpu.padded(size), on_gpu.padded(len(together))
+    width, height = on_gpu.padded(size), on_gpu.padded(len(dense_rows))
     found, count = on_gpu.run(
         kernel,
-        (mass, together, problem.force, diagonal, start, smallest, *by_row),
+        (mass, dense_rows, problem.force, diagonal, start, smallest, *by_row),
         ((start.dtype, width), (jnp.int32, 1)),
         width * height,
         interpret=interpret,
@@ -416,12 +415,12 @@ def in_one_kernel(
     return found[:size], count[0]
 
 
-def _in_turns(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
-    """Do what `minimise` does, each operation for the whole batch."""
+def _over_batch(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
+    """Compute `minimise` with operations on the whole batch."""
     batch, problem = start.shape[1:], system.problem(layout)
     solver = _Solver(problem, tolerance**2 * linear.add(problem.diagonal), max_iterations)
     first = solver.measure(start, jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32))
-    # On a CPU, where it was measured.
+    # Measured on a CPU only.
     splits = device.is_cpu() and bool(batch) and batch[0] >= _LEAST_BATCH
     num_last = batch[0] // _SHARE if splits else 0
     state = solver.run(first, num_last)
@@ -433,15 +432,15 @@ def _in_turns(layout: RowLayout, max_iterations: int, system: System, start: _Ve
 
 
 def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], result: _Result, count: int) -> _Result:
-    """Finish the few that are left among themselves: else all wait for the slowest, and compute what nobody needs.
+    """Finish the remaining members on their own, so that the others need not wait for the slowest.
 
-    There are places for `count`, no fewer than are left.
+    The subset has `count` places, at least as many as members are left.
     """
-    few = linear.Few(is_left, count)
-    part = few.take(solver)
-    # Evaluated anew: that takes less than it takes to gather it.
-    began = part.measure(*few.take((state.point.acceleration, state.is_near, state.num_iterations)))
-    return few.put(result, part.result(part.run(began, 0)))
+    subset = linear.Subset(is_left, count)
+    part = subset.take(solver)
+    # Evaluated anew, which is faster than gathering it.
+    began = part.measure(*subset.take((state.point.acceleration, state.is_near, state.num_iterations)))
+    return subset.put(result, part.result(part.run(began, 0)))
 
 
 class _Solver(eqx.Module):
@@ -455,19 +454,19 @@ class _Solver(eqx.Module):
         return _Iterate(self.problem.at(acceleration), is_near, num_iterations)
 
     def is_solved(self, state: _Iterate) -> _Truth:
-        """Return who has converged."""
-        # Known without the factor of H: as H exceeds M, no less than the decrement but for what M couples.
+        """Return which members have converged."""
+        # An estimate without the factor of H: H exceeds M, so this bounds the decrement up to the couplings in M.
         diagonal = self.problem.diagonal
         energy, floor = (linear.dot(v / diagonal, v) for v in (state.point.gradient, state.point.rounding()))
         return state.is_near | (energy < self.smallest) | (energy <= floor)
 
     def is_done(self, state: _Iterate) -> _Truth:
-        """Return who does not move any more."""
+        """Return which members are done: converged, broken or out of iterations."""
         is_broken = ~self.problem.is_finite(state.point.gradient)
         return self.is_solved(state) | is_broken | (state.num_iterations >= self.max_iterations)
 
     def run(self, state: _Iterate, num_left: int) -> _Iterate:
-        """Iterate until no more than so many are left."""
+        """Iterate until no more than `num_left` members are left."""
 
         def goes_on(state: _Iterate) -> Bool[Array, ""]:
             goes = ~self.is_done(state)
@@ -476,7 +475,7 @@ class _Solver(eqx.Module):
         if state.is_near.ndim:
             return jax.lax.while_loop(goes_on, lambda state: self.iterate(state, self.is_done(state)), state)
 
-        # In a program the question takes registers if asked of the carry.
+        # In a GPU's program a test on the carry would take registers.
         def turn(carry: tuple[_Iterate, _Truth]) -> tuple[_Iterate, _Truth]:
             state = self.iterate(carry[0], ~carry[1])
             return state, ~self.is_done(state)
@@ -484,11 +483,11 @@ class _Solver(eqx.Module):
         return jax.lax.while_loop(lambda carry: carry[1], turn, (state, ~self.is_done(state)))[0]
 
     def iterate(self, state: _Iterate, stays: _Truth) -> _Iterate:
-        """Take one step of Newton's method, those that stay excepted."""
+        """Take one step of Newton's method, except for members that stay."""
         problem, point = self.problem, state.point
         solution, diagonal = problem.newton(point)
         newton = -solution
-        # Where the factorisation fails in this precision, the gradient scaled by the diagonal.
+        # The diagonally scaled gradient where the factorisation fails in this precision.
         scaled = -point.gradient / diagonal
         direction = jnp.where(problem.is_finite(newton), newton, scaled)
         decrement, floor = -linear.dot(point.gradient, direction), problem.rounding(point)
@@ -499,8 +498,8 @@ class _Solver(eqx.Module):
         return self.measure(moved, is_near, state.num_iterations + ~stays)
 
     def result(self, state: _Iterate) -> _Result:
-        """Return what `minimise` does."""
-        # Non-finite forces or rows have no minimiser: the start must not pass for one.
+        """Return the acceleration and the number of iterations, as `minimise` does."""
+        # Non-finite forces or rows have no minimiser: the start must not be returned as one.
         is_sound = self.problem.is_finite(state.point.gradient)
         finished = self.is_solved(state) & self.problem.is_resolved(state.point)
         num_iterations = jnp.where(finished, state.num_iterations, self.max_iterations + 1)
@@ -508,9 +507,9 @@ class _Solver(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """Where the minimiser along a line is known to be: between `low`, up to which the cost has only fallen, and `high`.
+    """A bracket of the minimiser along a line: the cost falls up to `low`, and rises from `high` on.
 
-    `length` is where to look next; once the slope is flat, as it was at the last look, it is the minimiser.
+    `length` is the next length to evaluate, and the minimiser once the slope was flat at the last one.
     """
 
     low: _Scalar
@@ -520,30 +519,30 @@ class _Search(eqx.Module):
 
 
 def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth) -> _Scalar:
-    """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers it.
+    """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers the cost.
 
-    `noise` is the size of the slope by rounding alone; for those who are done the answer does not matter.
+    `noise` is the rounding error of the slope. The result is not used for members that are done.
     """
-    along = problem.rates(direction)
+    along = problem.mv(direction)
     smooth_slope = linear.dot(direction, point.inertia - problem.force)
-    smooth_curvature = linear.dot(direction, problem.weigh(direction))
+    smooth_curvature = linear.dot(direction, problem.mass_mv(direction))
     start = linear.dot(point.gradient, direction)
     flat = jnp.maximum(_LINE_TOLERANCE * jnp.abs(start), noise)
 
     def improve(search: _Search) -> _Search:
         length = search.length
         x = jax.tree.map(lambda x, rate: x + length * rate, point.x, along)
-        value = smooth_slope + length * smooth_curvature - _dot(problem.push(x), along)
-        curvature = smooth_curvature + _dot(problem.bent(x, along), along)
+        value = smooth_slope + length * smooth_curvature - _dot(problem.row_force(x), along)
+        curvature = smooth_curvature + _dot(problem.hessian_product(x, along), along)
         low, high = jnp.where(value < 0, length, search.low), jnp.where(value < 0, search.high, length)
         newton = length - value / jnp.where(curvature > 0, curvature, 1.0)
         is_flat = jnp.abs(value) <= flat
-        # From below it must not go back to where it came from, or it may go to and fro for ever between two pieces.
+        # A step from below must stay clear of the bracket's upper end, or it may alternate between two pieces for ever.
         reach = jnp.where((value < 0) & ~is_flat, high - _LINE_MARGIN * (high - low), high)
         inside = (newton >= low) & (newton <= reach)
         return _Search(low, high, jnp.where(inside, newton, 0.5 * (low + high)), is_flat)
 
-    # The inertial part alone bounds the root from above, as the rows only add to the slope: twice that was not looked at.
+    # The rows only add to the slope, so the inertial part alone bounds the root from above; twice that is outside.
     high = 2.0 * jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
     search = (_until_exact if problem.is_piecewise_quadratic else _until_flat)(improve, search)
@@ -555,16 +554,16 @@ def _dot(one: PyTree, other: PyTree) -> _Scalar:
 
 
 def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Search:
-    """Improve a few times, and on until every slope is flat, at which the next look is the minimiser.
+    """Improve a fixed number of times, then until every slope is flat, where the next length is the minimiser.
 
-    Without the second part the iteration may go around in a circle: where a step is a hundred times too long, as a foot that is
-    pressed hard may make it, four looks are all beyond the minimiser, and the last of them raises the cost.
+    A fixed number alone may fail: under a foot that is pressed hard a step can be a hundred times too long. Then four lengths
+    all lie beyond the minimiser, the last one raises the cost, and the iteration cycles.
     """
     is_done, num_looks = search.is_flat, 0
     least = _LINE_STEPS if is_done.ndim else 0  # one state's own loop ends with its search
     if not device.is_cpu() and is_done.ndim:
-        # A GPU spends more on starting the loop's turns than on the turns themselves. A CPU keeps the loop: unrolled, XLA
-        # writes each step out again wherever the next one uses its length.
+        # A GPU spends more on starting a loop's turns than on the turns. A CPU keeps the loop: XLA would repeat each
+        # unrolled step wherever the next one uses its length.
         num_looks = _LINE_STEPS
         for _ in range(num_looks):
             search = improve(search)
@@ -578,7 +577,7 @@ def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Sea
 
 
 def _until_flat(improve: Callable[[_Search], _Search], search: _Search) -> _Search:
-    """Improve until every member of the batch has a flat slope; those that have one stay."""
+    """Improve until every member of the batch has a flat slope; members with a flat slope stay."""
 
     def turn(state):
         search, count = state

@@ -1,7 +1,7 @@
 r"""The entries of the constraint Jacobian, without those that are always zero.
 
-The solve needs them many times over, but a contact moves few joints of the model, and which ones is known before anything
-is compiled: those between its two bodies. Arrays may carry the batch as trailing axes, see `linear`.
+A contact acts only on the joints between its two bodies, which are known before compilation. Arrays may carry the batch as
+trailing axes, see `linear`.
 """
 
 import equinox as eqx
@@ -10,30 +10,32 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad.batched import linear
-from mjxgrad.solver.constraint import Bend, RowLayout
+from mjxgrad.solver.constraint import RowHessian, RowLayout
 from mjxgrad.solver.jacobian import DenseRows, Group, RowMap, dense, edges, flat, fold
 
 _Entries = Float[Array, "num dim dofs *batch"]
 _Square = Float[Array, "dofs dofs *batch"]
 
-# Beyond so many groups the entries are kept in one matrix with its zeros: every group is some operations more to compile.
+# With more groups the entries are kept in one dense matrix, since every group adds operations to compile.
 _MOST_GROUPS = 24
 
 
 class SparseRows(eqx.Module):
     """The entries of a Jacobian, group by group, without those that are always zero.
 
-    `pieces` are by item, direction and joint velocity, `tilts` μ of each tangent of a pyramid.
+    Attributes:
+        pieces: entries by item, direction and joint velocity.
+        friction: μ of each tangent of a pyramid; None for other rows.
     """
 
     pieces: tuple[Float[Array, "_ _ _ *batch"], ...]
-    tilts: tuple[Float[Array, "_ _ *batch"] | None, ...]
+    friction: tuple[Float[Array, "_ _ *batch"] | None, ...]
     groups: tuple[Group, ...] = eqx.field(static=True)
     num_dofs: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
-        """Return the entries of a map; rows that are not active are zero."""
+        """Return the entries of a map; inactive rows are zero."""
         if not _keeps_groups(rows):
             rows = DenseRows(
                 rows.matrix(num_dofs), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
@@ -44,59 +46,63 @@ class SparseRows(eqx.Module):
             active = active[:, :1] if group.is_pyramid else active
             pieces.append(jnp.where(active[:, :, None], entries, 0.0))
             start += group.num_rows
-        return cls(tuple(pieces), tuple(rows.tilts()), rows.groups, num_dofs)
+        return cls(tuple(pieces), tuple(rows.friction_by_group()), rows.groups, num_dofs)
 
     def matvec(self, x: Float[Array, "nv *batch"]) -> Float[Array, "rows *batch"]:
         """Return J x."""
         rows = []
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
             moving = linear.take(x, group.dofs)
             along = entries[:, :, 0] * moving[:, None] if group.is_diagonal else _over_dofs(entries, moving)
-            rows.append(edges(along, tilt).reshape(group.num_rows, *x.shape[1:]))
+            rows.append(edges(along, mu).reshape(group.num_rows, *x.shape[1:]))
         return jnp.concatenate(rows)
 
     def rmatvec(self, force: Float[Array, "rows *batch"]) -> Float[Array, "nv *batch"]:
         """Return Jᵀ force."""
         total, start = jnp.zeros((self.num_dofs, *force.shape[1:]), force.dtype), 0
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
             own = force[start : start + group.num_rows].reshape(group.num, group.rows_each, *force.shape[1:])
             start += group.num_rows
-            push = fold(own, tilt)
-            part = entries[:, 0, 0] * push[:, 0] if group.is_diagonal else _over_rows(entries, push)
+            force_along = fold(own, mu)
+            part = entries[:, 0, 0] * force_along[:, 0] if group.is_diagonal else _over_rows(entries, force_along)
             total = linear.add_at(total, group.dofs, part)
         return total
 
-    def gram(self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, bend: Bend) -> Float[Array, "nv nv *batch"]:
-        """Return mass + Jᵀ s'' J, of which each group adds to what it moves and to nothing else; s'' by `constraint.bend`."""
+    def gram(
+        self, mass: Float[Array, "nv nv *batch"], layout: RowLayout, row_hessian: RowHessian
+    ) -> Float[Array, "nv nv *batch"]:
+        """Return mass + Jᵀ s'' J with s'' from `constraint.hessian`; each group adds only to the block of its dofs."""
         total, start = mass, 0
-        for group, entries, tilt in zip(self.groups, self.pieces, self.tilts, strict=True):
+        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
             rows = slice(start, start + group.num_rows)
             start = rows.stop
             if rows.start >= layout.simple_stop:
-                square = _gram(entries, _cone_product(layout, bend, rows, entries))
+                square = _gram(entries, _cone_product(layout, row_hessian, rows, entries))
             elif group.is_diagonal:
-                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * bend.simple[rows])
+                total = linear.add_to_diagonal(total, group.dofs, entries[:, 0, 0] ** 2 * row_hessian.simple[rows])
                 continue
-            elif tilt is None:
-                bent = bend.simple[rows].reshape(*entries.shape[:2], 1, *mass.shape[2:])
-                square = _gram(entries, bent * entries)
+            elif mu is None:
+                curvature = row_hessian.simple[rows].reshape(*entries.shape[:2], 1, *mass.shape[2:])
+                square = _gram(entries, curvature * entries)
             else:
-                square = _pyramid_square(bend.simple[rows].reshape(*tilt.shape[:2], 2, *mass.shape[2:]), tilt, entries)
+                square = _pyramid_square(
+                    row_hessian.simple[rows].reshape(*mu.shape[:2], 2, *mass.shape[2:]), mu, entries
+                )
             total = linear.add_to_block(total, group.dofs, square)
         return total
 
-    def together(self) -> Float[Array, "together nv *batch"]:
-        """Return J, zeros and all, without the rows that see one joint velocity each."""
-        # As the entries stand: else XLA computes them anew for every edge that they are in.
+    def dense_rows(self) -> Float[Array, "dense nv *batch"]:
+        """Return J with its zeros, without the rows that act on one joint velocity each."""
+        # The barrier keeps XLA from computing an entry again for every edge.
         pieces = jax.lax.optimization_barrier(self.pieces)
-        chosen = [one for one in zip(self.groups, pieces, self.tilts, strict=True) if not one[0].is_diagonal]
+        chosen = [one for one in zip(self.groups, pieces, self.friction, strict=True) if not one[0].is_diagonal]
         if not chosen:
             return jnp.zeros((0, self.num_dofs, *pieces[0].shape[3:]), pieces[0].dtype)
-        groups, entries, tilts = (list(of) for of in zip(*chosen, strict=True))
-        return dense(groups, entries, tilts, self.num_dofs)
+        groups, entries, friction = (list(of) for of in zip(*chosen, strict=True))
+        return dense(groups, entries, friction, self.num_dofs)
 
-    def apart(self, x: Float[Array, "rows *batch"]) -> tuple[Array, ...]:
-        """Return of what belongs to rows the part of those of `together`, and that of each other group by joint velocity."""
+    def split(self, x: Float[Array, "rows *batch"]) -> tuple[Array, ...]:
+        """Return the values of the rows in `dense_rows`, then those of each other group by joint velocity."""
         others, single, start = [x[:0]], [], 0
         for group in self.groups:
             own, start = x[start : start + group.num_rows], start + group.num_rows
@@ -107,35 +113,37 @@ class SparseRows(eqx.Module):
         return jnp.concatenate(others), *single
 
     def signs(self) -> tuple[Float[Array, "nv *batch"], ...]:
-        """Return the entries of the groups whose rows see one joint velocity each, by joint velocity."""
+        """Return the entries of rows that act on one joint velocity each, one array by joint velocity per group."""
         pairs = zip(self.groups, self.pieces, strict=True)
         return tuple(self._by_dof(group, entries[:, 0, 0]) for group, entries in pairs if group.is_diagonal)
 
     def _by_dof(self, group: Group, own: Float[Array, "num *batch"]) -> Float[Array, "nv *batch"]:
         return linear.add_at(jnp.zeros((self.num_dofs, *own.shape[1:]), own.dtype), group.dofs, own)
 
-    def bent(
-        self, together: Float[Array, "together nv *batch"], layout: RowLayout, bend: Bend
-    ) -> tuple[Float[Array, "together *batch"], Float[Array, "together nv *batch"] | None, Float[Array, "nv *batch"]]:
-        """Return Jᵀ s'' J in parts: factors of the rows of `together`; their partners, if not themselves; a diagonal."""
+    def hessian_factors(
+        self, dense_rows: Float[Array, "dense nv *batch"], layout: RowLayout, row_hessian: RowHessian
+    ) -> tuple[Float[Array, "dense *batch"], Float[Array, "dense nv *batch"] | None, Float[Array, "nv *batch"]]:
+        """Return Jᵀ s'' J in parts: factors of `dense_rows`, their right factors if these differ, and a diagonal."""
         num_coupled = layout.num_rows - layout.simple_stop
-        coupled = jnp.ones((num_coupled, *bend.simple.shape[1:]), bend.simple.dtype)
-        factors, *single = self.apart(jnp.concatenate([bend.simple, coupled]))
+        coupled = jnp.ones((num_coupled, *row_hessian.simple.shape[1:]), row_hessian.simple.dtype)
+        factors, *single = self.split(jnp.concatenate([row_hessian.simple, coupled]))
         diagonal = [sign**2 * own for sign, own in zip(self.signs(), single, strict=True)]
-        diagonal = linear.add([jnp.zeros_like(together, shape=(self.num_dofs, *together.shape[2:])), *diagonal])
+        diagonal = linear.add([jnp.zeros_like(dense_rows, shape=(self.num_dofs, *dense_rows.shape[2:])), *diagonal])
         if not layout.cones:
             return factors, None, diagonal
-        first = layout.num_rows - len(together)  # cones come last
-        parts = [together[: layout.simple_stop - first]]
-        for cone, square in zip(layout.cones, bend.cones, strict=True):
-            own = together[cone.start - first : cone.stop - first].reshape(cone.count, cone.dim, *together.shape[1:])
+        first = layout.num_rows - len(dense_rows)  # cones come last
+        parts = [dense_rows[: layout.simple_stop - first]]
+        for cone, square in zip(layout.cones, row_hessian.cones, strict=True):
+            own = dense_rows[cone.start - first : cone.stop - first].reshape(
+                cone.count, cone.dim, *dense_rows.shape[1:]
+            )
             both = linear.add(square[:, :, k, None] * own[:, None, k] for k in range(cone.dim))
-            parts.append(both.reshape(-1, *together.shape[1:]))
+            parts.append(both.reshape(-1, *dense_rows.shape[1:]))
         return factors, jnp.concatenate(parts), diagonal
 
 
-def num_together(rows: RowMap) -> int:
-    """Return the number of rows of `SparseRows.together`."""
+def num_dense_rows(rows: RowMap) -> int:
+    """Return the number of rows of `SparseRows.dense_rows`."""
     keeps_groups = _keeps_groups(rows)
     return sum(group.num_rows for group in rows.groups if not (keeps_groups and group.is_diagonal))
 
@@ -166,35 +174,37 @@ def _over_rows(entries: _Entries, force: Float[Array, "num dim *batch"]) -> Floa
 
 
 def _rows(entries: Array) -> list[Array]:
-    """Return all rows, one by one. As one array of another shape XLA would compute the entries again for it."""
+    """Return the rows as separate arrays: for one reshaped array XLA would compute the entries again."""
     return [entries[i, k] for i in range(entries.shape[0]) for k in range(entries.shape[1])]
 
 
 def _pyramid_square(
-    bend: Float[Array, "num tangents 2 *batch"], tilt: Float[Array, "num tangents *batch"], entries: _Entries
+    row_hessian: Float[Array, "num tangents 2 *batch"], friction: Float[Array, "num tangents *batch"], entries: _Entries
 ) -> _Square:
-    """Return Jᵀ s'' J of pyramids, J the edges n ± μ t, from their directions."""
-    both, difference = _both_edges(bend, tilt)
+    """Return Jᵀ s'' J of pyramids from their directions; J has the edges n ± μ t as rows."""
+    both, difference = _both_edges(row_hessian, friction)
     difference, (normal, tangents) = difference[:, :, None], (entries[:, 0], entries[:, 1:])
     of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
-    of_tangents = difference * normal[:, None] + (tilt**2 * both)[:, :, None] * tangents
+    of_tangents = difference * normal[:, None] + (friction**2 * both)[:, :, None] * tangents
     return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
 
 
-def _both_edges(bend: Float[Array, "num tangents 2 *batch"], tilt: Float[Array, "num tangents *batch"]):
-    """Return s'' of both edges of each tangent: the sum, and μ times the difference."""
-    return bend[:, :, 0] + bend[:, :, 1], tilt * (bend[:, :, 0] - bend[:, :, 1])
+def _both_edges(row_hessian: Float[Array, "num tangents 2 *batch"], friction: Float[Array, "num tangents *batch"]):
+    """Return the sum of s'' at the two edges of each tangent, and μ times the difference."""
+    return row_hessian[:, :, 0] + row_hessian[:, :, 1], friction * (row_hessian[:, :, 0] - row_hessian[:, :, 1])
 
 
-def _cone_product(layout: RowLayout, bend: Bend, rows: slice, entries: _Entries) -> _Entries:
+def _cone_product(layout: RowLayout, row_hessian: RowHessian, rows: slice, entries: _Entries) -> _Entries:
     """Return s'' of neighbouring elliptic contacts times their rows."""
-    matrix = _cone_matrices(layout, bend, rows, len(entries))
+    matrix = _cone_matrices(layout, row_hessian, rows, len(entries))
     return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(entries.shape[1]))
 
 
-def _cone_matrices(layout: RowLayout, bend: Bend, rows: slice, num: int) -> Float[Array, "num dim dim *batch"]:
+def _cone_matrices(
+    layout: RowLayout, row_hessian: RowHessian, rows: slice, num: int
+) -> Float[Array, "num dim dim *batch"]:
     """Return s'' of neighbouring elliptic contacts."""
     which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
     cone = layout.cones[which]
     first = (rows.start - cone.start) // cone.dim
-    return bend.cones[which][first : first + num]
+    return row_hessian.cones[which][first : first + num]

@@ -1,4 +1,4 @@
-"""One step that can be differentiated: rows of contacts, limits and equalities, time integration, onset and smoothing."""
+"""The differentiable step: rows of contacts, limits and equalities, time integration, onset and smoothing."""
 
 from mjxgrad.stepping.onset import Onset
 from mjxgrad.stepping.rows import contact_force

@@ -1,9 +1,9 @@
 r"""All constraint rows of a state: Jacobian, reference acceleration and weight.
 
-The same rows in the same order as `mjx.make_constraint`, so that `mjx.Data` keeps its meaning, formed differently for two
-reasons. Derivatives: MJX's impedance is NaN beyond its width, its stiffness is NaN for a direct solref without damping, and its
-norms have no derivative near zero. Speed: the Jacobian is a map that is applied without being formed (see `jacobian`), and
-the impedance is evaluated once per contact, not once per pyramid edge.
+The rows and their order are those of `mjx.make_constraint`, so that `mjx.Data` keeps its meaning. They are formed differently
+for two reasons. Derivatives: MJX's impedance has NaN derivatives beyond its width, its stiffness for a direct solref without
+damping, and its norms have none near zero. Speed: the Jacobian is a map that is applied without being formed (see `jacobian`),
+and the impedance is evaluated once per contact, not once per pyramid edge.
 
 References:
     MuJoCo documentation, "Modeling", "Solver parameters"; "Computation", "Constraint model".
@@ -25,7 +25,7 @@ _CONDIMS = (1, 3, 4, 6)
 
 
 def row_layout(model: mjx.Model, data: mjx.Data) -> RowLayout:
-    """Return which law holds on which rows of this data."""
+    """Return the layout of the laws over the rows of data."""
     impl, cones = data._impl, []
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         for dim in _CONDIMS[1:]:
@@ -37,7 +37,7 @@ def row_layout(model: mjx.Model, data: mjx.Data) -> RowLayout:
 
 
 def gather(model: mjx.Model, data: mjx.Data) -> list[Block]:
-    """Return the rows of a state, kind by kind in MuJoCo's order, also those that are inactive."""
+    """Return all rows of a state, inactive ones included, kind by kind in MuJoCo's order."""
     disabled, bits = model.opt.disableflags, mujoco.mjtDisableBit
     if disabled & bits.mjDSBL_CONSTRAINT:
         return []
@@ -53,7 +53,7 @@ def gather(model: mjx.Model, data: mjx.Data) -> list[Block]:
 
 
 def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None = None) -> mjx.Data:
-    """Fill the `efc_` fields from rows, gathered if they are not at hand; a drop-in for `mjx.make_constraint`."""
+    """Fill the `efc_` fields from rows, which are gathered if not given; a drop-in for `mjx.make_constraint`."""
     blocks = gather(model, data) if blocks is None else blocks
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
@@ -81,9 +81,9 @@ def system_of(
     noise: Noise | None = None,
     velocity: Float[Array, " nv"] | None = None,
 ) -> System:
-    """Return all that determines the acceleration of a state with all smooth forces, rows, and noise on them.
+    """Return the equations of motion of a state from its smooth forces, its rows, and noise on them.
 
-    The rows ask for their acceleration at a velocity, by default that of the state.
+    The rows' reference acceleration is taken at `velocity`, by default that of the state.
     """
     reference, weight = rows.law(model, data.qvel if velocity is None else velocity, block)
     laws = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)

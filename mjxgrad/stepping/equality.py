@@ -1,6 +1,6 @@
 """Constraint rows of equality constraints: connect, weld, joint and tendon couplings, in MuJoCo's order.
 
-Connect and weld ask for J̇ v less, by which points and turns of moving bodies accelerate while no joint does. MJX lacks it.
+Connect and weld subtract the drift J̇ v, the relative acceleration of moving bodies without joint accelerations. MJX lacks it.
 """
 
 import jax
@@ -21,7 +21,7 @@ _Ends = Float[Array, "constraints 2 3"]
 
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
-    """Return one block per type that the model has."""
+    """Return one block per type of equality constraint in the model."""
     kinds = mujoco.mjtEq
     table = (
         (kinds.mjEQ_CONNECT, _connect),
@@ -42,7 +42,7 @@ def _block(
     inverse_weight: Float[Array, "constraints k"],
     drift: Float[Array, "constraints k"] | None = None,
 ) -> Block:
-    """Return the rows of constraints with k rows each, whose impedance follows the norm of their residual."""
+    """Return the block of constraints with k rows each; their impedance is that of the residual's norm."""
     each = residual.shape[1]
     flat = residual.reshape(-1)
     zero = jnp.zeros_like(flat)
@@ -61,7 +61,7 @@ def _block(
 
 
 def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return whether constraints name sites, their objects (2 per constraint) and the objects' bodies."""
+    """Return whether constraints are between sites, their two objects each, and the objects' bodies."""
     is_site = np.asarray(model.eq_objtype)[ids] == mujoco.mjtObj.mjOBJ_SITE
     objects = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
     bodies = objects.copy()
@@ -93,7 +93,7 @@ def _translation(
 
 
 def _accelerations(model: mjx.Model, data: mjx.Data, points: _Ends, bodies: np.ndarray) -> tuple[_Ends, _Ends, _Ends]:
-    """Return angular velocities, angular accelerations and accelerations of both ends while no joint accelerates."""
+    """Return angular velocities, angular accelerations and accelerations of both ends without joint accelerations."""
     data = kinematics.com_vel(model, data)
     of_bodies = maps.combine(tree.moving_dofs(model), maps.scale(data.qvel, data.cdof_dot))
     lever = points - data.subtree_com[model.body_rootid[bodies]]
@@ -113,7 +113,7 @@ def _connect(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
 
 
 def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    """Six rows: difference of position, and the vector part of the relative quaternion times the torque scale."""
+    """Return six rows: difference of position, and the vector part of the relative quaternion times the torque scale."""
     settings = model.eq_data[ids]
     is_site, objects, bodies = _ends(model, ids)
     # The data of a weld hold the second body's anchor first.
@@ -136,7 +136,7 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     rate = 0.5 * scale[:, :, None] * jnp.swapaxes(rate, 1, 2)
     weight = jnp.sum(model.body_invweight0[bodies], axis=1)  # translation, rotation
     spin, angular, moved = _accelerations(model, data, points, bodies)
-    # With q' = ω q / 2 the rate of q₂* q₁ is q₂* (ω₁ - ω₂) q₁ / 2, and that once more:
+    # With q' = ω q / 2 the rate of q₂* q₁ is q₂* (ω₁ - ω₂) q₁ / 2; its rate gives the drift:
     own, other, change = (jnp.pad(x, ((0, 0), (1, 0))) for x in (spin[:, 0], spin[:, 1], angular[:, 0] - angular[:, 1]))
     change += 0.5 * (spatial.multiply(own - other, own) - spatial.multiply(other, own - other))
     twist = 0.5 * scale * spatial.multiply(spatial.multiply(back, change), first)[:, 1:]
@@ -149,7 +149,7 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
 def _polynomial(
     coefficients: Float[Array, "n 5"], x: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return a quartic and its derivative, by Horner's rule: no power of zero to differentiate."""
+    """Return a quartic and its derivative by Horner's rule, without powers of zero, which have no derivative."""
     value, slope = coefficients[:, 4], jnp.zeros_like(x)
     for k in (3, 2, 1, 0):
         slope = slope * x + value

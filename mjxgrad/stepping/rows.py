@@ -1,7 +1,8 @@
-"""Constraint rows, kind by kind: contacts, limits and friction loss; `equality` has the others.
+"""Constraint rows of contacts, limits and friction loss; `equality` has those of equality constraints.
 
-A row has residual r, rate J v, and asks for a_ref = -B J v - K d(r) r, with weight D = d / ((1 - d) Â), Â the inverse inertia
-of the row estimated at the reference pose. Where bodies are held together it asks for J̇ v less, as in C MuJoCo.
+A row has the residual r, the rate J v, the reference acceleration a_ref = -B J v - K d(r) r and the weight
+D = d / ((1 - d) Â), with Â the inverse inertia of the row estimated at the reference pose. Connect and weld constraints also
+subtract J̇ v, as in C MuJoCo.
 """
 
 import dataclasses
@@ -30,19 +31,19 @@ class Block(eqx.Module):
     """Constraint rows of one kind, before gating and scaling. All fields have the rows as leading axis.
 
     Attributes:
-        map: from joint velocities to the rows, also where the row is inactive.
+        map: J, from joint velocities to the rows, inactive rows included.
         residual: r in a_ref (m or rad).
         impedance: d(r), with dw and d0.
-        solimp: what the impedance follows from.
+        solimp: parameters of the impedance.
         inverse_weight: Â, inverse inertia (1/kg).
         solref: stiffness and damping in MuJoCo's formats.
         margin: distance at which the row begins (m or rad).
         friction_loss: largest force of a friction loss row.
         is_active: whether the row takes part.
-        drift: J̇ v, what the rate changes by without joint accelerations (m/s² or rad/s²); None where it does not count.
-        rows_each: how many consecutive rows begin and end together, those of a contact or of a limit; 0 if none ever does.
-        is_pyramid: whether these are the edges of a pyramid, whose mean is the normal row; otherwise the first one is.
-        is_contact: whether these are contacts.
+        drift: J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²); None where it is not used.
+        rows_each: number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
+        is_pyramid: whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
+        is_contact: whether the rows belong to contacts.
     """
 
     map: RowMap
@@ -61,7 +62,7 @@ class Block(eqx.Module):
 
 
 def joined(blocks: list[Block]) -> Block:
-    """Return all rows as one block; which of them begin and end together it no longer says."""
+    """Return all rows as one block, without `rows_each`, `is_pyramid` and `is_contact`."""
     if any(block.drift is not None for block in blocks):
         still = [jnp.zeros_like(x.residual) if x.drift is None else x.drift for x in blocks]
         blocks = [dataclasses.replace(x, drift=drift) for x, drift in zip(blocks, still, strict=True)]
@@ -74,9 +75,9 @@ def joined(blocks: list[Block]) -> Block:
 
 
 def law(model: mjx.Model, qvel: Float[Array, " nv"], block: Block) -> tuple[_PerRow, _PerRow]:
-    """Return a_ref and weight D of rows; those of inactive rows are zero and of no effect."""
+    """Return a_ref and weight D of rows; a_ref of inactive rows is zero, and they have no effect."""
     residual = jnp.where(block.is_active, block.residual, 0.0)
-    rate = jnp.where(block.is_active, block.map.rates(qvel), 0.0)
+    rate = jnp.where(block.is_active, block.map.mv(qvel), 0.0)
     stiffness, damping = stiffness_damping(model, block.solref, block.impedance.full)
     present = block.impedance.present
     drift = 0.0 if block.drift is None else jnp.where(block.is_active, block.drift, 0.0)
@@ -84,19 +85,20 @@ def law(model: mjx.Model, qvel: Float[Array, " nv"], block: Block) -> tuple[_Per
 
 
 def weight_of(block: Block, impedance: _PerRow) -> _PerRow:
-    """Return D of rows at some impedance."""
+    """Return the weight D of rows at an impedance."""
     return 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
 
 
 def per_row(x: Array, each: int) -> Array:
-    """Return for each row what is given for each contact, limit or constraint."""
+    """Repeat the value of each contact, limit or constraint for each of its rows."""
     return jnp.repeat(x, each, axis=0)
 
 
 def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     """Return the rows of all contacts of one dimension.
 
-    Two opposite edges J_n ± μ_k J_k for each friction direction of a pyramid; else the normal row and those of friction.
+    A pyramid has two opposite edges J_n ± μ_k J_k for each direction of friction. Other contacts have a normal row, then rows of
+    friction.
     """
     contact = data._impl.contact
     chosen = np.nonzero(np.asarray(contact.dim) == dim)[0]
@@ -138,7 +140,7 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
 def _cone_rows(
     model: mjx.Model, contact: Any, inverse_weight: Float[Array, " contacts"], dim: int
 ) -> tuple[_PerRow, Float[Array, "rows 2"]]:
-    """Return Â and solref of the normal row and the rows of friction of each contact, elliptic or frictionless."""
+    """Return Â and solref of the rows of elliptic or frictionless contacts, the normal row first."""
     weights, solref = [inverse_weight[:, None]], [contact.solref[:, None]]
     if dim > 1:
         friction2 = contact.friction[:, : dim - 1] ** 2
@@ -151,7 +153,7 @@ def _cone_rows(
 
 
 def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
-    """Return the map of consecutive contacts of one dimension, the first of which has a number."""
+    """Return the map of consecutive contacts of one dimension, from slot `first` on."""
     friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
     bodies = _bodies(model, data, contact, first)
     if isinstance(bodies, np.ndarray):
@@ -160,12 +162,12 @@ def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int
 
 
 def has_pyramids(model: mjx.Model, dim: int) -> bool:
-    """Return whether contacts of a dimension have the edges of a pyramid as rows."""
+    """Return whether contacts of a dimension have the edges of pyramids as rows."""
     return dim > 1 and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
 def _bodies(model: mjx.Model, data: mjx.Data, contact: Any, first: int) -> np.ndarray | Array:
-    """Return the bodies of consecutive contacts, as constants where they are known."""
+    """Return the bodies of consecutive contacts, as constants if they are known."""
     slots = slot_geoms(model, data)
     if slots is None:
         return jnp.asarray(model.geom_bodyid)[contact.geom]
@@ -173,19 +175,19 @@ def _bodies(model: mjx.Model, data: mjx.Data, contact: Any, first: int) -> np.nd
 
 
 def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:
-    """Return friction as C MuJoCo clamps it for every contact: a cone without width has no inside."""
+    """Return friction, clamped from below as in C MuJoCo: a cone of zero width has no interior."""
     return jnp.where(friction > mujoco.mjMINMU, friction, mujoco.mjMINMU)
 
 
 def contact_rows(
     model: mjx.Model, data: mjx.Data, contact: Any, bodies: np.ndarray, dim: int, friction: Array | None
 ) -> ContactRows:
-    """Return the rows of contacts between known bodies, as the relative velocity of the two at a point."""
+    """Return the rows of contacts between known bodies, the relative velocity of the two at a point."""
     moves = tree.moving_dofs(model)
     shares_root = model.body_rootid[bodies[:, 0]] == model.body_rootid[bodies[:, 1]]
     own = moves[bodies]
     own = own * (1 - own[:, ::-1] * shares_root[:, None, None])
-    # The side that moves first; then the second one is needed only for contacts of two moving bodies.
+    # Moving sides come first; the second is needed only for contacts of two moving bodies.
     order = np.argsort(~own.any(axis=2), axis=1, kind="stable")
     num_sides = max(1, int(own.any(axis=2).sum(axis=1).max()))
     order = order[:, :num_sides]
@@ -206,7 +208,7 @@ def contact_jacobian(
     bodies: Array | np.ndarray,
     dim: int,
 ) -> Float[Array, "contacts dim nv"]:
-    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as `ContactRows` do.
+    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as in `ContactRows`.
 
     The second body counts positive, the first negative.
     """
@@ -214,7 +216,7 @@ def contact_jacobian(
     lever = position[:, None] - maps.choose(jnp.asarray(model.body_rootid)[bodies], data.subtree_com)
     signs = moves * jnp.array([-1.0, 1.0], position.dtype)[:, None]
     turning, moving = data.cdof[:, :3], data.cdof[:, 3:]
-    # Of a joint velocity both sides have the same motion, about the same point if they have the same root.
+    # A joint velocity moves both sides alike, about the same point if they have the same root.
     sign, arm = signs[:, 0] + signs[:, 1], maps.contract("csv,csx->cvx", signs, lever)
     point = maps.contract("cv,vx->cvx", sign, moving) + maps.contract(
         "vxy,cvy->cvx", spatial.cross_matrix(turning), arm
@@ -229,19 +231,19 @@ def contact_jacobian(
 def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> Float[Array, "3"]:
     """Return the force that one geom exerts on another through all their contacts.
 
-    For `observe=` of a rollout: `lambda model, data: mg.contact_force(model, data, "floor", "foot")`.
+    It is meant for `observe=` of a rollout: `lambda model, data: mg.contact_force(model, data, "floor", "foot")`.
 
     Args:
-        model: the scene's.
-        data: with the forces of its constraints, as `forward`, a step or a rollout leaves them.
-        first: name of the geom that pushes.
-        second: name of the geom that is pushed.
+        model: the model of the scene.
+        data: data with constraint forces, as returned by `forward`, a step or a rollout.
+        first: name of the geom that exerts the force.
+        second: name of the geom that receives it.
 
     Returns:
-        The force in world coordinates (N); zero where they do not touch. Torques of friction are not in it.
+        The force in world coordinates (N); zero where they do not touch. It does not include torques of friction.
 
     Raises:
-        ValueError: if there is no such geom, or no contact between the two.
+        ValueError: if there is no such geom, or the two can never touch.
     """
     wanted = [index_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in (first, second)]
     contact, known = data._impl.contact, slot_geoms(model, data)
@@ -251,7 +253,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     total = jnp.zeros(3, data.qpos.dtype)
     for slot in slots:
         dim, address = int(contact.dim[slot]), int(contact.efc_address[slot])
-        # MuJoCo's normal points from the first geom to the second, which the force pushes away.
+        # MuJoCo's normal points from the first geom to the second, in the direction of the force on the second.
         along, against = (jnp.all(contact.geom[slot] == jnp.array(pair)) for pair in (wanted, wanted[::-1]))
         has_pyramid = has_pyramids(model, dim)
         force = data._impl.efc_force[address : address + (2 * (dim - 1) if has_pyramid else dim)]
@@ -263,7 +265,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
 
 
 def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
-    """Return the number of a body, joint, geom, site, sensor or actuator; refuse a name that there is not."""
+    """Return the index of a named body, joint, geom, site, sensor or actuator; refuse an unknown name."""
     word = kind.name.removeprefix("mjOBJ_").lower()
     count = {"joint": "njnt", "actuator": "nu"}.get(word, f"n{word}")
     names = [mjx.id2name(model, kind, index) for index in range(getattr(model, count))]
@@ -335,7 +337,7 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
 def one_sided(
     map: RowMap, distance: _PerRow, inverse_weight: _PerRow, chosen: np.ndarray, margin: Any, solref: Any, solimp: Any
 ) -> Block:
-    """Return rows that only push, one each; margin, solref and solimp are those of all, of which some are chosen."""
+    """Return one-sided rows, one per chosen item; margin, solref and solimp are those of all items."""
     margins, solimps = margin[chosen], solimp[chosen]
     residual = distance - margins
     return Block(
@@ -353,11 +355,11 @@ def one_sided(
 
 
 def _ball_limit(model: mjx.Model, data: mjx.Data, joints: np.ndarray) -> tuple[RowMap, _PerRow]:
-    """Return map and distance of limited ball joints, about the axis by which each is turned."""
+    """Return map and distance to the limit of ball joints, about each joint's present axis of rotation."""
     quaternion = data.qpos[model.jnt_qposadr[joints][:, None] + np.arange(4)]
     turn = spatial.logarithm(quaternion / safe_norm(quaternion)[:, None])
     angle = safe_norm(turn)
-    # Without an axis there is no limit near; a smaller angle, squared, is nothing in single precision.
+    # At a smaller angle, whose square underflows in single precision, the axis is zero; no limit is near there.
     axis = turn / jnp.where(angle > 1e-12, angle, 1.0)[:, None]
     select = np.zeros((len(joints), 3, model.nv))
     select[np.arange(len(joints))[:, None], np.arange(3), model.jnt_dofadr[joints][:, None] + np.arange(3)] = 1
@@ -370,7 +372,7 @@ def _axis_rows(sign: _PerRow, dofs: np.ndarray, model: mjx.Model) -> AxisRows:
 
 
 def _nearer_end(position: _PerRow, interval: Float[Array, "rows 2"]) -> tuple[_PerRow, _PerRow]:
-    """Return the distance to the nearer end of an interval, and its derivative's sign."""
+    """Return the distance to the nearer end of an interval, and the sign of its derivative."""
     below, above = position - interval[:, 0], interval[:, 1] - position
     is_lower = below < above
     return jnp.where(is_lower, below, above), jnp.where(is_lower, 1.0, -1.0).astype(position.dtype)

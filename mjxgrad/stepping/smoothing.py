@@ -2,32 +2,30 @@ r"""Contacts and limits averaged over noise on their distance, in closed form, w
 
 Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
 decides whether there is contact at all, $r + w < 0$. The mean of each row's cost over the noise is again convex and has a closed
-form, so the same solve finds the acceleration.
-What is averaged is thus the step's contact law and not the motion.
+form, so the same solve finds the acceleration. The average is thus over the step's contact law, not over the motion.
 
-As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters: a row without it
-(`gated=False`) acts wherever $J a - a_\text{ref} + K d w < 0$, touching or not, and its damping brakes bodies that
-approach from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact. It is the row that
-interior-point and barrier methods smooth.
+As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters. A row without it
+(`gated=False`) acts wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in interior-point and barrier methods.
+Its damping brakes approaching bodies from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact.
 
-A row has x = J a + B J v + c r with c = K d(r), and pushes with -D x where x < 0 and r < 0. Noise w on r makes that
-x + c w and r + w. With ρ the noise's density, P its distribution function and S its softened ramp, in units of its
-length (see `kernels`), the mean push is
+A row has x = J a + B J v + c r with c = K d(r), and the force -D x where x < 0 and r < 0. Noise w on r turns these into
+x + c w and r + w. With ρ the noise's density and S its softened ramp, in units of its length (see `kernels`), the mean
+force is
 
-    F(x) = -D ∫_{w < W} (x + c w) ρ(w) dw,        W = min(-r, -x/c),
+    F(x) = -D ∫_{w < W} (x + c w) ρ(w) dw,        W = min(-r, -x/c).
 
-that is D c S(x/c) while x > c r, and from there on downwards the tangent to that: noise-free parts of x that are
-positive mean a row that lets go before the bodies part, negative ones a row that pushes until they do. The cost is a
-mean of convex functions of a, so the problem stays convex, and the rows need nothing but the two numbers of
-`constraint.Noise`, spread = c times length, gate = c r. The edges of a pyramid share their noise, which changes
-nothing, since the mean of a sum is the sum of the means; cones: see `constraint`.
+This is D c S(x/c) while x > c r, and its tangent at x = c r below that. Where x - c r is positive, a row releases before the
+bodies separate; where it is negative, a row acts until they do. The cost is a mean of convex functions of a, so the problem
+stays convex. The rows need only the two numbers of `constraint.Noise`: spread = c times length, and gate = c r. The edges of
+a pyramid share their noise, which changes nothing, since the mean of a sum is the sum of the means. For cones see
+`constraint`.
 
-Two of a row's parameters depend on depth themselves, through the impedance: the weight D and c. They are taken at one
-depth, the mean of -(r + w) where it is positive. For bodies in contact this is their depth as the length goes to zero;
-for bodies apart it is about how far noise drives them into each other when it does. (At the mean distance itself,
-contacts whose impedance begins at zero would have no force at a distance at all.)
+The weight D and c also depend on depth, through the impedance. They are taken at one depth, the mean of -(r + w) given that it
+is positive. For bodies in contact this tends to their depth as the length goes to zero. For separate bodies it is the mean
+penetration when noise makes them touch. (At the mean distance itself, contacts whose impedance begins at zero would have no
+force at a distance.)
 
-MJX knows the distance of boxes, meshes and height fields only where they overlap, and says 1 or more elsewhere: such
+MJX knows the distance of boxes, meshes and height fields only where they overlap, and reports 1 or more elsewhere: such
 slots have no rows.
 """
 
@@ -53,10 +51,9 @@ from mjxgrad.stepping.rows import Block, per_row
 
 Mode = Literal["forward", "backward"]
 
-# Far below the stiffness of any contact (1/s²). Without stiffness noise on the distance does nothing, and c divides.
+# Far below the stiffness of any contact (1/s²): c is a divisor, and at zero stiffness noise on the distance has no effect.
 _SOFTEST = 1e-3
-# Inverse inertia of a slot without contact (1/kg), so large that no force is left; an infinite one would have no
-# derivative.
+# Inverse inertia of a slot without contact (1/kg), so large that its force vanishes; infinity would have no derivative.
 _WEIGHTLESS = 1e30
 
 
@@ -66,26 +63,26 @@ class Smoothing(eqx.Module):
     A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
 
     Attributes:
-        length: of the noise (m): the standard deviation of the Gaussian, and for the other kernels the one that gives
-            the same mean absolute value.
-        kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach some lengths far, the last
-            one falls off as 1/r.
-        mode: "forward" moves by the smoothed contact: force at a distance, and derivatives to match. "backward" moves
-            as without smoothing, and takes the derivative of the smoothed step at each state that is visited.
-        limit_length: likewise for the limits of joints and tendons, in their own units (m or rad); None leaves them as
-            they are. Apart from contacts, since no one length fits metres and radians.
-        gated: whether noise decides on contact, too, as in MuJoCo; without that, rows act at any distance.
+        length: length of the noise (m): the standard deviation of the Gaussian; other kernels have the same mean absolute
+            value.
+        kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach a few lengths, the last one falls
+            off as 1/r.
+        mode: "forward" simulates the smoothed contact, with force at a distance and its derivatives. "backward" simulates
+            without smoothing, and takes the derivative of the smoothed step at each visited state.
+        limit_length: length for the limits of joints and tendons, in their own units (m or rad); None leaves them unchanged.
+            It is separate, since no single length fits metres and radians.
+        gated: whether noise also decides whether there is contact, as in MuJoCo; if not, rows act at any distance.
     """
 
     length: Float[Array, "..."] = eqx.field(converter=as_float)
-    # Plain strings, so that a name that there is not meets the check below, which knows the choices.
+    # Plain strings, so that unknown names reach the check below, which lists the choices.
     kernel: str = eqx.field(static=True, default="gaussian")
     mode: str = eqx.field(static=True, default="forward")
     limit_length: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None, kw_only=True)
     gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
-        """Refuse names that there are not, and lengths that are not positive and finite if they are known."""
+        """Refuse unknown names, and known lengths that are not positive and finite."""
         for name, choices in (("kernel", tuple(KERNELS)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
@@ -97,11 +94,11 @@ class Smoothing(eqx.Module):
 
     @property
     def noise(self) -> Kernel:
-        """The kernel itself, in units of the length."""
+        """Return the kernel, in units of the length."""
         return KERNELS[self.kernel]
 
     def check(self, _: str) -> None:
-        """Refuse what a single step cannot take."""
+        """Refuse lengths with a leading axis."""
         for name in ("length", "limit_length"):
             value = getattr(self, name)
             if value is not None and value.ndim:
@@ -109,14 +106,14 @@ class Smoothing(eqx.Module):
 
 
 def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
-    """Say which parts of a smoothing have no effect on a model.
+    """Return warnings about parts of a smoothing that have no effect on a model.
 
     Args:
-        smoothing: as given to a step or rollout.
-        model: of MJX; only its static structure is read.
+        smoothing: the smoothing of a step or rollout.
+        model: a model of MJX; only its static structure is read.
 
     Returns:
-        Sentences that name what is not smoothed; none if everything is.
+        One sentence for each part that is not smoothed.
     """
     messages = []
     pairs = contact_pairs(model)
@@ -140,9 +137,9 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
 def smoothed(
     model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing, layout: RowLayout
 ) -> tuple[list[Block], Noise | None, RowLayout]:
-    """Return rows, present at any distance where they have noise, the noise of all rows, and their laws under noise.
+    """Return rows, the noise of all rows, and their layout under noise; rows with noise are active at any distance.
 
-    Noise has numbers without meaning for rows without, and is None, and nothing else changes, if there is nothing to be smoothed.
+    For rows without noise its numbers are not used. If no row is smoothed, noise is None and the rest is unchanged.
     """
     has_distance, num_contacts, start = _has_distance(model, data), 0, 0
     rows, noises, first = [], [], None
@@ -168,13 +165,13 @@ def smoothed(
 
 
 def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
-    """Return a block that is present at any known distance, and its noise."""
+    """Return a block that is active at any known distance, and its noise."""
     each, kernel = block.rows_each, smoothing.noise
     length = smoothing.length if block.is_contact else smoothing.limit_length
     assert length is not None
     length = length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
-    # The mean of -(r + w) where it is positive (m or rad).
+    # Impedance at the mean of -(r + w) given that it is positive (m or rad).
     resistance = impedance(block.solimp[::each], length * kernel.depth(distance / length))
     spread = functools.partial(per_row, each=each)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
@@ -190,5 +187,5 @@ def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
     contact = data._impl.contact
     if not np.isin(model.geom_type, CONVEX).any() or not len(contact.dist):
         return jnp.ones(len(contact.dist), bool)
-    # Of a ball on a box it is known, and of no interest beyond a metre.
+    # A ball on a box has a known distance, but beyond a metre it does not matter.
     return ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))

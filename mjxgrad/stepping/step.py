@@ -1,12 +1,11 @@
-"""One step that can be differentiated: MJX's stages in order, with our own rows, solve and integration.
+"""The differentiable step: MJX's stages in order, with our own rows, solve and integration.
 
-Drop-ins for `mjx.step`, `mjx.forward` and `mjx.solve` on any model and data of MJX's JAX implementation. Stages without work are
-skipped on what is static (no actuators, no tendons, no sensors, no rows); what nobody reads (camera poses, the unconstrained
-acceleration, the factor of the mass matrix) costs nothing under `jax.jit`, which removes it. For that to hold the solve starts
-from the last acceleration alone: MJX also evaluates the unconstrained one, which takes a factorisation of its own, to
-choose the better start.
+Drop-ins for `mjx.step`, `mjx.forward` and `mjx.solve` on any model and data of MJX's JAX implementation. Stages without work (no
+actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused results: camera poses, the
+unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last acceleration alone. MJX also
+evaluates the unconstrained one to choose the better start, which takes another factorisation.
 
-Matrix products ask for full precision, since NVIDIA GPUs otherwise round their factors to ten bits, contact Jacobians included.
+Matrix products request full precision: NVIDIA GPUs otherwise round factors to ten bits, contact Jacobians included.
 """
 
 import contextlib
@@ -30,7 +29,7 @@ from mjxgrad.solver.jacobian import DenseRows, JoinedRows
 from mjxgrad.solver.newton import System, Variant
 from mjxgrad.stepping import assembly
 from mjxgrad.stepping import onset as onsets
-from mjxgrad.stepping.onset import Onset, Partial, Shares
+from mjxgrad.stepping.onset import Onset, Shares, TwoSolves
 from mjxgrad.stepping.rows import Block, joined
 from mjxgrad.stepping.smoothing import Smoothing, smoothed
 
@@ -39,7 +38,7 @@ _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
 
 Gradient = Literal["discrete", "slope"]
-"""Along MuJoCo's own motion: the derivative of each step, or one whose mean is the slope of the outcome."""
+"""Derivatives along MuJoCo's own motion: "discrete", of each step, or "slope", with the slope of the outcome as mean."""
 
 
 @contextlib.contextmanager
@@ -49,17 +48,19 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
             "model and data must be of MJX's JAX implementation, got "
             f"{model.impl} and {data.impl}: create them with impl='jax'"
         )
-    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # which MJX has not, and by which scenes for C MuJoCo are known
+    if (
+        model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
+    ):  # MJX lacks it; it marks the models of scenes that C MuJoCo steps
         raise ValueError("this model is of a scene that C MuJoCo steps, as scene.unsupported says: use mg.rollout")
     with jax.default_matmul_precision("highest"):
         yield
 
 
 def check_gradient(gradient: str, onset: Onset | None = None, smoothing: Smoothing | None = None) -> None:
-    """Refuse the name of a gradient that there is not, and what does not go with it.
+    """Refuse an unknown gradient, and an onset or smoothing that a single step cannot use with it.
 
     Raises:
-        ValueError: naming those that there are, or saying what a single step cannot take.
+        ValueError: if the gradient is unknown, or onset or smoothing are of another type, have a leading axis or conflict.
     """
     if gradient not in get_args(Gradient):
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
@@ -83,21 +84,22 @@ def step(
     Args:
         model: any model of MJX's JAX implementation; Euler, implicitfast or RK4.
         data: the present state, controls and applied forces.
-        gradient: "discrete", the exact derivative of the simulated map, or "slope", which knows that contacts and limits begin
-            and end at times that move: that of the step with an onset, at MuJoCo's own motion. The step itself is the same.
+        gradient: "discrete", the exact derivative of the simulated map, or "slope", which includes the motion of the times at
+            which contacts and limits begin and end. "slope" is the derivative of the step with an onset, along MuJoCo's own
+            motion. The step itself is the same.
         onset: lets contacts and limits begin within the step, so that the motion has no jumps and its plain derivative is
-            right; see `stepping.onset`. None is MuJoCo's step.
+            unbiased; see `stepping.onset`. None is MuJoCo's step.
         smoothing: averages every contact over noise on its distance, for the motion or for its derivative alone.
 
     Returns:
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
         them. Differentiable with respect to every floating-point field of `model` and `data`, any number of times.
-        `_impl.solver_niter` is the number of iterations that the solve took, of Runge-Kutta's four the largest: one more than
-        `opt.iterations` where these, or the digits of the precision, were too few.
+        `_impl.solver_niter` is the solve's number of iterations, the largest of Runge-Kutta's four. It is `opt.iterations` + 1
+        where the iterations, or the digits of the precision, did not suffice.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, there is no such gradient, or onset or
-            smoothing have a leading axis or are to go with the gradient "slope".
+        ValueError: if `model` or `data` belong to another implementation of MJX, the gradient is unknown, onset or smoothing
+            have a leading axis, or an onset is combined with the gradient "slope".
         NotImplementedError: if MJX lacks the integrator.
     """
     check_gradient(gradient, onset, smoothing)
@@ -134,8 +136,8 @@ def forward(
     Args:
         model: any model of MJX's JAX implementation.
         data: the present state, controls and applied forces.
-        onset: as for `step`: accelerations and forces are then means over the coming time step.
-        smoothing: as for `step`.
+        onset: the onset of `step`; accelerations and forces are then means over the coming time step.
+        smoothing: the smoothing of `step`.
 
     Returns:
         Data with every field that depends on the state filled in. Under forward smoothing the constraint rows (`efc_`) are the
@@ -157,7 +159,7 @@ def _forward(
     smoothing: Smoothing | None,
     after: _Vector | None = None,
 ) -> mjx.Data:
-    """Return the data with all that depends on the state; `after` as for `onset.begin`."""
+    """Return data with all fields that depend on the state; `after` is that of `onset.begin`."""
     data, blocks = _smooth(model, data)
     rows, shares = blocks, None
     if onset is not None:
@@ -170,7 +172,7 @@ def _forward(
         data = mended.sensor_vel(model, mended.sensor_pos(model, data))
     if smoothing is None:
         data = _minimum(
-            model, data, *_system(model, data, rows), _start(model, data), onsets.partial(model, data, rows, shares)
+            model, data, *_system(model, data, rows), _start(model, data), onsets.two_solves(model, data, rows, shares)
         )
     else:
         data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
@@ -178,13 +180,13 @@ def _forward(
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Find the acceleration and the constraint forces; a drop-in for `mjx.solve`.
+    """Compute the acceleration and the constraint forces; a drop-in for `mjx.solve`.
 
     The derivative is that of the converged solve, by the implicit function theorem; see `solver.implicit`.
 
     Args:
-        model: its `opt.iterations` and `opt.tolerance` bound the iterations.
-        data: with mass matrix, smooth forces and constraint rows, as `mjx.fwd_acceleration` leaves them.
+        model: the model; its `opt.iterations` and `opt.tolerance` bound the iterations.
+        data: data with mass matrix, smooth forces and constraint rows, as returned by `mjx.fwd_acceleration`.
 
     Returns:
         Data with `qacc`, `qfrc_constraint` and the rows' forces.
@@ -202,7 +204,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowLayout, System | None]:
-    """Return the laws of the rows and all that determines the acceleration; nothing if there are no rows."""
+    """Return the layout of the rows and the equations of motion; None in place of these without rows."""
     layout = assembly.row_layout(model, data)
     return layout, assembly.system_of(model, data, layout, joined(blocks)) if blocks else None
 
@@ -219,22 +221,22 @@ def _smoothed_solve(
     shares: Shares | None,
     smoothing: Smoothing,
 ) -> mjx.Data:
-    """Solve with rows under noise; in backward mode without it, but for the derivative.
+    """Solve with rows under noise; in backward mode solve without noise and use noise for the derivative only.
 
-    `blocks` are the rows as MuJoCo has them, `begun` as they act for a part of the step, and `shares` for which.
+    `blocks` are MuJoCo's rows, `begun` and `shares` the rows and shares with an onset.
     """
     is_forward = smoothing.mode == "forward"
     layout = assembly.row_layout(model, data)
     blocks, uncertain, layout = smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
-    partial = onsets.partial(model, data, blocks if is_forward else begun, shares)
+    solves = onsets.two_solves(model, data, blocks if is_forward else begun, shares)
     if uncertain is None or not model.nv:
-        return _minimum(model, data, *_system(model, data, begun), _start(model, data), partial)
+        return _minimum(model, data, *_system(model, data, begun), _start(model, data), solves)
     soft = assembly.make_constraint(model, data, blocks)
     system = assembly.system_of(model, data, layout, joined(blocks), uncertain)
     if is_forward:
-        return _minimum(model, soft, layout, system, _start(model, data), partial)
-    fixed_model, fixed_data, given, partial = jax.lax.stop_gradient((model, data, begun, partial))
-    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), partial)
+        return _minimum(model, soft, layout, system, _start(model, data), solves)
+    fixed_model, fixed_data, given, solves = jax.lax.stop_gradient((model, data, begun, solves))
+    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), solves)
     soft = _minimum(model, soft, layout, system, hard.qacc)
 
     found = [(one.qacc, one.qfrc_constraint, one._impl.efc_force) for one in (hard, soft)]
@@ -244,7 +246,7 @@ def _smoothed_solve(
 
 @jax.custom_jvp
 def _with_derivative_of(value, other):
-    """Return the first argument to the last bit, with the derivative of the second."""
+    """Return the first argument, exactly, with the derivative of the second."""
     return value
 
 
@@ -259,9 +261,9 @@ def _minimum(
     layout: RowLayout,
     system: System | None,
     start: _Vector,
-    partial: Partial | None = None,
+    solves: TwoSolves | None = None,
 ) -> mjx.Data:
-    """Return data with the acceleration, and the forces of the rows, at which all are in balance."""
+    """Return data with the acceleration that balances all forces, and the forces of the rows."""
     if system is None or not layout.num_rows or not model.nv:
         data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
         none = jnp.zeros_like(data._impl.solver_niter)
@@ -269,23 +271,23 @@ def _minimum(
     tolerance = jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
     iterations = int(model.opt.iterations)
     start = jax.lax.stop_gradient(start)
-    if partial is None:
+    if solves is None:
         acceleration, num_iterations = implicit.solve(layout, iterations, system, start, tolerance)
         force = system.row_force(layout, acceleration)
-        total = system.pull(force)
+        total = system.rmv(force)
     else:
         both, num_iterations = implicit.solve_both(
-            layout, iterations, system, partial.variants, partial.is_split, start, tolerance
+            layout, iterations, system, solves.variants, solves.is_split, start, tolerance
         )
 
         def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
-            varied = system.varied(variant)
+            varied = system.with_variant(variant)
             force = varied.row_force(layout, acceleration)
-            return force, varied.pull(force)
+            return force, varied.rmv(force)
 
-        # In this order they are the whole contact's to the last bit where the two do not differ.
+        # In this order the result equals a single solve to the last bit where the two do not differ.
         acceleration, force, total = (
-            x[1] + partial.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(partial.variants, both))
+            x[1] + solves.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(solves.variants, both))
         )
     return _solved(data, acceleration, total, force, num_iterations.astype(data._impl.solver_niter.dtype))
 
@@ -296,7 +298,7 @@ def _solved(data: mjx.Data, acceleration: Array, total: Array, force: Array, num
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
-    """Run the stages up to the unconstrained acceleration and gather the rows; tendons and cameras are MJX's."""
+    """Run the stages up to the unconstrained acceleration, and gather the rows; MJX computes tendons and cameras."""
     data = mjx.camlight(model, kinematics.up_to_inertia(model, data))
     data = mjx.factor_m(model, data)
     data = collide(model, data)
@@ -310,8 +312,8 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
 
-    (M + h D) a' = M a, and M a the sum of all forces, is a' = a - (M + h D)⁻¹ h D a: so the forces need not be added up, nor
-    their derivatives.
+    With M a the sum of all forces, (M + h D) a' = M a gives a' = a - (M + h D)⁻¹ h D a. So neither the forces nor their
+    derivatives need to be summed.
     """
     if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or is_known_to_be(
         0.0, model.dof_damping
@@ -331,8 +333,8 @@ def _implicit_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
 
 
 def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: _Vector | None) -> mjx.Data:
-    """Advance velocity, then position with `velocity`, or with the new one; activations and time."""
-    # MJX's explicit Euler step advances activations and time; its velocity and position are replaced.
+    """Advance velocity, position, activations and time; positions move with `velocity`, by default the new one."""
+    # MJX's explicit Euler step advances activations and time; its velocity and position are not used.
     bare = model.tree_replace({"opt.disableflags": model.opt.disableflags | _Disable.mjDSBL_EULERDAMP})
     moved = mended.euler(bare, data)
     qvel = data.qvel + model.opt.timestep * acceleration

@@ -55,7 +55,7 @@ def test_what_rounding_made_indefinite_is_mended_by_the_least_share_of_its_diago
     least = 1e-9
     mass[0, place : place + 2, place : place + 2] = 7 * np.array([[1, 1 + least], [1 + least, 1]])
     mass[2, place, place] = -1.0
-    solve = functools.partial(on_gpu.solve, most_mended=0.01, interpret=_INTERPRET)
+    solve = functools.partial(on_gpu.solve, max_shift=0.01, interpret=_INTERPRET)
     found, _ = jax.jit(solve)(_last(mass), jnp.tile(jnp.arange(1.0, 21.0)[:, None], 3))
     share = np.finfo(float).eps
     while share <= least:

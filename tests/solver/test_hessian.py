@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjxgrad.solver import hessian
-from mjxgrad.solver.constraint import Bend, ConeGroup, RowLayout
+from mjxgrad.solver.constraint import ConeGroup, RowHessian, RowLayout
 from mjxgrad.solver.jacobian import Group
 from mjxgrad.solver.sparse import SparseRows
 
@@ -29,23 +29,25 @@ def _problem(groups):
         return jnp.asarray(random.normal(size=(*shape, _BATCH)))
 
     pieces = tuple(any_sign(g.num, g.dim, 1 if g.is_diagonal else len(g.dofs)) for g in groups)
-    tilts = tuple(positive(g.num, g.dim - 1) if g.is_pyramid else None for g in groups)
+    friction = tuple(positive(g.num, g.dim - 1) if g.is_pyramid else None for g in groups)
     num_rows, cones = sum(g.num_rows for g in groups), sum(g.num for g in groups if g in _CONES)
     layout = RowLayout(0, 0, num_rows, (ConeGroup(num_rows - 3 * cones, cones, 3),) if cones else ())
     roots = any_sign(cones, 3, 3)
-    bend = Bend(positive(layout.simple_stop), (jnp.einsum("cijb,ckjb->cikb", roots, roots),) if cones else ())
+    row_hessian = RowHessian(
+        positive(layout.simple_stop), (jnp.einsum("cijb,ckjb->cikb", roots, roots),) if cones else ()
+    )
     mass = jnp.eye(_NV)[:, :, None] * positive(_NV)
-    return layout, (mass, SparseRows(pieces, tilts, groups, _NV), bend, any_sign(_NV))
+    return layout, (mass, SparseRows(pieces, friction, groups, _NV), row_hessian, any_sign(_NV))
 
 
 @pytest.mark.parametrize("groups", [_SIMPLE + _PYRAMIDS, _SIMPLE + _CONES], ids=["pyramids", "cones"])
 def test_one_kernel_does_what_the_operations_do(groups):
-    layout, (mass, jacobian, bend, vector) = _problem(groups)
+    layout, (mass, jacobian, row_hessian, vector) = _problem(groups)
     kernel = functools.partial(hessian.in_one_kernel, interpret=jax.default_backend() != "gpu")
     found, diagonal = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, bend, vector
+        mass, jacobian, row_hessian, vector
     )
-    matrix = jacobian.gram(mass, layout, bend)
+    matrix = jacobian.gram(mass, layout, row_hessian)
     expected = np.linalg.solve(np.moveaxis(matrix, -1, 0), vector.T[..., None])[..., 0].T
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # conditions up to 1e4
     np.testing.assert_allclose(diagonal, matrix[np.arange(_NV), np.arange(_NV)], rtol=1e-13)
@@ -54,17 +56,19 @@ def test_one_kernel_does_what_the_operations_do(groups):
 def test_one_kernel_mends_what_the_operations_mend():
     """Where the rows outweigh a mass of a rank less, in single precision."""
     layout, problem = _problem(_SIMPLE)
-    mass, jacobian, bend, vector = jax.tree.map(lambda x: x.astype(jnp.float32), problem)
+    mass, jacobian, row_hessian, vector = jax.tree.map(lambda x: x.astype(jnp.float32), problem)
     mass = mass.at[:2, :2, 0].set(jnp.array([[1, 1.0001], [1.0001, 1]], jnp.float32))
-    bend = jax.tree.map(lambda x: x.at[:, 0].set(0.0), bend)
+    row_hessian = jax.tree.map(lambda x: x.at[:, 0].set(0.0), row_hessian)
     kernel = functools.partial(
-        hessian.in_one_kernel, most_mended=hessian._MOST_MENDED, interpret=jax.default_backend() != "gpu"
+        hessian.in_one_kernel, max_shift=hessian._MAX_SHIFT, interpret=jax.default_backend() != "gpu"
     )
-    found, _ = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(mass, jacobian, bend, vector)
-    expected = jax.jit(lambda *args: hessian.solve_mended(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, bend, vector
+    found, _ = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(
+        mass, jacobian, row_hessian, vector
     )
-    unmended, _ = hessian.solve(mass, jacobian, layout, bend, vector)
+    expected = jax.jit(lambda *args: hessian.solve_regularised(args[0], args[1], layout, args[2], args[3]))(
+        mass, jacobian, row_hessian, vector
+    )
+    unmended, _ = hessian.solve(mass, jacobian, layout, row_hessian, vector)
     assert not np.isfinite(unmended[:, 0]).all()
     assert np.isfinite(expected).all()
     # A condition of 1e4 in single precision.
@@ -73,7 +77,7 @@ def test_one_kernel_mends_what_the_operations_mend():
 
 def test_the_matrix_is_that_of_all_rows():
     """J formed row by row, edges of pyramids included."""
-    layout, (mass, jacobian, bend, _) = _problem(_SIMPLE + _PYRAMIDS)
+    layout, (mass, jacobian, row_hessian, _) = _problem(_SIMPLE + _PYRAMIDS)
     rows = jnp.stack([jacobian.matvec(jnp.broadcast_to(unit[:, None], (_NV, _BATCH))) for unit in jnp.eye(_NV)], axis=1)
-    expected = mass + jnp.einsum("rib,rb,rjb->ijb", rows, bend.simple, rows)
-    np.testing.assert_allclose(jacobian.gram(mass, layout, bend), expected, rtol=1e-12)
+    expected = mass + jnp.einsum("rib,rb,rjb->ijb", rows, row_hessian.simple, rows)
+    np.testing.assert_allclose(jacobian.gram(mass, layout, row_hessian), expected, rtol=1e-12)

@@ -16,7 +16,7 @@ from mjxgrad.bodies import kinematics
 from mjxgrad.bodies.kinematics import inertia_of
 from mjxgrad.contact.collision import collide, slot_geoms
 from mjxgrad.solver import constraint
-from mjxgrad.solver.constraint import Bend
+from mjxgrad.solver.constraint import RowHessian
 from mjxgrad.solver.jacobian import AxisRows, ContactRows
 from mjxgrad.solver.sparse import SparseRows
 from mjxgrad.stepping import assembly
@@ -94,13 +94,13 @@ def test_the_matrix_is_that_of_mjx(rows):
 def test_rates_are_the_matrix_times_a_velocity(rows, random):
     model, _, block, matrix = rows
     velocity = jnp.asarray(random.normal(size=model.nv))
-    np.testing.assert_allclose(eqx.filter_jit(block.map.rates)(velocity), matrix @ velocity, atol=ROUNDING)
+    np.testing.assert_allclose(eqx.filter_jit(block.map.mv)(velocity), matrix @ velocity, atol=ROUNDING)
 
 
 def test_the_pull_is_the_transpose(rows, random):
     _, _, block, matrix = rows
     force = jnp.asarray(random.normal(size=len(matrix)))
-    np.testing.assert_allclose(eqx.filter_jit(block.map.pull)(force), matrix.T @ force, atol=ROUNDING)
+    np.testing.assert_allclose(eqx.filter_jit(block.map.rmv)(force), matrix.T @ force, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("most_groups", [24, 0], ids=["by groups", "in one matrix"])
@@ -128,12 +128,12 @@ def test_sparse_rows_are_the_matrix_without_its_zeros(rows, random, batch, most_
         )
 
     @eqx.filter_jit
-    def products(rows, is_active, bend, mass, x, force):
+    def products(rows, is_active, row_hessian, mass, x, force):
         sparse = SparseRows.of(rows, is_active, model.nv)
-        return sparse.matvec(x), sparse.rmatvec(force), sparse.gram(mass, layout, bend)
+        return sparse.matvec(x), sparse.rmatvec(force), sparse.gram(mass, layout, row_hessian)
 
-    bend = Bend(jnp.asarray(simple), tuple(cones))
-    results = products(*spread((block.map, block.is_active, bend, mass, x, force)))
+    row_hessian = RowHessian(jnp.asarray(simple), tuple(cones))
+    results = products(*spread((block.map, block.is_active, row_hessian, mass, x, force)))
     expected = matrix @ x, matrix.T @ force, mass + matrix.T @ dense @ matrix
     for result, known in zip(results, expected, strict=True):
         np.testing.assert_allclose(result, spread(known), atol=ROUNDING)
@@ -178,7 +178,7 @@ def test_a_curvature_applied_is_its_matrix(rows, random):
     def both(x, moved):
         rows = assembly.system_of(model, data, layout, block).rows
         _, change = jax.jvp(lambda x: constraint.force(layout, rows, x), (x,), (moved,))
-        return change, constraint.bend_product(layout, constraint.bend(layout, rows, x), moved)
+        return change, constraint.hessian_product(layout, constraint.hessian(layout, rows, x), moved)
 
     change, bent = both(*jnp.asarray(random.normal(size=(2, len(matrix)))))
     # Stiffness of contacts is up to 1e4.
@@ -232,5 +232,5 @@ def test_a_gpu_adds_the_same_blocks(monkeypatch, random):
 
 def test_rows_of_one_joint_each_keep_their_order(random):
     rows, x = AxisRows(jnp.array([1.0, -1.0]), (1, 3), 4), jnp.asarray(random.normal(size=4))
-    np.testing.assert_array_equal(rows.rates(x), [x[1], -x[3]])
-    np.testing.assert_array_equal(rows.pull(jnp.array([2.0, 3.0])), [0, 2, 0, -3])
+    np.testing.assert_array_equal(rows.mv(x), [x[1], -x[3]])
+    np.testing.assert_array_equal(rows.rmv(jnp.array([2.0, 3.0])), [0, 2, 0, -3])
