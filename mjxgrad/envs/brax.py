@@ -1,7 +1,7 @@
 """Any environment as a brax environment, for brax's learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
 
-Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier jax, or a function
-of that name.
+Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier jax, or a
+substitute for this function.
 """
 
 import jax

@@ -75,8 +75,8 @@ def stepped_right(
         onset: contacts begin within the step; `mg.Onset()` for learning by derivatives.
         smoothing: average over contacts; see `mg.step`.
         iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
-            1 to 4, far from the tolerance where feet hit the ground. The motion is then not the model's, and the derivative
-            of the solve is not that of the motion.
+            1 to 4, far from the tolerance where feet hit the ground. The motion is then not the model's, and the solve's
+            derivative is not the motion's.
 
     Returns:
         The same object.

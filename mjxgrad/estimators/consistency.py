@@ -4,9 +4,9 @@ For two samples that differ only in their noise, the trapezoidal rule along the 
 
 $$f_j - f_k = \tfrac12 (\nabla f_j + \nabla f_k)\cdot(w_j - w_k) + r_{jk}.$$
 
-The residual is zero for every quadratic. Where $f$ is smooth it is of third order in the distance. It contains the whole
-of a jump between the two samples, and it is large if only one of them met a stiff slope. It needs no bound, no rate and no
-minimum number of samples: two samples on different sides of a jump are enough.
+The residual is zero for every quadratic. Where $f$ is smooth it is of third order in the distance. A jump between the two
+samples is wholly in it, and it is large if only one of them met a stiff slope. It needs no bound, no rate and no minimum
+number of samples: two samples on different sides of a jump are enough.
 
 The test uses secants: residuals and differences are divided by the distance. Near pairs therefore count most, where smooth
 functions are flat and jumps are not. In many dimensions all distances are alike.

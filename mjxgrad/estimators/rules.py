@@ -151,8 +151,8 @@ class BiasConstrained(eqx.Module):
 class Concavity(eqx.Module):
     r"""Inverse variance if $V^1 + \varepsilon \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
 
-    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. The variance of a cost
-    that jumps is too large for its derivatives.
+    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
+    too much variance for its derivatives.
 
     Attributes:
         slack: $c$.

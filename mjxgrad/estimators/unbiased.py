@@ -71,8 +71,8 @@ def _fitted_share(
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
-    The variance of the estimate is that of the remaining costs times that of the score, up to fourth moments. The share
-    that minimises the one therefore minimises the other.
+    Up to fourth moments, the variance of the estimate is the variance of the remaining costs times that of the score. The
+    share therefore minimises both.
     """
     has_slope = samples.has_derivative.astype(slopes.dtype)
     count = has_slope.sum() - has_slope[:, None] - has_slope[None, :]

@@ -29,8 +29,8 @@ class Settings:
         target_rate: share by which the target value function follows the value function.
         largest_norm: norm to which gradients are clipped.
         largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
-            unit is the root mean square of the zeroth-order gradient over environments: 0.3 limits the variance to a tenth
-            of the zeroth-order one. Infinity shortens none.
+            unit is the root mean square of the zeroth-order gradient over environments: 0.3 limits the first-order variance
+            to a tenth of the zeroth-order one. Infinity shortens none.
         has_critic: whether a value function stands for the rewards after a window; otherwise they are left out.
         is_episodic: whether every window starts a new episode.
     """

@@ -76,8 +76,8 @@ def optimise(
             dict or an equinox module. The function of `parameter_noise` and `evaluate` then take a pytree of the same
             form, and the result has this form. Estimators see all its arrays as one vector.
         key: consumed here; with a leading axis, one per seed.
-        estimator: function called as `estimator(objective, params, key)`: one of `mg.estimators` with its settings bound
-            by `functools.partial`, or your own.
+        estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
+            settings bound by `functools.partial`.
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
