@@ -31,11 +31,11 @@ class BraxEnv(Env):
         copy_key, reset_key = jax.random.split(key)
         changes = self.environment.changes(copy_key)
         physics = self.environment.with_changes(changes).reset(reset_key)
-        return _after_step(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
+        return _brax_state(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return _after_step(state, self.environment.with_changes(state.info["changes"]).step(before, action))
+        return _brax_state(state, self.environment.with_changes(state.info["changes"]).step(before, action))
 
     @property
     def observation_size(self) -> int:
@@ -55,7 +55,7 @@ class BraxEnv(Env):
         return float(self.environment.interval)
 
 
-def _after_step(state: State, now: EnvState) -> State:
+def _brax_state(state: State, now: EnvState) -> State:
     done = now.terminated.astype(now.obs.dtype)
     # Wrappers add to the metrics in place.
     metrics = {**state.metrics, **now.metrics}

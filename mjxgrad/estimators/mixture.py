@@ -206,7 +206,7 @@ class Parts(Summary):
         )
 
     def mixture(self, alpha: Float[Array, " dim"]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Return the weighted mean and its squared standard error; those of the unbiased part without finite derivatives."""
+        """Return the weighted mean and its squared error; without finite derivatives, those of the unbiased part."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)
         value = alpha * first + (1 - alpha) * self.unbiased.mean

@@ -108,7 +108,7 @@ def plan_for_baseline(
 
 
 def check_baseline(baseline: str, choices: tuple[str, ...] = ("leave_one_out", "zero_noise", "none")) -> None:
-    """Refuse a baseline that does not exist."""
+    """Raise a ValueError for an unknown baseline."""
     if baseline not in choices:
         raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")
 

@@ -133,7 +133,7 @@ def to_csv(path: str | os.PathLike[str]) -> Log:
                 there = next(csv.reader(file))
             if there != names:
                 raise ValueError(
-                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}: name another"
+                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}; use another path"
                 )
         with path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)

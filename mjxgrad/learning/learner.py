@@ -1,4 +1,4 @@
-"""SHAC and its kin as a method of the loop: a window in every environment, a step of the policy, a fit of the value function.
+"""SHAC and its relatives as a method of the loop: windows in all environments, a policy step, a fit of the value function.
 
 Another learner is another file like this one: a carry with everything that an update needs, and a `Method` for it.
 """

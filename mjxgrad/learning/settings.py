@@ -1,4 +1,4 @@
-"""Settings for learning from short windows; `apg` has those of analytic policy gradients."""
+"""Settings for learning from short windows: SHAC's, and those of analytic policy gradients (`apg`)."""
 
 import dataclasses
 from typing import Any
@@ -31,7 +31,7 @@ class Settings:
         largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
             unit is the root mean square of the zeroth-order gradient over environments: 0.3 limits the first-order variance
             to a tenth of the zeroth-order one. Infinity shortens none.
-        has_critic: whether a value function stands for the rewards after a window; otherwise they are left out.
+        has_critic: whether a value function estimates the rewards after a window; otherwise they are left out.
         is_episodic: whether every window starts a new episode.
     """
 

@@ -59,7 +59,7 @@ def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
         changes = ", ".join(_difference(name, header.get(name), expected[name]) for name in differing)
         raise ValueError(
             f"checkpoint must be of the same run, got {path} of one with other settings: {changes}; "
-            "give it the settings it had, or another path"
+            "use the settings of that run, or another path"
         )
     wanted = jax.tree.leaves(like)
     return jax.tree.unflatten(jax.tree.structure(like), [_restored(x, y) for x, y in zip(leaves, wanted, strict=True)])

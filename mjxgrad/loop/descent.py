@@ -103,8 +103,8 @@ class Descent(Method):
         """Return the arguments of `run` besides the method; with a leading axis of keys, one start per key."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, params, key))):
             raise ValueError(
-                "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles itself, and takes "
-                "several seeds by several keys"
+                "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles its own program, "
+                "and takes one key per seed"
             )
         key, params = jnp.asarray(key), jnp.asarray(params)
         if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim > 1:

@@ -49,8 +49,8 @@ def optimise(
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
     A step whose estimate is not finite is not taken: parameters and optimiser stay unchanged, `num_skipped` counts the
-    step, and the next one draws other noise. If all samples cost the same and no derivative differs from zero, for
-    instance because a policy touches nothing, the run stops after a few steps with `Stopped.nothing_felt`.
+    step, and the next one draws other noise. The run stops with `Stopped.nothing_felt` if for a few steps all samples cost
+    the same and no derivative differs from zero, for instance because a policy touches nothing.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.

@@ -88,7 +88,7 @@ def side_by_side(methods: Sequence[Any]) -> tuple[Any, list[int | None]]:
     """
     parts = [eqx.partition(one, eqx.is_array) for one in methods]
     if not all(eqx.tree_equal(parts[0][1], other) for _, other in parts):
-        raise ValueError("what runs side by side must differ in numbers alone: run each by itself")
+        raise ValueError("methods side by side must differ in numbers alone; run each separately")
     numbers = list(zip(*(jax.tree.leaves(arrays) for arrays, _ in parts), strict=True))
     is_common = [len(set(map(checkpoints.digest, each))) == 1 for each in numbers]
     joined = [each[0] if same else jnp.stack(each) for each, same in zip(numbers, is_common, strict=True)]
@@ -212,6 +212,7 @@ def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Ca
             put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=index - first, axis=0)
             return index + 1, carry, jax.tree.map(put, rows, row)
 
+        # A while_loop can end early but stacks no outputs, so the records are written into arrays of full length.
         rows = jax.tree.map(lambda x: jnp.zeros((segment, *x.shape), x.dtype), found)
         return jax.lax.while_loop(is_going, advance, (first, carry, rows))
 

@@ -119,8 +119,8 @@ class Analytic(Smoother):
         if not resting:
             return []
         return [
-            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then holds at a distance, "
-            "and bodies that should slide or roll hardly move; for planning give them condim=1, or take Sampled"
+            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then acts at a distance, "
+            "and bodies that should slide or roll hardly move; for planning set their condim to 1, or use Sampled"
         ]
 
 

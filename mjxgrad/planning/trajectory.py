@@ -82,10 +82,10 @@ class Plan(eqx.Module):
         if self.unmoved.any():
             return (
                 f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
-                "which cost, so their derivatives are zero; begin with controls that touch, or smooth by Analytic or Sampled"
+                "which have a cost, so derivatives are zero; start with controls that touch, or smooth by Analytic or Sampled"
             )
         if self.diverged:
-            return "the smoothed system left finite numbers; take smaller steps of time, or tighter limits"
+            return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         return "converged" if self.converged else "not converged; take more iterations"
 
 
@@ -228,6 +228,7 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
         course = jax.tree.map(lambda x: x[index], tried)
         true = problem.run(None, course, rest, 0.0)
         best = jax.tree.map(lambda new, old: jnp.where(is_first | (true.cost < best.cost), new, old), true, best)
+        # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
         change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
         after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
         after = jnp.where(is_first, regularisation, after)
@@ -372,6 +373,7 @@ def minimise_in_box(
     def improve(_, x):
         slope, is_free = free(x)
         direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
+        # Backtracking with all lengths at once: a loop of its own would wait for the slowest problem under vmap.
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
         values = jax.vmap(value)(tried)
         best = jnp.argmin(values)
