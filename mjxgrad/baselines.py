@@ -148,9 +148,8 @@ def mppi(
     A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
 
     A low temperature $\lambda$ follows the best candidate, a high one averages over all. If `is_relative`, its unit is the
-    standard deviation of the step's costs, so that the cost's unit has no effect; else it is the unit of the cost. All else
-    is
-    as in `cross_entropy`.
+    standard deviation of the step's costs, so that the cost's unit has no effect; otherwise it is the cost's unit.
+    All other arguments, the result and the errors are those of `cross_entropy`.
 
     References:
         Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based

@@ -331,8 +331,8 @@ def _estimates(
             jax.tree_util.Partial(unchanged),
             is_noisy=yes,
             is_noise_free=~yes,
-            silent_costs=jnp.zeros_like(costs),
-            is_quiet=~yes,
+            zero_noise_costs=jnp.zeros_like(costs),
+            has_no_effect=~yes,
         )
         return both_results(both_summary(samples), plan, "leave_one_out", unchanged)
 

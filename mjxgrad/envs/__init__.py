@@ -1,4 +1,4 @@
-"""Environments for learning policies: known tasks, one's own, and the way to other programs."""
+"""Environments for learning policies: known tasks, your own, and adapters to other programs."""
 
 from collections.abc import Callable
 

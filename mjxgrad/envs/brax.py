@@ -1,7 +1,7 @@
-"""Any environment as one of brax, for its learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
+"""Any environment as a brax environment, for brax's learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
 
-Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier
-jax, or a function of that name.
+Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier jax, or a
+substitute for this function.
 """
 
 import jax
@@ -17,10 +17,10 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """An environment as brax's wrappers take it: `train(BraxEnv(environment), environment.episode_length, ...)`.
+    """An environment for brax's wrappers: `train(BraxEnv(environment), environment.episode_length, ...)`.
 
-    Resets and time-outs are those of brax's wrappers, by the episode length that the learner is given; `done` is the end for
-    good alone. Each copy draws its friction, masses and gains in `reset`, and keeps them, if those are random.
+    Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. If friction, masses
+    and gains are random, each copy draws its own in `reset` and keeps them.
     """
 
     def __init__(self, environment: Environment):
@@ -31,11 +31,11 @@ class BraxEnv(Env):
         copy_key, reset_key = jax.random.split(key)
         changes = self.environment.changes(copy_key)
         physics = self.environment.with_changes(changes).reset(reset_key)
-        return _told(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
+        return _brax_state(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return _told(state, self.environment.with_changes(state.info["changes"]).step(before, action))
+        return _brax_state(state, self.environment.with_changes(state.info["changes"]).step(before, action))
 
     @property
     def observation_size(self) -> int:
@@ -55,7 +55,7 @@ class BraxEnv(Env):
         return float(self.environment.interval)
 
 
-def _told(state: State, now: EnvState) -> State:
+def _brax_state(state: State, now: EnvState) -> State:
     done = now.terminated.astype(now.obs.dtype)
     # Wrappers add to the metrics in place.
     metrics = {**state.metrics, **now.metrics}

@@ -1,8 +1,8 @@
-r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole to be swung up.
+r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole swing-up.
 
-Observations, rewards and ends are DiffRL's, starts up to the cart-pole's; the bodies are gymnasium's, and contact is MuJoCo's.
-Returns can therefore be compared within this project, and with the published ones as ratios only. An action holds for 1/60 s, an
-episode takes 1000 of them (cart-pole 240).
+Observations, rewards and ends are DiffRL's, and so are all starts but the cart-pole's. The bodies are gymnasium's, and contact
+is MuJoCo's. Returns are comparable within this project, but with published ones only as ratios. An action holds for 1/60 s, and
+an episode has 1000 actions (cart-pole 240).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
@@ -22,7 +22,7 @@ from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import scene_path
 
 Memory = dict[str, Float[Array, "..."]]
-_TILT = jnp.pi / 24  # rad, largest at the start of a floating base
+_TILT = jnp.pi / 24  # rad, largest tilt of a floating base at the start
 
 
 class _Remembers(Environment):
@@ -36,12 +36,12 @@ class _Remembers(Environment):
 
 
 class Walker(_Remembers):
-    """Ant and humanoid: a floating base that is to run along x, upright.
+    """A floating base that is to run upright along x: ant and humanoid.
 
     Attributes:
-        fallen: height of the torso below which it is over (m).
-        action_weight: charged per squared action.
-        rise_scale: paid per m above the wanted height, 0.1 m above `fallen`; None pays every m above `fallen` alike (the ant).
+        fallen: height of the torso below which the episode is over (m).
+        action_weight: cost per squared action.
+        rise_scale: reward per m above the wanted height, 0.1 m above `fallen`. None rewards each m above `fallen` by 1 (ant).
     """
 
     fallen: float = eqx.field(static=True, kw_only=True)
@@ -79,13 +79,14 @@ class Walker(_Remembers):
 
 
 class Planar(Environment):
-    """Hopper and cheetah: bodies in a plane that are to run along x.
+    """A body in a plane that is to run along x: hopper and cheetah.
 
     Attributes:
-        action_weight: charged per squared action.
-        fallen: change of the torso's height below which it is over (m); None is never, and height and tilt do not count.
-        rise_scale: paid per m above the wanted height, 0.15 m above `fallen`.
-        most_tilt: angle at which the reward for an upright torso is gone (rad).
+        action_weight: cost per squared action.
+        fallen: change of the torso's height below which the episode is over (m). With None it is never over, and height and
+            tilt are not rewarded.
+        rise_scale: reward per m above the wanted height, 0.15 m above `fallen`.
+        most_tilt: angle at which the reward for an upright torso is zero (rad).
     """
 
     action_weight: float = eqx.field(static=True, default=0.1, kw_only=True)
@@ -124,7 +125,7 @@ class Planar(Environment):
 
 
 class CartPole(Environment):
-    """A pole that hangs from a cart and is to be swung up and held."""
+    """A pole that hangs from a cart, to be swung up and held upright."""
 
     def start(self, key: PRNGKeyArray) -> State:
         place, speed = jax.random.split(key)
@@ -149,31 +150,31 @@ class CartPole(Environment):
 
 
 def cartpole() -> CartPole:
-    """Return the swing-up: 1 kg of cart, 0.1 kg of pole of 1 m, at most 20 N. Zero is upright."""
+    """Return the swing-up: a cart of 1 kg, a pole of 0.1 kg and 1 m, at most 20 N; an angle of zero is upright."""
     return CartPole(load_scene(scene_path("cartpole")), frame_skip=2, episode_length=240)
 
 
 def hopper(*, num_substeps: int = 4) -> Planar:
-    """Return the hopper, which is over when its torso is 0.45 m lower.
+    """Return the hopper; an episode is over when the torso is 0.45 m below its reference height.
 
     Args:
-        num_substeps: time steps per action, of 1/60 s together; stiffer contact needs more.
+        num_substeps: time steps per action, together 1/60 s; stiffer contact needs more.
     """
     return Planar(_scene("hopper", num_substeps), frame_skip=num_substeps, fallen=-0.45)
 
 
 def half_cheetah(*, num_substeps: int = 2) -> Planar:
-    """Return the cheetah, which is never over; `num_substeps` as for `hopper`."""
+    """Return the cheetah, whose episodes end only by time; `num_substeps` as for `hopper`."""
     return Planar(_scene("half_cheetah", num_substeps), frame_skip=num_substeps)
 
 
 def ant(*, num_substeps: int = 2) -> Walker:
-    """Return the ant, which is over when its torso is below 0.27 m; `num_substeps` as for `hopper`."""
+    """Return the ant; an episode is over when the torso is below 0.27 m; `num_substeps` as for `hopper`."""
     return Walker(_scene("ant", num_substeps, max_contacts=8), frame_skip=num_substeps, fallen=0.27)
 
 
 def humanoid(*, num_substeps: int = 4) -> Walker:
-    """Return the humanoid, which is over when its torso is below 0.74 m; `num_substeps` as for `hopper`."""
+    """Return the humanoid; an episode is over when the torso is below 0.74 m; `num_substeps` as for `hopper`."""
     scene = _scene("humanoid", num_substeps, max_contacts=12)
     return Walker(scene, frame_skip=num_substeps, fallen=0.74, action_weight=0.002, rise_scale=10.0)
 
@@ -183,12 +184,12 @@ def _scene(name: str, num_substeps: int, *, max_contacts: int | None = None) -> 
 
 
 def _posture(state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return how far the torso's own z and x axes point up and forward."""
+    """Return the vertical component of the torso's z axis and the forward component of its x axis."""
     turn = rotation_matrix(state.qpos[None, 3:7])[0]
     return turn[2, 2], turn[0, 0]
 
 
 def _rise(height: Float[Array, ""], scale: float, most: float) -> Float[Array, ""]:
-    """Return what a height above the wanted one is worth: paid up to `most`, charged by its square below."""
+    """Return the reward for a height above the wanted one: linear up to `most`, minus its scaled square below zero."""
     height = jnp.clip(height, -1.0, most)
     return jnp.where(height < 0, -200 * height**2, scale * height)

@@ -1,9 +1,9 @@
-"""Environments: a scene, where episodes start and end, what is seen and what it is worth, as pure functions.
+"""Environments: a scene with starts and ends of episodes, observations and rewards, as pure functions.
 
-`reset(key)` and `step(state, action)` are those of brax and MuJoCo Playground: traceable, mapped over batches by `jax.vmap`,
-differentiated by `jax.grad`, and compiled as `jax.jit(lambda state, action: env.step(state, action))`: a method of a pytree of
-arrays has no hash, which `jax.jit(env.step)` would need. An environment of one's own gives three or four methods and inherits
-the rest.
+`reset(key)` and `step(state, action)` are like those of brax and MuJoCo Playground: traceable, mapped over batches by
+`jax.vmap` and differentiated by `jax.grad`. Compile them as `jax.jit(lambda state, action: env.step(state, action))`, since
+`jax.jit(env.step)` would need a hash, which a pytree of arrays has not. Your own environment gives three or four methods and
+inherits the rest.
 """
 
 import dataclasses
@@ -22,22 +22,22 @@ from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
-"""From a key and a scene to one with other friction, masses, gains, by `scene.with_model`."""
+"""A function from a key and a scene to a scene with other friction, masses or gains, by `scene.with_model`."""
 
 
 class EnvState(eqx.Module):
-    """What an environment is in, and what the step that led there brought; under `jax.vmap` every field gains leading axes.
+    """The state of an environment, with the result of the last step; under `jax.vmap` every field gains leading axes.
 
     Attributes:
         physics: positions, velocities and activations.
-        obs: what a policy sees.
-        reward: of the step.
-        terminated: whether the episode ended there for good: it fell, it arrived, its state left all numbers.
-        truncated: whether only its time was up. A value function goes on beyond such an end.
+        obs: observation of the policy.
+        reward: reward of the last step.
+        terminated: whether the episode ended for good: a fall, an arrival, or a state that is not finite.
+        truncated: whether only the time was up. A value function continues beyond such an end.
         metrics: the terms of the reward by name, and `diverged`, 1 where the physics had no meaningful next state.
-        num_steps: since the start of the episode.
-        memory: what the task keeps in mind, such as a command or the last action.
-        key: for what is drawn later.
+        num_steps: steps since the start of the episode.
+        memory: the task's own state, such as a command or the last action.
+        key: key of all later draws.
     """
 
     physics: State
@@ -52,22 +52,22 @@ class EnvState(eqx.Module):
 
     @property
     def done(self) -> Bool[Array, "*batch"]:
-        """Whether the episode ended, for whatever reason."""
+        """Whether the episode ended for any reason."""
         return self.terminated | self.truncated
 
 
 class Environment(InScene):
-    """A scene with a reward; a subclass says what is seen, what counts, where it starts and when it is over.
+    """A scene with a reward; a subclass defines observations, rewards, starts and ends.
 
-    An action has one number per actuator, from −1 to 1, the ends of its `ctrlrange`; beyond them nothing changes. It holds for
-    `frame_skip` time steps. The motion is MuJoCo's own, in which policies are judged, with the derivative of its steps: ants and
-    hoppers learn most by it. `with_gradient("slope")` takes that of the outcome, `with_onset(mg.Onset())` a continuous motion,
+    An action has one number per actuator, clipped to −1 and 1, the ends of its `ctrlrange`. It holds for `frame_skip` time
+    steps. The motion is MuJoCo's own, in which policies are judged, with the derivative of its steps; ants and hoppers learn
+    most with it. `with_gradient("slope")` takes the derivative of the outcome, `with_onset(mg.Onset())` a continuous motion,
     `with_engine("mujoco")` C MuJoCo.
 
     Attributes:
         frame_skip: time steps per action.
-        episode_length: actions after which time is up.
-        randomisation: from a key and the scene to the scene of one copy; see `randomised`.
+        episode_length: number of actions after which the time is up.
+        randomisation: function from a key and the scene to the scene of one copy; see `randomised`.
     """
 
     gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
@@ -82,23 +82,23 @@ class Environment(InScene):
 
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
-        """Return what a policy sees."""
+        """Return the observation of the policy."""
 
     @abstractmethod
     def rewards(
         self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
     ) -> dict[str, Float[Array, ""]]:
-        """Return the terms of the reward of one step, whose sum it is.
+        """Return the terms of the reward of one step; the reward is their sum.
 
         Args:
-            before: where the action was chosen.
-            action: as it was given, clipped to −1 and 1.
-            after: where it led.
-            memory: at the time when it was chosen.
+            before: state in which the action was chosen.
+            action: the action, clipped to −1 and 1.
+            after: state after the action.
+            memory: memory when the action was chosen.
         """
 
     def start(self, key: PRNGKeyArray) -> State:
-        """Draw where an episode starts; by default the scene's reference pose."""
+        """Draw the start of an episode; by default the scene's reference pose."""
         return initial_state(self.scene)
 
     def is_over(self, state: State) -> Bool[Array, ""]:
@@ -106,19 +106,19 @@ class Environment(InScene):
         return jnp.array(False)
 
     def first_memory(self, key: PRNGKeyArray) -> PyTree:
-        """Draw what the task keeps in mind at the start; by default nothing."""
+        """Draw the memory at the start; by default None."""
         return None
 
     def next_memory(self, memory: PyTree, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> PyTree:
-        """Return what it keeps in mind after a step; by default the same."""
+        """Return the memory after a step; by default unchanged."""
         return memory
 
     def disturbed(self, state: State, memory: PyTree) -> State:
-        """Return where a step really begins, pushes included; by default the same."""
+        """Return the state from which a step begins, pushes included; by default unchanged."""
         return state
 
     def control(self, action: Float[Array, " nu"]) -> Float[Array, " nu"]:
-        """Return the controls of an action: −1 and 1 are the ends of `ctrlrange`; without a range it is the control itself."""
+        """Return the controls of an action: −1 and 1 are the ends of `ctrlrange`; without a range, the action itself."""
         low, high = self.scene.ctrlrange.T
         is_bounded = jnp.isfinite(high - low)
         middle, half = (jnp.where(is_bounded, x / 2, y) for x, y in ((low + high, 0.0), (high - low, 1.0)))
@@ -126,7 +126,7 @@ class Environment(InScene):
 
     @property
     def action_limit(self) -> Float[Array, " nu"]:
-        """What actions are clipped to, on both sides."""
+        """Largest magnitude of each action, to which actions are clipped."""
         return jnp.ones(self.num_actions)
 
     @property
@@ -147,7 +147,7 @@ class Environment(InScene):
         """Begin an episode.
 
         Args:
-            key: consumed here; it decides all that is drawn until the next reset.
+            key: consumed here; it decides all draws until the next reset.
         """
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
@@ -159,7 +159,7 @@ class Environment(InScene):
         return EnvState(physics, obs, zero, no, no, metrics, jnp.zeros((), jnp.int32), memory, next_key)
 
     def step(self, state: EnvState, action: Float[Array, " nu"]) -> EnvState:
-        """Let an action act for `frame_skip` time steps; what comes after an end is the caller's, see `step_on`.
+        """Apply an action for `frame_skip` time steps; an episode that ended is not reset, see `step_on`.
 
         Raises:
             ValueError: if the action does not have one number per actuator.
@@ -200,11 +200,11 @@ class Environment(InScene):
         )
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
-        """Step, and begin anew where that ended the episode.
+        """Step, and start a new episode where the step ended one.
 
         Returns:
-            What the step led to, with its reward, and where to go on: the same, or the start of the next episode, on which no
-            derivative by what came before depends.
+            The state after the step, with its reward, and the state to continue from: the same, or the start of the next
+            episode, whose derivative by anything before is zero.
         """
         stepped = self.step(state, action)
         key, fresh_key = jax.random.split(stepped.key)
@@ -213,16 +213,16 @@ class Environment(InScene):
         return stepped, dataclasses.replace(following, key=key)
 
     def randomised(self, key: PRNGKeyArray) -> "Environment":
-        """Return a copy with its own friction, masses, gains, as `randomisation` draws them; under `jax.vmap`, many."""
+        """Return a copy whose friction, masses and gains `randomisation` has drawn; under `jax.vmap`, many."""
         if self.randomisation is None:
             return self
         return dataclasses.replace(self, scene=self.randomisation(key, self.scene))
 
     def refined(self, times: int) -> "Environment":
-        """Return the same with so many times shorter time steps; an action takes as long.
+        """Return the environment with time steps shorter by a factor of `times`; an action lasts as long as before.
 
-        Where contact lasts few time steps, what a policy is worth is a property of the step as well as of the scene. Judged
-        in shorter ones, it is that of the scene.
+        Where contact lasts few time steps, a policy's return depends on the time step as well as on the scene. With shorter
+        steps it depends on the scene alone.
 
         Raises:
             ValueError: if `times` is no whole number, or below 1.
@@ -232,15 +232,15 @@ class Environment(InScene):
         return dataclasses.replace(self, scene=scene, frame_skip=times * self.frame_skip)
 
     def changes(self, key: PRNGKeyArray) -> PyTree:
-        """Draw what sets one copy apart, see `randomised`; in a batch of them the copies share all else.
+        """Draw the numbers in which one copy differs, see `randomised`; a batch of copies shares all others.
 
         Returns:
-            Its own numbers, for `with_changes`.
+            The copy's own numbers, for `with_changes`.
         """
         pairs = zip(jax.tree.leaves(self.randomised(key)), jax.tree.leaves(self), strict=True)
         return [None if copied is own else copied for copied, own in pairs]
 
     def with_changes(self, changes: PyTree) -> "Environment":
-        """Return the copy whose own numbers `changes` drew."""
+        """Return the copy with its own numbers, as drawn by `changes`."""
         own, structure = jax.tree.flatten(self)
         return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])

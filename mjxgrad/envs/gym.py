@@ -1,7 +1,7 @@
 """Any environment as gymnasium's `Env` and `VectorEnv`; importing this registers `ENVIRONMENTS` there.
 
-Their names are `mjxgrad/Hopper-v0`, `mjxgrad/DiffRLAnt-v0` and so on, for `gymnasium.make` and `gymnasium.make_vec`; an
-environment of one's own goes to `GymEnv` or `GymVectorEnv`.
+Their names are `mjxgrad/Hopper-v0`, `mjxgrad/DiffRLAnt-v0` and so on, for `gymnasium.make` and `gymnasium.make_vec`. Pass
+your own environment to `GymEnv` or `GymVectorEnv`.
 """
 
 from typing import Any
@@ -27,9 +27,9 @@ _METADATA: _Info = {"render_modes": ["rgb_array"]}
 
 
 class GymEnv(gymnasium.Env):
-    """One copy of an environment. `reset` draws its friction, masses and gains anew, if those are random.
+    """One copy of an environment. `reset` draws its friction, masses and gains anew, if they are random.
 
-    Time is up by the environment's own `episode_length`: there is no other limit of steps.
+    The environment's own `episode_length` is the only limit of steps.
     """
 
     metadata = _METADATA
@@ -38,9 +38,9 @@ class GymEnv(gymnasium.Env):
         """Prepare an environment; nothing is compiled before `reset` and `step`.
 
         Args:
-            environment: itself, or its name among `mjxgrad.envs.ENVIRONMENTS`.
+            environment: the environment, or its name in `mjxgrad.envs.ENVIRONMENTS`.
             render_mode: "rgb_array" or None.
-            view: `height`, `width` and `camera` of `mjxgrad.render.frames`. The camera is the scene's first one, if it has any.
+            view: `height`, `width` and `camera` of `mjxgrad.render.frames`. By default the scene's first camera, if any.
 
         Raises:
             ValueError: if there is no such environment or render mode.
@@ -74,10 +74,10 @@ class GymEnv(gymnasium.Env):
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):
-    """Many copies of an environment in one program, each with its own friction, masses and gains, if those are random.
+    """Many copies of an environment in one program, each with its own friction, masses and gains, if they are random.
 
-    A copy whose episode ends begins the next one in the same step: the observation is already the new one, `final_obs` and
-    `final_info` hold those of the end.
+    A copy whose episode ends starts the next one in the same step: the observation is already the new one. `final_obs` and
+    `final_info` hold the last ones of the old episode.
     """
 
     metadata = _METADATA
@@ -88,7 +88,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         """Prepare the copies; nothing is compiled before `reset` and `step`.
 
         Args:
-            environment: itself, or its name among `mjxgrad.envs.ENVIRONMENTS`.
+            environment: the environment, or its name in `mjxgrad.envs.ENVIRONMENTS`.
             num_envs: number of copies.
             render_mode: "rgb_array" or None.
             view: see `GymEnv`.
@@ -131,7 +131,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         )
 
     def _info(self, state: EnvState) -> _Info:
-        """Return the metrics as gymnasium lays them out: arrays, and beside each which copies have it."""
+        """Return the metrics in gymnasium's layout: arrays, each with a mask of the copies that have it."""
         everyone = np.ones(self.num_envs, bool)
         return {k: v for name, x in state.metrics.items() for k, v in ((name, np.asarray(x)), (f"_{name}", everyone))}
 
@@ -145,7 +145,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
 
 def register() -> None:
-    """Tell gymnasium of `ENVIRONMENTS`."""
+    """Register `ENVIRONMENTS` with gymnasium."""
     for name in ENVIRONMENTS:
         place = f"{__name__}:"
         gymnasium.register(
@@ -157,7 +157,7 @@ def register() -> None:
 
 
 def gym_name(name: str) -> str:
-    """Return what gymnasium knows one of `ENVIRONMENTS` by: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
+    """Return gymnasium's name of one of `ENVIRONMENTS`: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
     words = ["DiffRL" if word == "diffrl" else word.capitalize() for word in name.split("_")]
     return f"mjxgrad/{''.join(words)}-v0"
 
@@ -195,7 +195,7 @@ def _info(state: EnvState) -> _Info:
 
 def _drawn(environment: Environment, qpos: Float[Array, "states nq"], view: _Info) -> np.ndarray:
     first = 0 if environment.scene.mj_model.ncam else None
-    # One state per second, one frame per second: each is drawn.
+    # One state and one frame per second, so that every state is drawn.
     return render.frames(environment.scene, qpos, timestep=1.0, fps=1.0, **{"camera": first, **view})
 
 

@@ -1,7 +1,7 @@
 """Gymnasium's walking robots: its bodies, starts, observations, rewards and ends (version 5).
 
-Two things differ. Steps are Euler's, not Runge-Kutta's, which cost four times as much. Ant and humanoid are those of the options
-`include_..._in_observation=False` and `contact_cost_weight=0`: contact forces and inertias are neither seen nor charged.
+Two things differ. Steps are Euler's, not Runge-Kutta's, which cost four times as much. Ant and humanoid have the options
+`include_..._in_observation=False` and `contact_cost_weight=0`: contact forces and inertias are neither observed nor charged.
 
 References:
     Towers et al. Gymnasium: A Standard Interface for Reinforcement Learning Environments. arXiv:2407.17032.
@@ -25,19 +25,19 @@ _ANY = (-float("inf"), float("inf"))
 
 
 class Robot(Environment):
-    """A robot that is paid for going forward, for staying upright, and charged for its controls.
+    """A robot rewarded for moving forward and staying upright, and charged for its controls.
 
     Attributes:
-        forward_weight: per m/s of the torso, or of the centre of mass.
-        control_weight: per squared control.
-        alive_reward: for every step that ends within the healthy ranges.
-        healthy_height: of the torso (m); beyond it an episode ends.
-        healthy_angle: of a planar torso (rad).
-        healthy_rest: most that all angles and speeds but those of the way may be (rad, m/s, rad/s).
-        num_unseen: leading positions that are not observed, where it is.
-        speed_limit: what observed speeds are clipped to.
-        noise: of positions and velocities at the start, uniform about the reference pose at rest.
-        is_normal: whether that of the velocities is normal instead.
+        forward_weight: reward per m/s of the torso or of the centre of mass.
+        control_weight: cost per squared control.
+        alive_reward: reward for every step that ends within the healthy ranges.
+        healthy_height: range of the torso's height (m); outside it an episode ends.
+        healthy_angle: range of a planar torso's angle (rad).
+        healthy_rest: bound on all speeds and on all positions after the first two (rad, m/s, rad/s).
+        num_unseen: number of leading positions that are not observed, the location.
+        speed_limit: bound to which observed speeds are clipped.
+        noise: size of the uniform noise on positions and velocities at the start, about the reference pose at rest.
+        is_normal: whether the noise on the velocities is normal instead.
         by_mass: whether the speed is that of the centre of mass.
     """
 
@@ -160,14 +160,14 @@ def robot_scene(name: str, *, timestep: float | None = None, max_contacts: int |
     """Load one of gymnasium's robots, to be stepped by Euler's method.
 
     Args:
-        name: of the file, without its ending.
-        timestep: in s, instead of that in the file.
+        name: name of the file without its ending.
+        timestep: time step in s, in place of the file's.
         max_contacts: see `load_scene`.
 
     Raises:
         ImportError: if gymnasium is not installed.
     """
-    # Imported here: only what loads its robots needs it.
+    # Imported here: only these robots need it.
     try:
         import gymnasium
     except ImportError as error:

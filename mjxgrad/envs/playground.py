@@ -1,6 +1,6 @@
 """Environments of MuJoCo Playground and brax, stepped by `mg.step`.
 
-Both call `mjx.step`; here it is ours while their `reset` and `step` run, and theirs again after. Nothing else of them changes.
+Both call `mjx.step`. It is replaced by `mg.step` while their `reset` and `step` run, and restored after. Nothing else changes.
 """
 
 import contextlib
@@ -30,16 +30,16 @@ def load(
 ) -> Any:
     """Load an environment of MuJoCo Playground, to be stepped by `mg.step`.
 
-    It is their own object, fit for their wrappers and randomisers. Its motion is theirs with a solver that has converged, unless
-    an onset or smoothing changes it.
+    The object is Playground's own and works with its wrappers and randomisers. Its motion is Playground's with a converged
+    solver, unless an onset or smoothing changes it.
 
     Args:
-        name: as `registry.load` takes it, for instance "CartpoleSwingup".
-        config: theirs; None is the default.
-        config_overrides: by flattened name; `impl` is "jax", the implementation that has derivatives.
+        name: name for `registry.load`, for instance "CartpoleSwingup".
+        config: Playground's configuration; None is the default.
+        config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
         gradient: see `mg.step`.
-        onset: lets contacts begin within the step; `mg.Onset()` for learning by derivatives.
-        smoothing: averages contacts.
+        onset: contacts begin within the step; `mg.Onset()` for learning by derivatives.
+        smoothing: average over contacts; see `mg.step`.
         iterations: see `stepped_right`.
 
     Raises:
@@ -52,7 +52,7 @@ def load(
     except ImportError as error:
         raise ImportError(f"{name} is MuJoCo Playground's, not installed: pip install 'mjxgrad[playground]'") from error
     overrides = {**(config_overrides or {}), "impl": "jax"}
-    # A copy, for theirs is changed by the overrides.
+    # A copy, because the overrides change the configuration in place.
     own = None if config is None else config.copy_and_resolve_references()
     environment = registry.load(name, own, overrides)
     return stepped_right(environment, gradient=gradient, onset=onset, smoothing=smoothing, iterations=iterations)
@@ -66,17 +66,17 @@ def stepped_right(
     smoothing: Smoothing | None = None,
     iterations: int = 100,
 ) -> Foreign:
-    """Have an object's `reset` and `step` run on `mg.step` wherever they call `mjx.step`.
+    """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`.
 
     Args:
-        environment: with such methods, of MJX's JAX implementation: one of playground's or of brax's backend "mjx", or one of
+        environment: an object with these methods on MJX's JAX implementation: from Playground, from brax's backend "mjx", or
             your own. Only this object changes.
         gradient: see `mg.step`.
-        onset: lets contacts begin within the step; `mg.Onset()` for learning by derivatives.
-        smoothing: averages contacts.
-        iterations: of the solver, if theirs are fewer; it stops at the model's tolerance. Many of theirs stop after 1 to 4, far
-            from it where feet hit the ground: the motion is then not the model's, and a derivative of the solve not that of
-            the motion.
+        onset: contacts begin within the step; `mg.Onset()` for learning by derivatives.
+        smoothing: average over contacts; see `mg.step`.
+        iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
+            1 to 4, far from the tolerance where feet hit the ground. The motion is then not the model's, and the solve's
+            derivative is not the motion's.
 
     Returns:
         The same object.
@@ -85,10 +85,10 @@ def stepped_right(
         ValueError: if there is no such gradient, or it does not go with onset or smoothing.
     """
     check_gradient(gradient, onset, smoothing)
-    by_ours = functools.partial(_step, iterations, gradient=gradient, onset=onset, smoothing=smoothing)
-    # On the object, not in a wrapper: those who randomise models go to the innermost environment and call its step.
+    own_step = functools.partial(_step, iterations, gradient=gradient, onset=onset, smoothing=smoothing)
+    # On the object, not in a wrapper: randomisers of models call the step of the innermost environment.
     for name in ("reset", "step"):
-        setattr(environment, name, _within(getattr(environment, name), by_ours))
+        setattr(environment, name, _within(getattr(environment, name), own_step))
     return environment
 
 
@@ -97,24 +97,24 @@ def _step(iterations: int, model: mjx.Model, data: mjx.Data, **settings: Any) ->
     return step(model.replace(opt=model.opt.replace(iterations=most)), data, **settings)
 
 
-def _within(method: Callable, by_ours: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Callable:
+def _within(method: Callable, own_step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Callable:
     @functools.wraps(method)
     def call(*args: Any, **kwargs: Any) -> Any:
-        with _substituted(by_ours):
+        with _substituted(own_step):
             return method(*args, **kwargs)
 
     return call
 
 
 @contextlib.contextmanager
-def _substituted(by_ours: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Iterator[None]:
-    """Let `mjx.step` be ours within the block, in this thread."""
-    # One thread at a time: two that took turns would put back each other's substitute.
+def _substituted(own_step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Iterator[None]:
+    """Replace `mjx.step` within the block, in this thread."""
+    # One thread at a time: two interleaved threads would restore each other's substitute.
     with _LOCK:
         original, thread = mujoco.mjx.step, threading.get_ident()
 
         def substitute(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-            return (by_ours if threading.get_ident() == thread else original)(model, data)
+            return (own_step if threading.get_ident() == thread else original)(model, data)
 
         mujoco.mjx.step = substitute
         try:

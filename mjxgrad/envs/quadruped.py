@@ -1,4 +1,4 @@
-"""A quadruped that follows velocity commands, blind: it sees its joints, its turning and which way is down, not its speed.
+"""A blind quadruped that follows velocity commands: it observes its joints, its angular velocity and gravity, not its speed.
 
 References:
     Open-DiffLoco, arXiv:2608.02069 (rewards, commands, pushes, ends and the spread of the models, there on another robot
@@ -25,11 +25,11 @@ _PUSHED = 0.005  # chance per action of a push: after 4 s on average
 _REACH = 0.5  # rad that an action of 1 moves a joint's target
 _HEIGHT = 0.3  # m, of the trunk
 _LOWEST = 0.18
-_ALIVE = 4.0  # without it a policy that cannot follow yet earns least charges by falling at once
+_ALIVE = 4.0  # without it an early policy would be charged least for falling at once
 
 
 class Quadruped(Environment):
-    """Twelve position servos, 50 actions a second; every 5 s on average the command changes, every 4 s something pushes."""
+    """A quadruped with twelve position servos, 50 actions a second; on average a new command every 5 s, a push every 4 s."""
 
     def start(self, key: PRNGKeyArray) -> State:
         joints, speeds = jax.random.split(key)
@@ -84,14 +84,14 @@ def quadruped(*, is_randomised: bool = True) -> Quadruped:
     """Return the task on a robot of 12 kg; a time step is 4 ms, an action holds for five.
 
     Args:
-        is_randomised: friction, masses and gains differ between copies, see `Environment.randomised`.
+        is_randomised: whether friction, masses and gains differ between copies, see `Environment.randomised`.
     """
     scene = load_scene(scene_path("quadruped"), timestep=0.004, max_contacts=8)
     return Quadruped(scene, frame_skip=5, randomisation=spread if is_randomised else None)
 
 
 def spread(key: PRNGKeyArray, scene: Scene) -> Scene:
-    """Draw friction from 0.5 to 2, masses within 15 %, stiffness of the servos within 25 %, damping within 40 %."""
+    """Return a scene with random friction (0.5 to 2), masses (± 15 %), servo stiffness (± 25 %) and damping (± 40 %)."""
     friction, mass, stiffness, damping = jax.random.split(key, 4)
     model = scene.model
     sliding = jax.random.uniform(friction, (), minval=0.5, maxval=2.0)
@@ -111,6 +111,6 @@ def _command(key: PRNGKeyArray) -> Float[Array, "3"]:
 
 
 def _in_trunk(state: State) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """Return which way is down, the speed (m/s) and the turning (rad/s), all in the trunk's own axes."""
+    """Return the downward direction, the velocity (m/s) and the angular velocity (rad/s) in the trunk's axes."""
     turn = rotation_matrix(state.qpos[None, 3:7])[0]
     return -turn[2], turn.T @ state.qvel[:3], state.qvel[3:6]

@@ -1,4 +1,4 @@
-"""The tasks of this project as environments: an episode is one rollout, paid at its end."""
+"""The tasks of this project as environments: an episode is one rollout, rewarded at its end."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ class TaskEnvironment(Environment):
     """A task whose controls an agent chooses step by step; see `from_task`.
 
     Attributes:
-        task: whose start and cost these are.
+        task: the task, which gives start and cost.
     """
 
     task: SceneTask = eqx.field(kw_only=True)
@@ -48,7 +48,7 @@ class TaskEnvironment(Environment):
 
     def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
         step = memory["step"]
-        # What is to come is filled with what is: a cost of the course so far then has finite derivatives, too.
+        # The rows to come hold the present state: the cost of an unfinished trajectory then has finite derivatives, too.
         course = {name: _from(step + 1, memory[name], getattr(after, name)) for name in ("qpos", "qvel", "act")}
         return {**course, "ctrl": _from(step, memory["ctrl"], self.control(action)), "step": step + 1}
 
@@ -79,18 +79,18 @@ class TaskEnvironment(Environment):
 
 
 def from_task(task: SceneTask) -> TaskEnvironment:
-    """Return a task as an environment: one time step per action, `task.horizon` of them.
+    """Return a task as an environment: `task.horizon` actions of one time step each.
 
-    The reward of the last step is minus the task's cost, all others are zero, so that the return is minus the cost. An episode
-    whose physics diverges ends there and is charged as if all had stayed where it was. The end is part of the task:
-    `terminated`, not `truncated`. Actions are scaled to `ctrlrange`; where that has no ends they are the controls themselves.
-    A policy sees positions, velocities, activations and the share of the time that is gone.
+    The reward of the last step is minus the task's cost, and all others are zero, so the return is minus the cost. An episode
+    whose physics diverges ends there, charged as if the state had stayed constant. The end is part of the task: `terminated`,
+    not `truncated`. Actions are scaled to `ctrlrange`; without limits they are the controls themselves. A policy observes
+    positions, velocities, activations and the elapsed share of the time.
 
     Args:
-        task: without `observe`; a policy of its own plays no part.
+        task: a task without `observe`; its own policy is not used.
 
     Raises:
-        ValueError: if its cost needs observations.
+        ValueError: if the task's cost needs observations.
     """
     if task.observe is not None:
         raise ValueError(f"task must have a cost of positions, velocities and controls, got observe={task.observe!r}")
@@ -103,5 +103,5 @@ def _repeated(value: Float[Array, " n"], num_states: int) -> Float[Array, "state
 
 
 def _from(step: Array, rows: Float[Array, "rows n"], value: Float[Array, " n"]) -> Float[Array, "rows n"]:
-    """Set all rows from a step on."""
+    """Return the rows with a value in all rows from a step on."""
     return jnp.where(jnp.arange(len(rows))[:, None] >= step, value, rows)

@@ -1,23 +1,23 @@
-r"""Do the derivatives of samples explain the differences of their costs?
+r"""A test whether the derivatives of samples explain the differences between their costs.
 
-For two samples that differ in their noise alone, the trapezoidal rule along the line between them gives
+For two samples that differ only in their noise, the trapezoidal rule along the line between them gives
 
 $$f_j - f_k = \tfrac12 (\nabla f_j + \nabla f_k)\cdot(w_j - w_k) + r_{jk}.$$
 
-The residual vanishes for every quadratic and is of third order in the distance where $f$ is smooth. A jump between the
-two is in $r_{jk}$ whole, and a stiff slope that one of them met and the other did not makes it large. No bound, no rate
-and no number of samples is needed to read it, and two samples on different sides of a jump are enough.
+The residual is zero for every quadratic. Where $f$ is smooth it is of third order in the distance. A jump between the two
+samples is wholly in it, and it is large if only one of them met a stiff slope. It needs no bound, no rate and no minimum
+number of samples: two samples on different sides of a jump are enough.
 
-The test is on secants: residuals and differences are divided by the distance, so that near pairs, where smooth functions
-are flat and jumps are not, count most. In many dimensions all distances are alike.
+The test uses secants: residuals and differences are divided by the distance. Near pairs therefore count most, where smooth
+functions are flat and jumps are not. In many dimensions all distances are alike.
 
-What the residual says about bias: let $J$ be the part of the cost that derivatives miss. The bias of the first-order
-estimate is $-\mathbb{E}[J s]$, and because the components of $\sigma s$ are orthonormal its norm is at most
-$\mathrm{sd}(J)/\sigma$ in any dimension (Bessel's inequality); $\mathbb{E}[r^2] \approx 2\,\mathrm{Var}\,J$.
+The residual also bounds the bias. Let $J$ be the part of the cost that derivatives miss. The bias of the first-order
+estimate is $-\mathbb{E}[J s]$. The components of $\sigma s$ are orthonormal, so its norm is at most
+$\mathrm{sd}(J)/\sigma$ in any dimension (Bessel's inequality), and $\mathbb{E}[r^2] \approx 2\,\mathrm{Var}\,J$.
 
 References:
-    Compare Onoda et al., arXiv:2604.18161 (DDCG), who test the Poincaré inequality between the variances of costs and
-    derivatives: a necessary condition for smoothness, where this one looks at each pair.
+    Compare Onoda et al., arXiv:2604.18161 (DDCG). They test the Poincaré inequality between the variances of costs and
+    derivatives, a necessary condition for smoothness; this test looks at each pair.
 """
 
 import equinox as eqx
@@ -26,15 +26,18 @@ from jaxtyping import Array, Float
 
 from mjxgrad.estimators.samples import Group
 
-# Differences of costs are rounded; what is within this many units in the last place of the largest cost is no residual.
+# Costs are rounded: a residual below this many units in the last place of the largest cost counts as zero.
 _ROUNDING = 32.0
 
 
 class SecantSums(eqx.Module):
     """Sums over pairs of samples, to be added over groups.
 
-    Of squared residuals, and differences of costs, over squared distances in standard deviations of the noise; of half the
-    squared residuals, missed; and the number of pairs.
+    Attributes:
+        residual: squared residuals over squared distances, in standard deviations of the noise.
+        difference: squared differences of costs over the same squared distances.
+        missed: half the squared residuals.
+        pairs: number of pairs.
     """
 
     residual: Float[Array, ""]
@@ -43,19 +46,19 @@ class SecantSums(eqx.Module):
     pairs: Float[Array, ""]
 
     def inconsistency(self) -> Float[Array, ""]:
-        """Give the share of the secants' squares that derivatives do not explain: zero where they explain all."""
+        """Return the share of the squared secants that derivatives do not explain; zero where they explain all."""
         return jnp.where(self.residual > 0, self.residual / jnp.maximum(self.difference, self.residual * 1e-6), 0)
 
     def missed_variance(self) -> Float[Array, ""]:
-        """Give the variance of the part of the cost that derivatives miss; NaN without pairs."""
+        """Return the variance of the part of the cost that derivatives miss; NaN without pairs."""
         return self.missed / self.pairs
 
 
 def secant_sums(samples: Group, slopes: Float[Array, "samples samples"]) -> SecantSums:
-    """Compare all pairs of a group that differ in their noise alone; every pair is in the sums twice."""
+    """Compare all pairs of a group that differ only in their noise; every pair is in the sums twice."""
     own = jnp.diagonal(slopes)
     difference = samples.costs[:, None] - samples.costs[None, :]
-    # The derivatives of both along the way from k to j.
+    # The derivatives of both samples along the line from k to j.
     rise = (own[:, None] - slopes + slopes.T - own[None, :]) / 2
     residual = difference - rise
     rounding = _ROUNDING * jnp.finfo(residual.dtype).eps * samples.rounding
@@ -64,7 +67,7 @@ def secant_sums(samples: Group, slopes: Float[Array, "samples samples"]) -> Seca
     distance = squares[:, None] + squares[None, :] - 2 * jnp.matmul(scaled, scaled.T, precision="highest")
     is_pair = samples.same_start() & samples.has_derivative[:, None] & samples.has_derivative[None, :]
     is_pair &= ~jnp.eye(len(own), dtype=bool)
-    # Samples that fall together have no secant; the floor is rounding's in the line above.
+    # Coinciding samples have no secant; the floor is the rounding error of `distance`.
     floor = 16 * jnp.finfo(distance.dtype).eps * jnp.maximum(squares.max(), 1e-30)
     is_pair &= distance > floor
     inverse = jnp.where(is_pair, 1 / jnp.where(is_pair, distance, 1), 0)

@@ -1,4 +1,4 @@
-"""What every estimator returns."""
+"""The result of an estimator, and its assembly from moments."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from mjxgrad.estimators.samples import Plan
 
 
 class Diagnosis(eqx.Enumeration):
-    """What to know about an estimate before using it; `Diagnosis[estimate.diagnosis]` is the sentence."""
+    """The soundness of an estimate; `Diagnosis[estimate.diagnosis]` is the sentence."""
 
     fine = "every sample was finite"
     some_not_finite = "samples that were not finite were left out, so the mean is over the rest"
@@ -23,7 +23,7 @@ class Diagnosis(eqx.Enumeration):
 
 
 class Reason(eqx.Enumeration):
-    """Why α, the weight of the first-order part, is what it is; `Reason[estimate.reason]` is the sentence."""
+    """The reason for the value of α, the weight of the first-order part; `Reason[estimate.reason]` is the sentence."""
 
     fixed = "the estimator leaves no choice, or α was given"
     inverse_variance = "the weights are those of least variance: no bias was found, or none was looked for"
@@ -38,28 +38,27 @@ class Reason(eqx.Enumeration):
 
 
 class GradientEstimate(eqx.Module):
-    r"""An estimate of $\nabla F(\theta)$ and what it cost.
+    r"""An estimate of $\nabla F(\theta)$ with its errors and the rollouts spent on it.
 
-    `covariance_diagonal` is per rollout, whatever the estimator does with its rollouts: divided
-    by the number of finite ones and rooted it is `standard_error`. A leave-one-out baseline and
-    antithetic pairs make samples dependent; both are accounted for in it.
+    `covariance_diagonal` is per rollout for every estimator: `standard_error` is the root of it divided by `num_finite`.
+    It accounts for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
 
     Attributes:
         value: the estimate, NaN if fewer than two independent samples were finite. It and the next two have the form of
-            the parameters, with None in place of what is no floating-point array.
-        standard_error: of each coordinate of `value`.
+            the parameters, with None in place of leaves that are no floating-point arrays.
+        standard_error: standard error of each coordinate of `value`.
         covariance_diagonal: variance of each coordinate, per rollout.
         objective_mean: mean cost under noise, an estimate of $F(\theta)$.
-        objective_standard_error: of `objective_mean`.
+        objective_standard_error: standard error of `objective_mean`.
         num_samples: rollouts with noise that were asked for.
-        num_finite: of those, the ones used; a pair is used if both of it are finite.
+        num_finite: rollouts with noise that were used; a pair is used if both its rollouts are finite.
         num_rollouts: rollouts spent, a zero-noise baseline included.
-        num_gradient_rollouts: of those, the ones that were differentiated.
+        num_gradient_rollouts: rollouts that were differentiated.
         diagnosis: an item of `Diagnosis`.
-        alpha: weight of the first-order part; one number; of `per_step` one per step and action.
-        reason: an item of `Reason` for each `alpha`; `Reason.nothing_felt` with any estimator.
-        bias_bound: an upper bound on the norm of the bias of `value`, as far as the rule that chose `alpha` knows one:
-            zero for what is unbiased, NaN where nothing is known.
+        alpha: weight of the first-order part: one number, or from `per_step` one per step and action.
+        reason: an item of `Reason` for each `alpha`; every estimator may give `Reason.nothing_felt`.
+        bias_bound: an upper bound on the norm of the bias of `value`, if the rule that chose `alpha` knows one. Zero for
+            an unbiased estimate, NaN where nothing is known.
     """
 
     value: PyTree[Float[Array, "..."]]
@@ -79,7 +78,7 @@ class GradientEstimate(eqx.Module):
     @property
     def variance(self) -> Float[Array, "*batch"]:
         """Trace of the covariance, per rollout."""
-        first = jnp.ndim(self.num_samples)  # what stands before is of `jax.vmap`
+        first = jnp.ndim(self.num_samples)  # the axes before it come from `jax.vmap`
         leaves = jax.tree.leaves(self.covariance_diagonal)
         return jnp.stack([leaf.sum(axis=tuple(range(first, leaf.ndim))) for leaf in leaves]).sum(axis=0)
 
@@ -89,17 +88,17 @@ class GradientEstimate(eqx.Module):
         return self.num_finite / self.num_samples
 
 
-# Called as (objective, params, key), with its settings, such as num_samples, as keywords or bound by functools.partial.
+# Called as (objective, params, key); settings such as num_samples are keywords or bound by functools.partial.
 Estimator = Callable[..., GradientEstimate]
 
 
 def is_nothing_felt(plan: Plan, costs: Moments, num_felt: Int[Array, ""]) -> Bool[Array, ""]:
-    """Say whether the noise of no unit made a difference, to a derivative or from one cost to another.
+    """Return whether the noise changed no cost, and no derivative differed from zero, in any unit.
 
-    Noise that is zero is no evidence. Where starts are random, costs are compared within units that share one; without
-    such a unit they differ by their starts, and it cannot be said.
+    Zero noise is no evidence. With random starts, only costs of units that share a start are compared; without such
+    units the costs differ by their starts, and the answer is False.
     """
-    return (num_felt == 0) & ((costs.squares == 0) | plan.shares_start | plan.with_silence)
+    return (num_felt == 0) & ((costs.squares == 0) | plan.shares_start | plan.zero_noise_per_unit)
 
 
 def assemble(
@@ -116,10 +115,22 @@ def assemble(
     reason: Any = Reason.fixed,
     bias_bound: ArrayLike = 0.0,
 ) -> GradientEstimate:
-    """Put an estimate together, refusing to give a number where there is none.
+    """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over independent units: samples, or pairs of them. `count` are those that were finite, `num_felt`
-    those whose noise made a difference, or that cannot tell. `restore` goes from a vector to the form of the parameters.
+    Moments and counts are over independent units: samples, or pairs of them.
+
+    Args:
+        value: mean over the units.
+        squared_error: squared standard error of `value`.
+        costs: moments of the costs.
+        plan: the rollouts that were asked for.
+        count: number of finite units.
+        num_felt: number of units whose noise made a difference, or cannot tell.
+        restore: map from a vector to the form of the parameters.
+        has_baseline: whether the baseline is finite.
+        alpha: weight of the first-order part.
+        reason: an item of `Reason`.
+        bias_bound: upper bound on the norm of the bias.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

@@ -1,4 +1,4 @@
-"""First order, the mean of the derivatives of samples; zeroth order, the covariance of cost and score; both at once."""
+"""First order (mean derivative of the samples), zeroth order (covariance of cost and score), and both at once."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,16 +17,16 @@ def first_order(
 ) -> GradientEstimate:
     r"""Estimate the gradient of a smoothed objective by differentiating each sample.
 
-    $\hat g = \mathrm{mean}_i \nabla_\theta f(\theta, w_i)$. Unbiased where $f$ is continuous;
-    where it jumps the derivative misses the jump, and where it is stiff the variance is huge.
+    $\hat g = \mathrm{mean}_i \nabla_\theta f(\theta, w_i)$. It is unbiased where $f$ is continuous.
+    Where $f$ jumps the derivative misses the jump; where $f$ is stiff the variance is huge.
 
     Args:
         objective: differentiated once per sample, under `jax.vmap`.
-        params: the point $\theta$: a vector, or a pytree such as a dict or an equinox module, whose floating-point
-            arrays are the parameters; the estimate then has its form.
+        params: the point $\theta$: a vector, or a pytree such as a dict or an equinox module. The floating-point
+            arrays of a pytree are the parameters, and the estimate has its form.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. At least 2.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
+        chunk_size: rollouts at a time. Memory grows with it; the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -57,20 +57,19 @@ def zeroth_order(
     r"""Estimate the gradient of a smoothed objective without differentiating it.
 
     With noise $w \sim p(w \mid \theta)$ the gradient of $F(\theta) = \mathbb{E}[f]$ is
-    $\mathbb{E}[(f_i - b_i)\, s_i]$, $s_i$ the score. All three baselines $b_i$ are independent
-    of sample $i$, so the estimate is unbiased even where $f$ jumps.
+    $\mathbb{E}[(f_i - b_i)\, s_i]$ with the score $s_i$. None of the three baselines $b_i$ depends on sample $i$,
+    so the estimate is unbiased even where $f$ jumps.
 
     Args:
         objective: its `value` is called once under `jax.vmap`.
         params: the point $\theta$, as in `first_order`.
         key: consumed here; do not use it again.
         num_samples: rollouts with noise to spend. At least 2; even and at least 4 with antithetic pairs.
-        baseline: "leave_one_out", the mean cost of the other samples (of the other pairs);
-            "zero_noise", the cost without noise, one more rollout, or where starts are random one
-            more for each sample (for each pair), from the same start; or "none".
-        antithetic: use every noise together with its mirror image. The standard error is then taken over pairs. Where
-            the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
-        chunk_size: rollouts at a time; memory grows with it, the result depends on it only by rounding.
+        baseline: "leave_one_out", the mean cost of the other samples or pairs; "zero_noise", the cost without noise;
+            or "none". Zero noise costs one more rollout; with random starts, one per sample or pair, from its start.
+        antithetic: whether every noise is used together with its mirror image. The standard error is then over pairs.
+            Where the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
+        chunk_size: rollouts at a time. Memory grows with it; the result depends on it only by rounding.
 
     Returns:
         The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
@@ -99,16 +98,16 @@ def first_and_zeroth_order(
     antithetic: bool = False,
     chunk_size: int | None = None,
 ) -> tuple[GradientEstimate, GradientEstimate]:
-    """Estimate the gradient both ways, with one differentiated rollout per sample for both.
+    """Estimate the gradient in first and in zeroth order from the same differentiated rollouts.
 
-    Each is what `first_order` and `zeroth_order` give from the same key. They are dependent,
-    and each reports what was spent on both: do not add the two.
+    The two estimates are those of `first_order` and `zeroth_order` from the same key. They are dependent. Each reports
+    the rollouts spent on both: do not add the two.
 
-    Arguments and refusals are those of `zeroth_order`. With antithetic pairs the first-order estimate uses pairs, too.
+    Arguments and errors are those of `zeroth_order`. With antithetic pairs the first-order estimate uses pairs, too.
 
     Returns:
-        The first-order and the zeroth-order estimate. A sample with a finite cost whose
-        derivative is not finite counts in the second only.
+        The first-order and the zeroth-order estimate. A sample with a finite cost but no finite derivative counts in
+        the second only.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
@@ -116,14 +115,14 @@ def first_and_zeroth_order(
 
 
 def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Total]:
-    """Keep of samples what the estimate needs: moments of gradients and of costs."""
+    """Return the moments of gradients and of costs, and the number of units that felt their noise."""
     mask = samples.first_order_mask()
     gradients = Moments.of(samples.gradients.mean(axis=1), mask)
     return gradients, Moments.of(samples.costs.mean(axis=1), mask), Total(samples.num_felt())
 
 
 def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) -> GradientEstimate:
-    """Turn what `first_order_summary` kept into the estimate."""
+    """Return the estimate from the summary of `first_order_summary`."""
     gradients, costs, felt = summary
     return assemble(
         gradients.mean,
@@ -139,21 +138,21 @@ def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) 
 
 
 def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Total]:
-    """Keep of samples what the estimate needs: joint moments, moments of the cost, and the cost without noise."""
+    """Return joint moments of costs and scores, moments of the costs, and the cost without noise."""
     mask = samples.zeroth_order_mask()
-    moments = ScoreMoments.of(samples.costs - samples.silent_costs[:, None], samples.scores, mask)
+    moments = ScoreMoments.of(samples.costs - samples.zero_noise_costs[:, None], samples.scores, mask)
     sums = Total((samples.noise_free_cost(), samples.num_felt()))
     return moments, Moments.of(samples.costs.mean(axis=1), mask), sums
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:
-    """Turn what `zeroth_order_summary` kept into the estimate."""
+    """Return the estimate from the summary of `zeroth_order_summary`."""
     moments, costs, sums = summary
     noise_free_cost, num_felt = sums.value
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
     else:
-        # Costs are already above those from their own starts, if there are any.
+        # Costs from their own starts are already taken off.
         centre = noise_free_cost if plan.with_zero_noise else jnp.zeros_like(noise_free_cost)
         first, second = moments.about(centre)
         value, squared_error = _mean_and_squared_error(first[0], second[0, 0], moments.costs.count)
@@ -170,21 +169,21 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, res
 
 
 def both_summary(samples: Samples) -> tuple:
-    """Keep of samples what both estimates need."""
+    """Return the summaries of both estimates, one after the other."""
     return *first_order_summary(samples), *zeroth_order_summary(samples)
 
 
 def both_results(
     kept: tuple, plan: Plan, baseline: str, restore: Callable
 ) -> tuple[GradientEstimate, GradientEstimate]:
-    """Turn what was kept into both estimates."""
+    """Return both estimates from the summary of `both_summary`."""
     return first_order_result(kept[:3], plan, restore), zeroth_order_result(kept[3:], plan, baseline, restore)
 
 
 def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    r"""Mean of $g_i = u_i - b_i \bar s_i$, $b_i$ the mean cost of the other units.
+    r"""Return the mean of $g_i = u_i - b_i \bar s_i$ and its squared error; $b_i$ is the mean cost of the other units.
 
-    About the mean cost $g_i = u_i + p_i/(n-1)$ (features of `ScoreMoments`); without pairs $u = p$ and this is
+    About the mean cost, $g_i = u_i + p_i/(n-1)$ with the features of `ScoreMoments`. Without pairs $u = p$, and this is
     $\frac{n}{n-1}(f_i - \bar f)s_i$, whose mean is the sample covariance of cost and score.
 
     The $g_i$ share the mean, so their spread over $n$ is not quite the variance $V$ of their
@@ -193,8 +192,9 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     $$V = \frac{\mathrm{Var}\,u}{n} + \frac{\mathrm{Var}\bar f\,\mathrm{Var}\bar s + c^2}{n(n-1)},
       \qquad \mathbb{E}[\text{spread}/n] = V - \frac{c^2}{(n-1)^2}.$$
 
-    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and $\mathbb{E}[k^2] = c^2 +
-    V_k$; together they give an estimate of $V$ that is unbiased for every $n \ge 2$, and never negative without pairs.
+    The same holds for the sample covariance $k$ of $\bar f, \bar s$ with its own spread, and
+    $\mathbb{E}[k^2] = c^2 + V_k$. Together they give an estimate of $V$ that is unbiased for every $n \ge 2$. Without
+    pairs it is never negative.
     """
     first, second, count = moments.first, moments.second, moments.costs.count
     others = as_real(jnp.maximum(count - 1, 1), first)

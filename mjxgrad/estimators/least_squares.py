@@ -1,4 +1,4 @@
-"""The slope of the cost over its noise by least squares."""
+"""Least squares: the slope of the cost over its noise."""
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +15,15 @@ def least_squares(
 ) -> GradientEstimate:
     r"""Estimate the gradient of a smoothed objective by a linear fit to its samples, without derivatives.
 
-    The slope of the regression of $f$ on $w$ (with an intercept). For Gaussian noise that of infinitely many samples is
-    $\nabla F$ (Stein's lemma), whatever $f$ is; for a linear $f$ it is exact from $\mathrm{dim} + 1$ samples on, where
-    zeroth order has the full noise. With samples not much more than the dimension it is noisier than zeroth order.
+    The estimate is the slope of the regression of $f$ on $w$, with an intercept. For Gaussian noise it converges to
+    $\nabla F$ for every $f$ (Stein's lemma). For a linear $f$ it is exact from $\mathrm{dim} + 1$ samples on, where
+    zeroth order has the full noise. With few more samples than dimensions it is noisier than zeroth order.
 
-    The standard error is the sandwich with residuals over one less their leverage (HC3), since at a jump the residual
-    depends on the noise; it is a little too large rather than too small.
+    The standard error is the sandwich with each residual divided by one minus its leverage (HC3), because at a jump the
+    residual depends on the noise. It is a little too large rather than too small.
 
     Args:
-        objective: with Gaussian noise on the parameters, or open loop from a fixed start.
+        objective: an objective with Gaussian noise on the parameters, or open loop from a fixed start.
         params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here; do not use it again.
         num_samples: rollouts to spend. More than dim + 1.
@@ -59,7 +59,7 @@ def least_squares(
     samples = jax.tree.map(lambda leaf: leaf.reshape(num_chunks * size, *leaf.shape[2:]), samples)
     mask = samples.zeroth_order_mask()
     costs = Moments.of(samples.costs[:, 0], mask)
-    # Scores in place of noise: of comparable size for all coordinates, and the units follow from their scale.
+    # Scores times the standard deviation: comparable size in all coordinates, whatever their units.
     stddev = jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape)).astype(vector.dtype)
     noise = jnp.where(mask[:, None], samples.scores[:, 0] * stddev, 0)
     slope, squared_error = _fit(noise, jnp.where(mask, samples.costs[:, 0] - costs.mean, 0), mask)
@@ -78,7 +78,7 @@ def least_squares(
 def _fit(
     noise: Float[Array, "samples dim"], costs: Float[Array, " samples"], mask: Array
 ) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    """Regress, by QR, and give the slope with its squared error."""
+    """Return the slope of the regression, by QR, with its squared error."""
     design = jnp.concatenate([mask[:, None].astype(noise.dtype), noise], axis=1)
     basis, triangle = jnp.linalg.qr(design)
     to_slope = jax.scipy.linalg.solve_triangular(triangle, basis.T)

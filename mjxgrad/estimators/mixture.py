@@ -1,4 +1,4 @@
-"""Mixtures of a first-order and an unbiased estimate from the same rollouts, and all that is needed to weigh them."""
+"""Mixtures of a first-order and an unbiased estimate from the same rollouts, and the evidence that weighs them."""
 
 import functools
 from collections.abc import Callable
@@ -31,18 +31,18 @@ def alpha_order(
 ) -> GradientEstimate:
     r"""Mix a first-order and an unbiased estimate of the gradient of a smoothed objective.
 
-    $\alpha g^1 + (1 - \alpha) g^0$, both parts from the same rollouts. $g^1$ is the mean derivative; $g^0$ the
-    control-variate estimate (see `control_variate`), which is never much worse than zeroth order and far better where
-    derivatives explain the costs. The rule chooses $\alpha$ and says why. Choosing it from the same samples adds a
-    dependence of the order of one over their number that the standard error does not count.
+    The estimate is $\alpha g^1 + (1 - \alpha) g^0$, both parts from the same rollouts. $g^1$ is the mean derivative.
+    $g^0$ is the control-variate estimate, see `control_variate`: never much worse than zeroth order, and far better where
+    derivatives explain the costs. The rule chooses $\alpha$ and names the reason. It chooses from the same samples, which
+    adds a dependence of order 1 / `num_samples` that the standard error does not count.
 
     Args:
         objective: differentiated once per sample by its noise, under `jax.vmap`.
         params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; where starts are random, even and at least 4, since pairs share one.
-        rule: chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
-        control_variate: whether $g^0$ uses derivatives; without, it is zeroth order with the leave-one-out baseline.
+        num_samples: rollouts to spend. At least 2; with random starts even and at least 4, since pairs share a start.
+        rule: the rule that chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
+        control_variate: whether $g^0$ uses derivatives; otherwise it is zeroth order with the leave-one-out baseline.
         chunk_size: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
             within groups of at most 64 of a chunk.
 
@@ -69,15 +69,15 @@ def control_variate(
 ) -> GradientEstimate:
     r"""Estimate the gradient without bias, using derivatives as far as they explain the costs.
 
-    The mean of $(f_j - \beta\,\bar g\cdot w_j - b) s_j + \beta P_j^\top \bar g$, where the mean derivative $\bar g$, the
-    baseline $b$ and the share $\beta \in [0, 1]$, fitted by least squares, all leave sample j out; see `unbiased`.
-    Unbiased however wrong derivatives are; then $\beta$ is near zero and this is zeroth order. Where they explain the
-    costs its error is smaller by the root of the share that they leave.
+    The estimate is the mean of $(f_j - \beta\,\bar g\cdot w_j - b) s_j + \beta P_j^\top \bar g$. The mean derivative
+    $\bar g$, the baseline $b$ and the share $\beta \in [0, 1]$, fitted by least squares, all leave sample j out; see
+    `unbiased`. It is unbiased even if derivatives are wrong: $\beta$ is then near zero, and this is zeroth order. Where
+    derivatives explain the costs, the error falls by the root of the share that they leave unexplained.
 
-    The standard error does not count that terms depend on each other through the mean derivative: at four samples it was
-    up to 8 % too small in the tests, from ten on less than 2 %.
+    The standard error ignores that terms depend on each other through the mean derivative. In the tests it was up to 8 %
+    too small at four samples, and less than 2 % from ten samples on.
 
-    Arguments, units and refusals are those of `alpha_order`.
+    Arguments, units and errors are those of `alpha_order`.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
@@ -97,17 +97,17 @@ def per_step(
 ) -> GradientEstimate:
     r"""Mix derivatives and unbiased terms by step and action, then pull the mixture back through the policy, once.
 
-    By the noise of step t and action a, a sample has a derivative $\lambda_{t,a}$ and an unbiased term $z_{t,a}$; the
-    estimate is the mean of $P_j^\top(\alpha\odot\lambda_j + (1 - \alpha)\odot z_j)$. Derivatives far from the end of a
-    long rollout may explode while those near it are exact, so that one weight for all would waste the latter.
+    For the noise of step t and action a, a sample has a derivative $\lambda_{t,a}$ and an unbiased term $z_{t,a}$. The
+    estimate is the mean of $P_j^\top(\alpha\odot\lambda_j + (1 - \alpha)\odot z_j)$. Early in a long rollout derivatives
+    may explode while those near its end are exact. One weight for all steps would waste the exact ones.
 
-    Arguments and refusals are those of `alpha_order`. The rule chooses each $\alpha_{t,a}$, within a chunk:
-    `Consistent()`, the default, has one first question for all steps, and `InverseVariance()` is the published IVW-H.
+    Arguments and errors are those of `alpha_order`. The rule chooses each $\alpha_{t,a}$ within a chunk. `Consistent()`,
+    the default, asks its first question once for all steps; `InverseVariance()` is the published IVW-H.
     With noise on the parameters the steps are the parameters.
 
     Returns:
-        The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number for each
-        step and action, flattened, the mean over chunks; its `reason` the most frequent. The bias is not bounded.
+        The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number per step and
+        action, flattened, the mean over chunks; its `reason` is the most frequent one. The bias is not bounded.
 
     References:
         Onoda et al., arXiv:2604.18161 (IVW-H).
@@ -145,16 +145,20 @@ def per_step(
 
 
 class Parts(Summary):
-    """Moments of both parts over all samples; of pairs of them where starts are random.
+    """Moments of both parts over all units: samples, or pairs where starts are random.
 
     Attributes:
-        difference: of the unbiased terms less the derivatives.
-        scaled: of the derivatives by noise, in its standard deviations.
-        linear_variance: of the costs that the mean derivative explains, summed over samples.
-        beta: sum of the shares that were taken off.
-        num_costs: samples in these sums.
-        num_groups: groups of samples that share their baselines.
-        num_felt: units whose noise made a difference.
+        first: moments of the derivatives.
+        unbiased: moments of the unbiased terms.
+        difference: moments of the unbiased terms minus the derivatives.
+        costs: moments of the costs.
+        scaled: moments of the derivatives by the noise, in its standard deviations.
+        secants: comparison of costs and derivatives over pairs.
+        linear_variance: variance of the costs that the mean derivative explains, summed over samples.
+        beta: sum of the shares of the linear part that were taken off.
+        num_costs: number of samples in the last two sums.
+        num_groups: number of groups of samples that share their baselines.
+        num_felt: number of units whose noise made a difference.
     """
 
     first: Moments
@@ -176,7 +180,7 @@ class Parts(Summary):
         return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
 
     def evidence(self, *, by_coordinate: bool) -> Evidence:
-        """Give what a rule may look at, of all coordinates as one block or of each as one."""
+        """Return the evidence for a rule, with all coordinates as one block or each as a block of its own."""
         pool = jnp.asarray if by_coordinate else jnp.sum
         dim = pool(jnp.ones_like(self.first.offset))
 
@@ -202,7 +206,7 @@ class Parts(Summary):
         )
 
     def mixture(self, alpha: Float[Array, " dim"]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Give the weighted mean and its squared standard error; where no derivative was finite, the unbiased part's."""
+        """Return the weighted mean and its squared error; without finite derivatives, those of the unbiased part."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)
         value = alpha * first + (1 - alpha) * self.unbiased.mean
@@ -214,9 +218,9 @@ class Parts(Summary):
         return value, jnp.where(has_first, mixed, unbiased_error)
 
     def _unbiased_squared_error(self, first: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """Give the squared error of terms that share their baseline; the derivation is at `first_and_zeroth._leave_one_out`.
+        """Return the squared error of terms that share their baseline; derived at `first_and_zeroth._leave_one_out`.
 
-        There c is the covariance of cost and score; here that of the remaining cost and the score.
+        Its c, the covariance of cost and score, is here the covariance of the remaining cost and the score.
         """
         spread = self.unbiased.squared_error()
         num_groups = jnp.maximum(self.num_groups, 1)
@@ -226,7 +230,7 @@ class Parts(Summary):
 
 
 def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
-    """Summarise a chunk for both parts by the parameters."""
+    """Return the summary of a chunk with both parts pulled back to the parameters."""
     chunk = Group.of(samples)
     take = functools.partial(chunk.pull_back, samples)
     return (parts_and_terms(samples, chunk, control_variate=control_variate, take=take)[0],)
@@ -235,9 +239,9 @@ def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
 def parts_and_terms(
     samples: Samples, chunk: Group, *, control_variate: bool, take: Callable[[ByNoise], Array]
 ) -> tuple[Parts, ByNoise, Bool[Array, " units"]]:
-    """Give the summary of a chunk, the unbiased terms by noise, and which units have both cost and baseline.
+    """Return the summary of a chunk, the unbiased terms by noise, and which units have both a cost and a baseline.
 
-    Moments are wanted where `take` goes: it is the pull-back for parameters, the identity for noise.
+    `take` maps the noise to the space of the moments: the pull-back for parameters, the identity for noise.
     """
     groups = chunk.split()
 
@@ -248,7 +252,7 @@ def parts_and_terms(
     terms, secants = jax.vmap(compare)(groups)
     count = len(chunk.costs)
     terms_by_noise = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[:count]
-    # A cost without another to compare it with has no baseline.
+    # A group with a single cost has no baseline.
     num_costs = groups.has_cost.sum(axis=1)
     is_compared = (groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count]
     has_cost = chunk.complete(is_compared)
@@ -272,7 +276,7 @@ def parts_and_terms(
 
 
 def weigh(rule: Rule, parts: Parts, plan: Plan, *, by_coordinate: bool = False) -> Weights:
-    """Apply a rule to all coordinates or to each, where it has derivatives to judge that say something."""
+    """Apply a rule to all coordinates or to each; α is zero without finite derivatives, or if nothing was felt."""
     if isinstance(rule, type) or not callable(rule):
         raise ValueError(f"rule must be one of mg.estimators.rules, such as rules.Consistent(), got {rule!r}")
     is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
@@ -290,7 +294,7 @@ def weigh(rule: Rule, parts: Parts, plan: Plan, *, by_coordinate: bool = False) 
 def _assembled(
     parts: Parts, plan: Plan, restore: Callable, weights: Float[Array, " dim"], **facts: Any
 ) -> GradientEstimate:
-    """Turn both parts into one estimate; the facts are what `assemble` says about α."""
+    """Return one estimate from both parts; the facts are the arguments of `assemble` about α."""
     value, squared_error = parts.mixture(weights)
     count, num_felt = parts.unbiased.count, parts.num_felt
     return assemble(value, squared_error, parts.costs, plan, count=count, num_felt=num_felt, restore=restore, **facts)

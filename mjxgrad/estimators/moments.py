@@ -1,7 +1,7 @@
 r"""Moments of samples that arrive in chunks, merged without cancellation.
 
-Each class is an empty summary when all its leaves are zero, and has `merge`. Sums are kept about the mean of what was
-seen so far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
+Each class has `merge`, and is an empty summary when all its leaves are zero. Sums are about the mean of the samples so
+far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
 
 References:
     Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample
@@ -18,18 +18,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 class Summary(eqx.Module):
-    """What is kept of samples; all leaves zero means of none."""
+    """A summary of samples; with all leaves zero it is the summary of none."""
 
     @abstractmethod
     def merge(self, other: Any) -> Any:
-        """Give the summary of both sets of samples."""
+        """Return the summary of both sets of samples."""
 
 
 class Moments(Summary):
     """Count, mean, and sum of squared deviations.
 
-    The mean is kept as a sample, the origin, and an offset from it: rounded to one number in float32, that of costs of 1e6
-    would be off by 0.03, which a small spread notices.
+    The mean is kept as one of the samples, the origin, and an offset from it. A single float32 number would be off by 0.03
+    for costs of 1e6, too much for a small spread.
     """
 
     count: Int[Array, ""]
@@ -48,11 +48,11 @@ class Moments(Summary):
 
     @property
     def mean(self) -> Float[Array, "*shape"]:
-        """Give the mean, rounded."""
+        """The mean, rounded."""
         return self.origin + self.offset
 
     def above(self, centre: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Give the mean less a centre, without rounding the mean first."""
+        """Return the mean minus a centre, without rounding the mean first."""
         return (self.origin - centre) + self.offset
 
     def merge(self, other: "Moments") -> "Moments":
@@ -65,11 +65,11 @@ class Moments(Summary):
         return Moments(count, origin, mine + (theirs - mine) * share, squares)
 
     def variance(self) -> Float[Array, "*shape"]:
-        """Give the variance, with N − 1; zero for fewer than two samples."""
+        """Return the variance, with N − 1; zero for fewer than two samples."""
         return self.squares / as_real(jnp.maximum(self.count - 1, 1), self.squares)
 
     def squared_error(self) -> Float[Array, "*shape"]:
-        """Give the squared standard error of the mean, NaN for fewer than two samples."""
+        """Return the squared standard error of the mean, NaN for fewer than two samples."""
         count = as_real(self.count, self.squares)
         return jnp.where(count > 1, self.squares / jnp.maximum(count * (count - 1), 1), jnp.nan)
 
@@ -84,13 +84,13 @@ class Total(Summary):
 
 
 class ScoreMoments(Summary):
-    r"""Joint moments of costs and scores from which the baseline can be chosen at the end.
+    r"""Joint moments of costs and scores that leave the choice of the baseline to the end.
 
     A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a centre $c$, its
-    features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and $\bar s$, where bars are means
-    within the unit. Moving the centre acts on them linearly, $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$, so
-    their sums and sums of products about any centre follow from those about another: about the mean they merge without
-    cancellation, about zero or about the noise-free cost they give the other baselines.
+    features are $u = \mathrm{mean}_j((f_j - c) s_j)$, $p = (\bar f - c)\bar s$ and $\bar s$; bars are means within the
+    unit. Moving the centre acts on them linearly: $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$. Sums of features
+    and of their products about any centre therefore follow from sums about another. About the mean they merge without
+    cancellation; about zero or the noise-free cost they give the other baselines.
 
     Attributes:
         costs: moments of $\bar f$; its mean is the centre.
@@ -122,7 +122,7 @@ class ScoreMoments(Summary):
         return cls(summary, features.sum(axis=1), second)
 
     def about(self, centre: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
-        """Give the sums of the features, and of their products, about another centre than the mean."""
+        """Return the sums of the features, and of their products, about another centre than the mean."""
         return self._moved(self.costs.above(centre))
 
     def merge(self, other: "ScoreMoments") -> "ScoreMoments":
@@ -136,7 +136,7 @@ class ScoreMoments(Summary):
 
 
 def as_real(count: Int[Array, "*batch"], like: Float[Array, "..."]) -> Float[Array, "*batch"]:
-    """Give a count the type of what it is reckoned with: a quotient of integers would be of double precision."""
+    """Return a count as a float of the type of `like`; a quotient of integers would have double precision."""
     return count.astype(like.dtype)
 
 

@@ -1,4 +1,4 @@
-r"""REINFORCE with reward-to-go: an action answers only for what comes after it."""
+r"""REINFORCE with reward-to-go: an action answers only for the costs after it."""
 
 import jax
 import jax.numpy as jnp
@@ -18,23 +18,23 @@ def reinforce(
     num_samples: int,
     baseline: str = "leave_one_out",
 ) -> GradientEstimate:
-    r"""Estimate the gradient by the policy gradient theorem, an estimator for `optimise`.
+    r"""Estimate the gradient by the policy gradient theorem.
 
-    With $c_{it}$ the cost charged at step $t$ of rollout $i$ and $w_{it}$ the noise of its action,
+    With the cost $c_{it}$ charged at step $t$ of rollout $i$ and the noise $w_{it}$ of its action,
 
     $$\hat g = \mathrm{mean}_i \sum_t \Big(\frac{\partial \pi_\theta(x_{it})}{\partial\theta}\Big)^{\!\top}
       \frac{w_{it}}{\sigma^2} \Big(\sum_{t' \ge t} c_{it'} - b_{it}\Big).$$
 
-    What was charged before step $t$ does not depend on $w_{it}$ and so adds nothing but variance: `zeroth_order` keeps
-    it, this leaves it out. The leave-one-out baseline $b_{it}$ is the mean cost to go of the other rollouts at the same
-    step, independent of rollout $i$: the estimate is unbiased with it and without. All rollouts are held in memory at
-    once, for the baseline of every step needs them all.
+    Costs charged before step $t$ do not depend on $w_{it}$ and add only variance: `zeroth_order` keeps them, this
+    estimator leaves them out. The leave-one-out baseline $b_{it}$ is the mean cost to go of the other rollouts at the
+    same step. It is independent of rollout $i$, so the estimate is unbiased with it and without. All rollouts are in
+    memory at once, because the baseline of every step needs them all.
 
-    The standard error is from the spread of the samples. The baseline makes them dependent, which it does not see; that
-    is a share of order 1 / `num_samples` of the variance.
+    The standard error is from the spread of the samples. It ignores their dependence through the baseline, a share of
+    order 1 / `num_samples` of the variance.
 
     Args:
-        objective: from `open_loop` or `closed_loop`, on a task that gives `step_costs`.
+        objective: an objective from `open_loop` or `closed_loop`, on a task that gives `step_costs`.
         params: the point $\theta$, a vector or a pytree as in `first_order`.
         key: consumed here.
         num_samples: rollouts to spend. At least 2.
@@ -70,7 +70,7 @@ def reinforce(
     is_used = jnp.isfinite(outcomes.cost) & jnp.isfinite(to_go).all(axis=1)
     count = is_used.sum()
     if baseline == "leave_one_out":
-        # n/(n-1) (C - mean of all) is C less the mean of the others.
+        # n/(n-1) (C - mean of all) is C minus the mean of the others.
         mean = jnp.where(is_used[:, None], to_go, 0).sum(axis=0) / jnp.maximum(count, 1)
         to_go = (to_go - mean) * (as_real(count, to_go) / as_real(jnp.maximum(count - 1, 1), to_go))
     weighted = actions / objective.stddev**2 * to_go[:, :, None]
@@ -85,14 +85,14 @@ def reinforce(
         Moments.of(outcomes.cost, is_used),
         plan,
         count=gradients.count,
-        # Noise that is zero has no score, so what is used was moved by it.
+        # Zero noise has no finite score, so every sample that is used was moved by its noise.
         num_felt=(~is_used).sum(),
         restore=restore,
     )
 
 
 def _costs_to_go(step_costs: Float[Array, "num_samples steps"], horizon: int) -> Float[Array, "num_samples horizon"]:
-    """Sum what is charged from each step on; what comes after the last action is in all of them."""
+    """Return the sum of the costs from each step on; costs after the last action are in all of them."""
     return jnp.cumsum(step_costs[:, ::-1], axis=1)[:, ::-1][:, :horizon]
 
 

@@ -1,7 +1,7 @@
-r"""How to weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
+r"""Rules that weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
-A rule is a function from `Evidence` to `Weights`, both of plain numbers; any callable will do in `alpha_order(...,
-rule=)`, and in `per_step`, which maps it over steps and actions. $\delta$ is the chance to *fail* everywhere.
+A rule is a function from `Evidence` to `Weights`, both of plain numbers. `alpha_order(..., rule=)` takes any callable, and
+`per_step` maps it over steps and actions. $\delta$ is everywhere the probability of *failure*.
 """
 
 from collections.abc import Callable
@@ -18,23 +18,23 @@ from mjxgrad.estimators.estimate import Reason
 
 
 class Evidence(eqx.Module):
-    """What a rule may look at: norms and variances of one block of coordinates, and what concerns all of them.
+    """The input of a rule: norms and variances of one block of coordinates, and facts about all coordinates.
 
     Attributes:
-        count: samples (pairs of them where starts are random) behind the means.
-        dim: coordinates in the block.
-        first_norm: of the mean derivative.
-        zeroth_norm: of the unbiased mean.
-        difference_norm: of the difference of both.
+        count: number of samples behind the means, or of pairs where starts are random.
+        dim: number of coordinates in the block.
+        first_norm: norm of the mean derivative.
+        zeroth_norm: norm of the mean of the unbiased terms.
+        difference_norm: norm of the difference between the two means.
         first_variance: trace of the covariance of one sample's derivative.
-        zeroth_variance: of one sample's unbiased term.
-        difference_variance: of one sample's difference; both parts come from the same rollouts.
+        zeroth_variance: trace of the covariance of one sample's unbiased term.
+        difference_variance: trace of the covariance of one sample's difference; both parts share their rollouts.
         inconsistency: share of the squared secants of the cost that derivatives do not explain, from zero.
-        relative_bias_bound: standard deviation of the cost that derivatives miss over that of the cost that their mean
-            explains; a bound on the bias of the first order relative to its norm (see `consistency`).
-        cost_variance: of the cost.
-        scaled_first_variance: trace of the covariance of derivatives by noise in standard deviations.
-        scaled_first_norm: of their mean.
+        relative_bias_bound: bound on the bias of the first order relative to its norm (see `consistency`): the standard
+            deviation of the cost that derivatives miss, over that of the cost that their mean explains.
+        cost_variance: variance of the cost.
+        scaled_first_variance: trace of the covariance of derivatives by the noise in its standard deviations.
+        scaled_first_norm: norm of the mean of these derivatives.
     """
 
     count: Int[Array, "*blocks"]
@@ -56,15 +56,18 @@ class Evidence(eqx.Module):
         return self.count.astype(self.first_norm.dtype)
 
     def least_variance(self) -> Float[Array, "*blocks"]:
-        """Give the weights of inverse variance, V⁰/(V⁰ + V¹); 1 where both are zero."""
+        """Return the inverse-variance weight of the first order, V⁰/(V⁰ + V¹); 1 where both are zero."""
         total = self.first_variance + self.zeroth_variance
         return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
 
 
 class Weights(eqx.Module):
-    """What a rule decides: the weight of the first-order part, from 0 to 1, and why.
+    """The decision of a rule.
 
-    `bias_bound` is on the norm of the bias, NaN where the rule knows none.
+    Attributes:
+        alpha: weight of the first-order part, from 0 to 1.
+        reason: an item of `Reason`.
+        bias_bound: upper bound on the norm of the bias, NaN where the rule knows none.
     """
 
     alpha: Float[Array, "*blocks"]
@@ -76,7 +79,7 @@ Rule = Callable[[Evidence], Weights]
 
 
 class FixedAlpha(eqx.Module):
-    """The same weight always, from 0 to 1."""
+    """A fixed weight, from 0 to 1."""
 
     alpha: ArrayLike
 
@@ -91,7 +94,7 @@ class FixedAlpha(eqx.Module):
 
 
 class InverseVariance(eqx.Module):
-    r"""$\alpha = V^0/(V^0 + V^1)$, which has the least variance if both parts are independent, and no eye for bias."""
+    r"""$\alpha = V^0/(V^0 + V^1)$: least variance if both parts are independent, blind to bias."""
 
     def __call__(self, evidence: Evidence) -> Weights:
         alpha = evidence.least_variance()
@@ -101,16 +104,16 @@ class InverseVariance(eqx.Module):
 class BiasConstrained(eqx.Module):
     r"""Least variance as far as a bound on the bias allows.
 
-    $B = \|g^1 - g^0\|$ is the bias up to the error of $g^0$, which is at most $\varepsilon$ but for a chance of
-    $\delta$. Then $\alpha = 0$ if $\varepsilon > \gamma$; inverse variance if that keeps $\alpha B \le \gamma -
-    \varepsilon$; else $\alpha = (\gamma - \varepsilon)/B$.
+    $B = \|g^1 - g^0\|$ is the bias up to the error of $g^0$. This error exceeds $\varepsilon$ with probability $\delta$ at
+    most. Then $\alpha = 0$ if $\varepsilon > \gamma$; inverse variance if $\alpha B \le \gamma - \varepsilon$ holds for
+    it; else $\alpha = (\gamma - \varepsilon)/B$.
 
     Attributes:
-        gamma: the bias that is allowed, a norm.
+        gamma: the allowed norm of the bias.
         bound: $L$, a bound on the norm of one zeroth-order term, for Bernstein's inequality as in the paper. None takes
-            an empirical bound that needs none: Student's quantile times the standard error of the whole vector. For a
-            mean near a normal distribution that is on the safe side whatever the covariance is, since among Gaussian
-            quadratic forms of equal mean the one of a single coordinate has the heaviest tail.
+            an empirical bound instead: Student's quantile times the standard error of the whole vector. For a nearly
+            normal mean it is safe for every covariance: among Gaussian quadratic forms of equal mean, that of a single
+            coordinate has the heaviest tail.
         failure_probability: $\delta$, at most 0.2 for the empirical bound.
 
     References:
@@ -138,7 +141,7 @@ class BiasConstrained(eqx.Module):
         return Weights(alpha, reason, alpha * (found + error))
 
     def zeroth_error(self, evidence: Evidence) -> Float[Array, ""]:
-        """Give ε, which the error of the unbiased part exceeds with chance δ at most."""
+        """Return ε; the error of the unbiased part exceeds it with probability δ at most."""
         if self.bound is None:
             return confidence_radius(evidence.zeroth_variance, evidence.count, self.failure_probability)
         rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.real_count
@@ -148,8 +151,8 @@ class BiasConstrained(eqx.Module):
 class Concavity(eqx.Module):
     r"""Inverse variance if $V^1 + \varepsilon \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
 
-    A smooth cost satisfies it with $c = 0$ on average (a Poincaré inequality one order up); one that jumps has too much
-    variance for its derivatives.
+    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
+    too much variance for its derivatives.
 
     Attributes:
         slack: $c$.
@@ -173,23 +176,25 @@ class Concavity(eqx.Module):
 class Consistent(eqx.Module):
     r"""First order where the derivatives explain the costs, weighed by least error; the default.
 
-    Two questions, the sharper first. Do the derivatives of the samples explain the differences of their costs (see
-    `consistency`)? If a share of more than `threshold` remains, $\alpha = 0$. If so, is the difference of both parts
-    larger than its own noise, $\|g^1 - g^0\| > \varepsilon$ with chance of failure $\delta$? The excess
-    $\|g^1 - g^0\|^2 - \varepsilon^2$ joins the variance of the first order,
-    $\alpha = V^0/(V^0 + V^1 + n\,\text{excess})$, the weight of least mean squared error.
+    The rule asks two questions, the sharper one first:
 
-    The first sees jumps with few samples and in many dimensions, where the second knows nothing; the second sees small
-    biases with many. Neither has a constant with a unit.
+    - Do the derivatives of the samples explain the differences of their costs (see `consistency`)? If a share of more
+      than `threshold` remains unexplained, $\alpha = 0$.
+    - Does the difference of both parts exceed its own noise, $\|g^1 - g^0\| > \varepsilon$ with failure probability
+      $\delta$? The excess $\|g^1 - g^0\|^2 - \varepsilon^2$ is added to the variance of the first order:
+      $\alpha = V^0/(V^0 + V^1 + n\,\text{excess})$, the weight of least mean squared error.
+
+    The first question finds jumps with few samples and in many dimensions. The second finds small biases with many
+    samples. Neither needs a constant with a unit.
 
     Attributes:
-        threshold: share of the squared secants that may remain unexplained. A bias is then at most its root times
-            $\mathrm{sd}(f)/\sigma$.
+        threshold: share of the squared secants that may remain unexplained. The bias is then at most the root of this
+            share times $\mathrm{sd}(f)/\sigma$.
         failure_probability: $\delta$, at most 0.2.
 
     References:
-        Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal
-        of the American Statistical Association 86, 1991 (weights from the squared difference).
+        Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators.
+        Journal of the American Statistical Association 86, 1991 (weights from the squared difference).
     """
 
     threshold: float = eqx.field(static=True, default=0.1)
@@ -211,7 +216,7 @@ class Consistent(eqx.Module):
         return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
 
 
-# Beyond, a single coordinate is not the worst case among Gaussian quadratic forms.
+# Above this, a single coordinate is not the worst case among Gaussian quadratic forms.
 _MOST_FAILURES = 0.2
 _LONGEST_TABLE = 1000
 
@@ -219,11 +224,12 @@ _LONGEST_TABLE = 1000
 def confidence_radius(
     variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
 ) -> Float[Array, ""]:
-    """Give what the norm of a mean's error exceeds with at most some chance, up to 0.2; see `BiasConstrained.bound`.
+    """Return a radius that the norm of a mean's error exceeds with the given probability, at most 0.2.
 
-    The variance is the trace of the covariance of one sample; fewer than two samples give infinity.
+    The variance is the trace of the covariance of one sample. Fewer than two samples give infinity. See
+    `BiasConstrained.bound`.
     """
-    # JAX has no quantile of Student's t; a table on the host has, and beyond it is constant to three digits.
+    # JAX has no quantile of Student's t, so it comes from a table; beyond the table it is constant to three digits.
     freedom = np.arange(1, _LONGEST_TABLE)
     quantiles = np.concatenate([[np.inf, np.inf], stats.t.isf(failure_probability / 2, freedom)])
     quantile = jnp.asarray(quantiles, variance.dtype)[jnp.clip(count, 0, _LONGEST_TABLE)]

@@ -1,8 +1,7 @@
 """Rollouts under noise, in chunks, with memory independent of their number.
 
-A rollout is differentiated by the parameters or, for estimators that compare derivatives with costs, by its noise. The
-second is not the first in general: by few parameters a long rollout is differentiated in forward mode, which by the noise
-of all its actions it cannot be.
+A rollout is differentiated by the parameters, or by its noise for estimators that compare derivatives with costs. Both ways
+are needed: a long rollout with few parameters is differentiated in forward mode, which the noise of all its actions forbids.
 """
 
 import dataclasses
@@ -21,30 +20,30 @@ from mjxgrad.estimators.moments import Summary
 from mjxgrad.objective import Differentiated, Objective
 from mjxgrad.objective.base import unchanged, value_and_gradient
 
-# Wide enough to fill a CPU's vector units and hide loop overhead, narrow enough that a chunk of
-# checkpointed rollouts of a small scene stays within tens of megabytes.
+# Wide enough to fill a CPU's vector units and to hide loop overhead; narrow enough that a chunk of checkpointed rollouts
+# of a small scene takes no more than tens of megabytes.
 DEFAULT_CHUNK_SIZE = 512
 
-# All pairs of a group are compared: larger ones cost more for each sample, smaller ones leave out more of what is known.
+# All pairs of a group are compared: larger groups cost more per sample, smaller groups use less of the evidence.
 GROUP_SIZE = 64
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Which rollouts an estimator asks for.
+    """The rollouts that an estimator asks for.
 
-    A unit is what is independent of the others: one sample, or a pair of them.
+    A unit is one sample or one pair of samples, independent of all other units.
 
     Attributes:
-        num_samples: rollouts with noise.
+        num_samples: number of rollouts with noise.
         chunk_size: rollouts at a time, or None for the default.
         antithetic: whether every noise is used with its mirror image.
         with_gradient: whether the cost is differentiated by the parameters.
         with_score: whether the score by the parameters is wanted.
         by_noise: whether derivative and score are by the noise instead.
-        with_zero_noise: whether one more rollout goes without noise.
-        shares_start: whether samples come in pairs that differ in their noise alone, not in a random start.
-        with_silence: whether each unit has one more rollout, without noise, from its own random start.
+        with_zero_noise: whether there is one more rollout without noise.
+        shares_start: whether samples come in pairs that share a random start and differ only in their noise.
+        zero_noise_per_unit: whether each unit has one more rollout, without noise, from its own random start.
     """
 
     num_samples: int
@@ -55,7 +54,7 @@ class Plan:
     by_noise: bool = False
     with_zero_noise: bool = False
     shares_start: bool = False
-    with_silence: bool = False
+    zero_noise_per_unit: bool = False
 
     def __post_init__(self):
         pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
@@ -70,21 +69,21 @@ class Plan:
 
     @property
     def rollouts_per_unit(self) -> int:
-        """Give 2 for pairs, else 1."""
+        """2 for pairs, else 1."""
         return 2 if self.antithetic or self.shares_start else 1
 
     @property
     def num_units(self) -> int:
-        """Give the number of independent samples or pairs."""
+        """Number of independent samples or pairs."""
         return self.num_samples // self.rollouts_per_unit
 
     @property
     def num_rollouts(self) -> int:
-        """Give the number of rollouts, those without noise included."""
-        return self.num_samples + self.with_zero_noise + self.with_silence * self.num_units
+        """Number of rollouts, including those without noise."""
+        return self.num_samples + self.with_zero_noise + self.zero_noise_per_unit * self.num_units
 
     def chunks(self) -> tuple[int, int]:
-        """Give the number of chunks and the units in each, as even as they can be."""
+        """Return the number of chunks and the largest number of units in one, as even as possible."""
         units = self.num_units + self.with_zero_noise
         most = max(1, (self.chunk_size or DEFAULT_CHUNK_SIZE) // self.rollouts_per_unit)
         num_chunks = -(-units // most)
@@ -94,7 +93,7 @@ class Plan:
 def plan_for_baseline(
     objective: Objective, num_samples: int, chunk_size: int | None, antithetic: bool, baseline: str, **wanted: bool
 ) -> Plan:
-    """Plan rollouts with the ones without noise that a baseline needs."""
+    """Return a plan with the rollouts without noise that a baseline needs."""
     check_baseline(baseline)
     is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
     return Plan(
@@ -103,19 +102,19 @@ def plan_for_baseline(
         antithetic,
         with_score=True,
         with_zero_noise=is_needed and not has_own,
-        with_silence=is_needed and has_own,
+        zero_noise_per_unit=is_needed and has_own,
         **wanted,
     )
 
 
 def check_baseline(baseline: str, choices: tuple[str, ...] = ("leave_one_out", "zero_noise", "none")) -> None:
-    """Refuse a baseline that does not exist."""
+    """Raise a ValueError for an unknown baseline."""
     if baseline not in choices:
         raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")
 
 
 def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None) -> Plan:
-    """Plan rollouts that are differentiated by their noise, in pairs that share a start where starts are random."""
+    """Return a plan of rollouts differentiated by their noise; with random starts, in pairs that share a start."""
     if chunk_size is not None and chunk_size < 4:
         raise ValueError(f"chunk_size must be at least 4, got {chunk_size}: samples of a chunk are compared")
     if type(objective).differentiate is Objective.differentiate:
@@ -130,15 +129,15 @@ class Samples(eqx.Module):
     """Rollouts, by unit and by rollout within the unit.
 
     Attributes:
-        costs: one per rollout.
-        gradients: of the cost, by the parameters or by the noise; zero if not asked for.
-        scores: of the noise, likewise.
-        stddevs: of the noise; NaN where derivatives are by the parameters.
-        pull_backs: from components of the noise to parameters.
-        is_noisy: False for units that fill up the last chunk and for the one without noise.
-        is_noise_free: True for the one without noise.
-        silent_costs: of the rollout without noise of each unit; zero if there is none.
-        is_quiet: whether the noise of the unit, not being zero, made no difference within it and to no derivative.
+        costs: cost of each rollout.
+        gradients: derivatives of the cost by the parameters or by the noise; zero if not asked for.
+        scores: scores by the parameters or by the noise; zero if not asked for.
+        stddevs: standard deviations of the noise; NaN where derivatives are by the parameters.
+        pull_backs: linear maps from components of the noise to parameters.
+        is_noisy: False for units that pad the last chunk and for the unit without noise.
+        is_noise_free: True for the unit without noise.
+        zero_noise_costs: cost of each unit's own rollout without noise; zero if there is none.
+        has_no_effect: whether noise that is not zero changed no cost within the unit and all derivatives are zero.
     """
 
     costs: Float[Array, "units rollouts"]
@@ -148,24 +147,25 @@ class Samples(eqx.Module):
     pull_backs: Partial
     is_noisy: Bool[Array, " units"]
     is_noise_free: Bool[Array, " units"]
-    silent_costs: Float[Array, " units"]
-    is_quiet: Bool[Array, " units"]
+    zero_noise_costs: Float[Array, " units"]
+    has_no_effect: Bool[Array, " units"]
 
     def first_order_mask(self) -> Bool[Array, " units"]:
-        """Pick the units that a first-order estimate can use."""
+        """Return which units a first-order estimate can use."""
         return self.is_noisy & _all_finite(self.costs) & _all_finite(self.gradients)
 
     def zeroth_order_mask(self) -> Bool[Array, " units"]:
-        """Pick the units that a zeroth-order estimate can use: gradients do not matter to it."""
-        return self.is_noisy & _all_finite(self.costs) & _all_finite(self.scores) & jnp.isfinite(self.silent_costs)
+        """Return which units a zeroth-order estimate can use, whatever their gradients."""
+        is_finite = _all_finite(self.costs) & _all_finite(self.scores) & jnp.isfinite(self.zero_noise_costs)
+        return self.is_noisy & is_finite
 
     def noise_free_cost(self) -> Float[Array, ""]:
-        """Give the cost without noise if it is among these, else zero."""
+        """Return the cost without noise if it is in this chunk, else zero."""
         return jnp.where(self.is_noise_free, self.costs[:, 0], 0).sum()
 
     def num_felt(self) -> Int[Array, ""]:
-        """Count the units of the plan that are not quiet."""
-        return (self.is_noisy & ~self.is_quiet).sum()
+        """Return the number of units whose noise made a difference, or cannot tell."""
+        return (self.is_noisy & ~self.has_no_effect).sum()
 
 
 def sample(
@@ -173,8 +173,8 @@ def sample(
 ) -> Samples:
     """Roll out some units of a plan under one `jax.vmap`.
 
-    The noise of unit i comes from `fold_in(key, i)`, so it is the same in whatever chunk. The index `plan.num_units` is
-    the rollout without noise, which rides in the batch so that the rollout is compiled only once.
+    The noise of unit i comes from `fold_in(key, i)`, so it does not depend on the chunk. The index `plan.num_units` is
+    the rollout without noise. It is part of the batch so that the rollout is compiled only once.
     """
     one_key(key)
     is_noise_free = (units == plan.num_units) & plan.with_zero_noise
@@ -183,12 +183,12 @@ def sample(
         noise = objective.sample_noise(jax.random.fold_in(key, unit))
         if plan.with_zero_noise:
             noise = jax.tree.map(lambda free, noisy: jnp.where(is_free, free, noisy), objective.zero_noise(), noise)
-        silence = objective.silence(noise)
+        zero_noise = objective.silence(noise)
         images = [noise, objective.mirror(noise)] if plan.antithetic else [noise]
         if plan.shares_start:
             images.append(objective.redraw(noise, jax.random.fold_in(key, plan.num_units + unit)))
-        # Among the others, so that the rollout is compiled once.
-        return [*images, silence] if plan.with_silence else images, _differ(noise, silence)
+        # In the same batch, so that the rollout is compiled once.
+        return [*images, zero_noise] if plan.zero_noise_per_unit else images, _differ(noise, zero_noise)
 
     def in_order(*members: Array) -> Array:
         # Not -1: the state of a scene without activations has an axis of length zero.
@@ -200,9 +200,9 @@ def sample(
     found = jax.tree.map(lambda leaf: leaf.reshape(len(units), len(images), *leaf.shape[1:]), flat)
     is_same = (found.cost == found.cost[:, :1]).all(axis=1) & _all_finite(found.cost)
     is_flat = (found.gradient_by_noise == 0).all(axis=(1, 2))
-    silent_costs = jnp.zeros_like(found.cost[:, 0])
-    if plan.with_silence:
-        silent_costs = found.cost[:, -1]
+    zero_noise_costs = jnp.zeros_like(found.cost[:, 0])
+    if plan.zero_noise_per_unit:
+        zero_noise_costs = found.cost[:, -1]
         found = jax.tree.map(lambda leaf: leaf[:, :-1], found)
     return Samples(
         found.cost,
@@ -212,7 +212,7 @@ def sample(
         found.pull_back,
         units < plan.num_units,
         is_noise_free,
-        silent_costs,
+        zero_noise_costs,
         is_moved & is_same & is_flat,
     )
 
@@ -224,7 +224,7 @@ def stream(
     plan: Plan,
     summarise: Callable[[Samples], tuple[Summary, ...]],
 ) -> tuple[Any, ...]:
-    """Roll out a plan chunk by chunk, and merge what is kept of each."""
+    """Roll out a plan chunk by chunk, and return the merged summaries."""
     num_chunks, size = plan.chunks()
     total = plan.num_units + plan.with_zero_noise
     fewest, num_larger = divmod(total, num_chunks)
@@ -235,7 +235,7 @@ def stream(
         chunk, start, kept = carry
         end = start + fewest + (chunk < num_larger)
         units = start + jnp.arange(size)
-        # What fills up the chunk is no unit of the plan, and not the rollout without noise either.
+        # The padding of a chunk is no unit of the plan, nor the rollout without noise.
         new_ones = summarise(sampled(jnp.where(units < end, units, total)))
         return (chunk + 1, end, tuple(old.merge(new) for old, new in zip(kept, new_ones, strict=True))), None
 
@@ -246,10 +246,21 @@ def stream(
 
 
 class Group(eqx.Module):
-    """Samples by noise that are compared with each other; where starts are random, samples 2i and 2i + 1 begin alike.
+    """Samples differentiated by noise that are compared with each other.
 
-    What is not finite, or none of the plan, is zero here, and the masks say so. Costs are about `centre`, their mean;
-    `rounding` is the size that they had. `per_unit` is 2 where pairs share a start, else 1.
+    Values that are not finite, or pad a chunk, are zero and masked. With random starts samples 2i and 2i + 1 share one.
+
+    Attributes:
+        costs: costs minus `centre`.
+        derivatives: derivatives of the cost by the noise.
+        noise: noise of each sample.
+        scores: scores of the noise.
+        has_cost: whether a sample has a finite cost.
+        has_derivative: whether a sample has a finite cost and derivative.
+        stddev: standard deviation of each component of the noise.
+        centre: mean cost.
+        rounding: largest magnitude of a cost, the scale of its rounding.
+        per_unit: 2 where pairs share a start, else 1.
     """
 
     costs: Float[Array, "*groups samples"]
@@ -273,7 +284,7 @@ class Group(eqx.Module):
         has_derivative = has_cost & jnp.isfinite(gradients).all(axis=1)
         stddev = samples.stddevs[0, 0]
         costs = jnp.where(has_cost, raw, 0)
-        # About one of the costs first: a mean of large costs is not exact enough to take off.
+        # Taken about one of the costs first: a mean of large costs is too inexact to subtract.
         origin = costs[jnp.argmax(has_cost)]
         offset = jnp.where(has_cost, costs - origin, 0).sum() / jnp.maximum(has_cost.sum(), 1).astype(costs.dtype)
         return cls(
@@ -290,7 +301,7 @@ class Group(eqx.Module):
         )
 
     def same_start(self) -> Bool[Array, "samples samples"]:
-        """Say which samples differ in nothing but their noise."""
+        """Return which pairs of samples differ only in their noise."""
         count = len(self.costs)
         if self.per_unit == 1:
             return jnp.ones((count, count), bool)
@@ -298,21 +309,21 @@ class Group(eqx.Module):
         return unit[:, None] == unit[None, :]
 
     def by_unit(self, values: Float[Array, "samples *shape"]) -> Float[Array, "units *shape"]:
-        """Give the mean over each unit."""
+        """Return the mean over each unit."""
         return values.reshape(-1, self.per_unit, *values.shape[1:]).mean(axis=1)
 
     def complete(self, mask: Bool[Array, " samples"]) -> Bool[Array, " units"]:
-        """Say which units have all their samples in a mask."""
+        """Return which units have all their samples in a mask."""
         return mask.reshape(-1, self.per_unit).all(axis=1)
 
     def pull_back(self, samples: Samples, by_noise: Float[Array, "samples m"]) -> Float[Array, "samples dim"]:
-        """Take each sample's components of the noise to the parameters; zero where there is no sample."""
+        """Return each sample's components of the noise, pulled back to the parameters; zero where there is no sample."""
         pull_backs = jax.tree.map(lambda leaf: leaf.reshape(len(by_noise), *leaf.shape[2:]), samples.pull_backs)
         by_params = jax.vmap(lambda pull, vector: pull(vector))(pull_backs, by_noise)
         return jnp.where(self.has_cost[:, None], by_params, 0)
 
     def split(self) -> "Group":
-        """Split a chunk into groups, as even as they can be, with an axis of groups; samples that fill up have no cost."""
+        """Return a chunk split into groups as even as possible, on a first axis; padding has no cost."""
         count, unit = len(self.costs), self.per_unit
         num_groups = -(-count // GROUP_SIZE)
         size = unit * -(-count // (num_groups * unit))
@@ -329,7 +340,7 @@ class Group(eqx.Module):
 
 
 def _by_parameters(objective: Objective, plan: Plan, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
-    """Roll out once for all that is wanted of it; what is not is zero."""
+    """Roll out once for the score and the derivative by the parameters; what the plan does not ask for is zero."""
     nothing = jnp.zeros_like(params)
 
     def cost_and_score(at: Float[Array, " dim"]) -> tuple[Float[Array, ""], Array]:
@@ -343,7 +354,7 @@ def _by_parameters(objective: Objective, plan: Plan, params: Float[Array, " dim"
 
 
 def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
-    """Say whether two draws of noise differ in any real number."""
+    """Return whether two draws of noise differ in any floating-point number."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     differences = [(x != y).any() for x, y in pairs if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.zeros((), bool), *differences]).any()

@@ -4,11 +4,11 @@ With noise $w_j$, score $s_j$, cost $f_j$ and a vector $a$ that does not depend 
 
 $$\mathbb{E}[(f_j - \beta\, a\cdot w_j - b)\, s_j + \beta\, P_j^\top a] = \nabla F$$
 
-for every $\beta$ and $b$ that do not depend on $w_j$ either, whatever $a$ is: $(a\cdot w_j)s_j$ has the mean of
-$P_j^\top a$, where $P_j^\top$ is the pull-back from the noise to the parameters. With $a$ the mean derivative of the other
-samples the linear part of the cost, which makes most of the noise of a zeroth-order estimate, is gone; where derivatives
-are wrong $\beta$ is near zero and what remains is the zeroth-order estimate itself. All of $a$, $\beta$ and $b$ leave
-sample j out, so nothing is lost to splitting.
+for all $a$, $\beta$ and $b$ that do not depend on $w_j$. The reason: $(a\cdot w_j)s_j$ and $P_j^\top a$ have the same mean,
+where $P_j^\top$ is the pull-back from the noise to the parameters. Here $a$ is the mean derivative of the other samples. It
+removes the linear part of the cost, the source of most of the noise of a zeroth-order estimate. Where derivatives are wrong,
+$\beta$ is near zero and the zeroth-order estimate remains. $a$, $\beta$ and $b$ all leave sample j out, so no samples are
+set aside.
 """
 
 import equinox as eqx
@@ -20,9 +20,12 @@ from mjxgrad.estimators.samples import Group
 
 
 class UnbiasedTerms(eqx.Module):
-    r"""One term per sample, before the pull-back, whose mean is the estimate; the share $\beta$ of each.
+    r"""The terms of a group, whose mean after the pull-back is the estimate.
 
-    The variance is that of the linear part $a\cdot w$ over the samples.
+    Attributes:
+        by_noise: term of each sample before the pull-back.
+        beta: share $\beta$ of each sample.
+        linear_variance: variance of the linear part $a\cdot w$ over the samples.
     """
 
     by_noise: Float[Array, "samples m"]
@@ -31,14 +34,14 @@ class UnbiasedTerms(eqx.Module):
 
 
 def gram(samples: Group) -> Float[Array, "samples samples"]:
-    """Give the slope of sample i along the noise of sample k, from which all comparisons follow."""
+    """Return the slope of sample i along the noise of sample k, from which all comparisons follow."""
     return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
 
 
 def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, with_derivatives: bool) -> UnbiasedTerms:
-    """Give the terms of a group, without derivatives those of the zeroth-order estimate.
+    """Return the terms of a group; without derivatives, the terms of the zeroth-order estimate.
 
-    Those of samples without a cost are zero or meaningless, and masked by their pull-back.
+    Terms of samples without a cost are meaningless; the pull-back masks them.
     """
     costs, has_cost = samples.costs, samples.has_cost.astype(samples.costs.dtype)
     has_slope = samples.has_derivative.astype(costs.dtype)
@@ -55,7 +58,7 @@ def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, w
     rest = costs[None, :] - beta[:, None] * along
     baseline = (others * rest).sum(axis=1) / num_others
     if samples.per_unit == 2:
-        baseline += _partners_surplus(samples, rest - baseline[:, None], others)
+        baseline += _partner_prediction(samples, rest - baseline[:, None], others)
     residual = jnp.diagonal(rest) - baseline
     total = samples.derivatives.sum(axis=0)[None, :]
     without = (total - samples.derivatives) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
@@ -68,8 +71,8 @@ def _fitted_share(
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
-    The share that minimises the variance of the remaining costs also minimises, up to their fourth moments, that of the
-    estimate: its variance is that of the costs times that of the score.
+    Up to fourth moments, the variance of the estimate is the variance of the remaining costs times that of the score. The
+    share therefore minimises both.
     """
     has_slope = samples.has_derivative.astype(slopes.dtype)
     count = has_slope.sum() - has_slope[:, None] - has_slope[None, :]
@@ -77,7 +80,7 @@ def _fitted_share(
     weights = others * (count >= 1)
 
     def centred(values: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
-        if samples.per_unit == 2:  # what the start does to the costs is not the noise's doing
+        if samples.per_unit == 2:  # the difference within a pair is free of the effect of the start
             return pairs * (values - _partner(values)) / jnp.sqrt(2.0)
         mean = (weights * values).sum(axis=1) / jnp.maximum(weights.sum(axis=1), 1)
         return weights * (values - mean[:, None])
@@ -92,18 +95,19 @@ def _fitted_share(
     return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
 
 
-def _partners_surplus(
+def _partner_prediction(
     samples: Group, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
 ) -> Float[Array, " samples"]:
-    """Give what the cost of the other sample from the same start tells about this one's, beyond the mean of all.
+    """Return the best linear prediction of each remaining cost from its partner's, relative to the mean.
 
-    The best linear guess: its distance from the mean times the correlation within pairs, which is taken from the other
-    pairs. Where starts make most of the spread it is near one, and the baseline is the partner's cost.
+    The partner is the other sample from the same start. The prediction is its distance from the mean times the
+    correlation within the other pairs. Where starts cause most of the spread, the correlation is near one and the
+    baseline is the partner's cost.
     """
     both = others * _partner(others)
-    together = (both * rest * _partner(rest)).sum(axis=1)
-    alone = (both * rest**2).sum(axis=1)
-    correlation = jnp.where(alone > 0, jnp.clip(together / jnp.where(alone > 0, alone, 1), 0, 1), 0)
+    covariance = (both * rest * _partner(rest)).sum(axis=1)
+    variance = (both * rest**2).sum(axis=1)
+    correlation = jnp.where(variance > 0, jnp.clip(covariance / jnp.where(variance > 0, variance, 1), 0, 1), 0)
     index = jnp.arange(len(rest))
     partner = index + 1 - 2 * (index % 2)
     has_partner = samples.has_cost[partner]
@@ -111,5 +115,5 @@ def _partners_surplus(
 
 
 def _partner(rows: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
-    """Swap the two samples of each start in every row."""
+    """Return the rows with the two samples of each start swapped."""
     return rows.reshape(len(rows), -1, 2)[:, :, ::-1].reshape(rows.shape)

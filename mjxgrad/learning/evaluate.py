@@ -1,4 +1,4 @@
-"""What a policy is worth, judged in C MuJoCo rather than in the simulator that it was trained in."""
+"""Evaluation of a policy in C MuJoCo rather than in the simulator that it was trained in."""
 
 from collections.abc import Callable
 
@@ -13,14 +13,14 @@ from mjxgrad.rollouts import Engine
 
 
 class Evaluation(eqx.Module):
-    """Some episodes without noise on the actions, each from a start of its own.
+    """Some episodes without noise on the actions, each from its own start.
 
     Attributes:
-        returns: sum of the rewards.
-        lengths: actions until the end.
+        returns: sum of the rewards of each episode.
+        lengths: number of actions until the end.
         terminated: whether an episode ended before its time.
-        qpos: positions at each action and after the last; from an end on they stay.
-        terms: of the reward by name, their means per step.
+        qpos: positions at each action and after the last; after the end of an episode they stay constant.
+        terms: terms of the reward by name, as means per step.
     """
 
     returns: Float[Array, "*episodes"]
@@ -41,12 +41,12 @@ def evaluate(
     """Run a policy for whole episodes.
 
     Args:
-        environment: its model as it is, without randomisation; `environment.refined(8)` for shorter time steps, where contact
-            lasts few of its own.
-        policy: from what is seen to an action.
-        key: for the starts; consumed here.
-        num_episodes: at least 1.
-        engine: "mujoco" for C MuJoCo and its own contact, "mjx" for the step that the environment has.
+        environment: the environment; its model is not randomised. Where contact lasts few time steps, take
+            `environment.refined(8)` for shorter ones.
+        policy: function from an observation to an action.
+        key: key of the starts; consumed here.
+        num_episodes: number of episodes, at least 1.
+        engine: "mujoco" for C MuJoCo and its own contact, "mjx" for the environment's own step.
 
     Raises:
         ValueError: if there are no episodes, or no such engine.
@@ -75,5 +75,5 @@ def evaluate(
 
     keys = jax.random.split(key, num_episodes)
     program = jax.jit(jax.vmap(one))
-    # What calls C MuJoCo is compiled in no time, and is not kept.
+    # A program that calls C MuJoCo compiles fast and cannot be cached.
     return program(keys) if engine == "mujoco" else compile_once(program.lower(keys))(keys)

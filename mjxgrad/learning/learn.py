@@ -1,15 +1,15 @@
-r"""Policies by short windows: SHAC, its α-order form, and the likelihood ratio, in one loop.
+r"""Policies learned from short windows: SHAC, its α-order form, and the likelihood ratio, in one loop.
 
-An update runs one window in every environment (see `window`), moves the policy along a mixture of both gradients, fits the
-value function to TD($\lambda$) targets, and lets the target value function follow. The rule that mixes is the only
-difference between methods:
+An update runs one window in every environment (see `window`) and moves the policy along a mixture of both gradients. It then
+fits the value function to TD($\lambda$) targets, and the target value function follows. The methods differ only in the
+mixing rule:
 
 | `rule` | method |
 |---|---|
 | `rules.FixedAlpha(1)` | first order: SHAC |
 | `rules.FixedAlpha(0)` | zeroth order: REINFORCE with a value function |
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
-| `rules.Consistent(failure_probability=1e-3)` | the same with an eye for bias: α-order, the default |
+| `rules.Consistent(failure_probability=1e-3)` | the same with a test for bias: α-order, the default |
 
 With the settings `apg()` there is no value function: analytic policy gradients (APG).
 
@@ -36,12 +36,12 @@ from mjxgrad.loop.run import Log, run, side_by_side
 
 
 class Learned(eqx.Module):
-    """What came of it.
+    """The result of `learn`.
 
     Attributes:
-        policy: to act by.
-        history: by name, one number per update; see `learn`.
-        learner: to go on from.
+        policy: the learned policy.
+        history: one number per update for each name; see `learn`.
+        learner: the state of the learner after the last update.
     """
 
     policy: Policy
@@ -61,34 +61,33 @@ def learn(
 ) -> Learned:
     """Learn a policy.
 
-    Its history has a number per update:
+    The history has one number per update for each of these names:
 
-    - `reward`, mean per step; `return`, mean of the episodes that ended, NaN without any;
-    - `alpha`, mean weight of first order; `gradient_norm`, by the parameters;
-    - `first_variance`, `zeroth_variance` of one environment's gradient by its actions; `squared_bias`, of the difference of
-      their means, less what noise explains, so that it may be negative;
-    - `ended`, share of windows in which an episode ended for good: no derivative sees across that;
-    - `not_finite`, share of first-order gradients that were not numbers; `shortened`, of those that were too large, see
-      `Settings.largest_sample`; `diverged`, steps without a meaningful next state;
-      `skipped`, 1 if the mixture was not finite and nothing was changed;
-    - `critic_loss`;
-    - `seconds`, of the clock for an update of all policies, without compilation.
+    - `reward`, mean per step; `return`, mean over the episodes that ended, NaN without any;
+    - `alpha`, mean weight of first order; `gradient_norm`, norm of the gradient by the parameters;
+    - `first_variance` and `zeroth_variance`, variances of one environment's gradient by its actions; `squared_bias`, squared
+      difference of their means minus the part that noise explains, which may be negative;
+    - `ended`, share of windows in which an episode ended for good: no derivative passes such an end;
+    - `not_finite`, share of first-order gradients that were not finite; `shortened`, share of those that were too large, see
+      `Settings.largest_sample`; `diverged`, number of steps without a meaningful next state;
+      `skipped`, 1 if the mixture was not finite and the policy was not changed;
+    - `critic_loss`, loss of the value function;
+    - `seconds`, wall-clock time of an update of all policies, without compilation.
 
     Args:
-        environment: to learn in; or several that differ in numbers alone, such as the stiffness of contact. All learn side by
-            side from the same keys, and what is returned gets a first axis for them.
-        key: consumed here; an array of several learns as many policies side by side, and what is returned gets an axis for them.
-        num_updates: in all, those before a checkpoint included.
-        settings: how; None are the defaults.
-        log: called after every `log_every` updates with their means: `to_csv("run.csv")`, or for a tracker
+        environment: the environment to learn in, or several that differ only in numbers, such as the stiffness of contact.
+            Several learn side by side from the same keys, and the result gets a first axis for them.
+        key: consumed here; an array of keys learns one policy per key side by side, and the result gets an axis for them.
+        num_updates: total number of updates, those before a checkpoint included.
+        settings: settings of the learner; None takes the defaults.
+        log: function called after every `log_every` updates with their means: `to_csv("run.csv")`, or for a tracker
             `lambda update, metrics: wandb.log(metrics, step=update)`.
-        log_every: updates in one program; between them are logs and checkpoints.
-        checkpoint: file to go on from if it is there, and to write after every `log_every` updates. The same settings, the same
-            environment in numbers and code, and the same key are needed; the result is that of an uninterrupted run to the bit,
-            but for `seconds`.
+        log_every: updates in one program; logs and checkpoints come between programs.
+        checkpoint: file to resume from if it exists, written after every `log_every` updates. Settings, key and environment
+            (numbers and code) must be the same. The result is that of an uninterrupted run to the bit, except for `seconds`.
 
     Raises:
-        ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is of another run.
+        ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is from another run.
     """
     settings = Settings() if settings is None else settings
     for name, number in (("num_updates", num_updates), ("log_every", log_every)):
@@ -119,12 +118,10 @@ def learn(
 
 
 def to_csv(path: str | os.PathLike[str]) -> Log:
-    """Return a `log` for `learn` and `mg.optimise` that writes a row per call, headed by the names of the first.
-
-    A file that is there is gone on with.
+    """Return a `log` for `learn` and `mg.optimise` that appends a row per call; a new file begins with the names.
 
     Raises:
-        ValueError: when called with other names than those in the file.
+        ValueError: when the log is called with other names than those in the file.
     """
     path = Path(path)
 
@@ -136,7 +133,7 @@ def to_csv(path: str | os.PathLike[str]) -> Log:
                 there = next(csv.reader(file))
             if there != names:
                 raise ValueError(
-                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}: name another"
+                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}; use another path"
                 )
         with path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)

@@ -1,6 +1,6 @@
-"""SHAC and its kin as a method of the loop: a window in every environment, a step of the policy, a fit of the value function.
+"""SHAC and its relatives as a method of the loop: windows in all environments, a policy step, a fit of the value function.
 
-Another learner is another file like this: a carry with all that an update needs, and a `Method` that begins it and updates it.
+Another learner is another file like this one: a carry with everything that an update needs, and a `Method` for it.
 """
 
 import dataclasses
@@ -23,11 +23,11 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 class Policy(eqx.Module):
-    """A learned policy: what it does for what it sees.
+    """A learned policy: a map from observations to actions.
 
     Attributes:
-        actor: from normalised observations to actions before their squashing.
-        normaliser: of observations.
+        actor: network from normalised observations to actions before squashing.
+        normaliser: normalisation of observations.
     """
 
     actor: Network
@@ -39,19 +39,19 @@ class Policy(eqx.Module):
 
 
 class Learner(eqx.Module):
-    """All that an update needs: to go on from a `Learner` is to have never stopped.
+    """The complete state between two updates.
 
     Attributes:
-        policy: with the moments of what it has seen.
+        policy: the policy, with the moments of its observations.
         critic: the value function.
-        target: that follows it, and is used in its place in targets and gradients.
-        actor_moments: of the optimiser.
-        critic_moments: likewise.
-        environments: where they are, one per copy.
-        model_keys: by which the copies' models differ.
-        episode_return: so far, of the episodes that run.
-        num_updates: done.
-        key: for what is drawn later.
+        target: the target value function, which follows the critic and replaces it in targets and gradients.
+        actor_moments: state of the policy's optimiser.
+        critic_moments: state of the value function's optimiser.
+        environments: state of each copy of the environment.
+        model_keys: key of each copy's randomised model.
+        episode_return: return so far of each running episode.
+        num_updates: number of updates done.
+        key: key of all later draws.
     """
 
     policy: Policy
@@ -67,12 +67,12 @@ class Learner(eqx.Module):
 
 
 class ActorCritic(Method):
-    """The method: its carry is a `Learner`, its step an update.
+    """The method of `learn`: its carry is a `Learner`, its step an update.
 
     Attributes:
-        environment: to learn in.
-        settings: how.
-        num_updates: in all, for what decreases from the first to the last.
+        environment: the environment to learn in.
+        settings: settings of the learner.
+        num_updates: total number of updates, for schedules from the first to the last.
     """
 
     environment: Environment
@@ -86,12 +86,12 @@ class ActorCritic(Method):
         model_keys = jax.random.split(model_key, count)
         environments = self._starts(model_keys, start_key)
         if not settings.is_episodic:
-            # Otherwise all episodes would end together, and an update see only one part of them.
+            # Otherwise all episodes would end together, and an update would see only one part of them.
             spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
             environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
         num_seen, num_actions = environments.obs.shape[-1], self.environment.num_actions
         actor = make_actor(num_seen, num_actions, settings.actor_layers, actor_key, settings.actor_scale)
-        # Without a value function it is one that is zero and stays so.
+        # No value function is a network that is zero and is never fitted.
         scale = 1.0 if settings.has_critic else 0.0
         critic = make_critic(num_seen, settings.critic_layers, critic_key, final_scale=scale)
         actor_optimiser, critic_optimiser = optimisers(settings, self.num_updates)
@@ -109,7 +109,7 @@ class ActorCritic(Method):
         )
 
     def step(self, carry: Learner, index: Int[Array, ""]) -> tuple[Learner, Metrics]:
-        """Do one update; what it finds is described in `learn`."""
+        """Do one update; its metrics are described in `learn`."""
         settings, learner, environments = self.settings, carry, carry.environments
         noise_key, start_key, critic_key, next_key = jax.random.split(learner.key, 4)
         first, last = settings.stddev
@@ -154,7 +154,7 @@ class ActorCritic(Method):
         return {"settings": repr(self.settings), "num_updates": self.num_updates, "environment": name}
 
     def _starts(self, model_keys: Key[Array, " environments"], key: PRNGKeyArray) -> EnvState:
-        """Begin an episode in each copy."""
+        """Return the start of an episode in each copy."""
 
         def start(model_key: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:
             return self.environment.randomised(model_key).reset(key)
@@ -164,7 +164,7 @@ class ActorCritic(Method):
     def _windows(
         self, learner: Learner, environments: EnvState, key: PRNGKeyArray, stddev: Float[Array, ""]
     ) -> tuple[Window, EnvState, Gradients]:
-        """Run a window everywhere, on all devices, and differentiate what it returns."""
+        """Run a window in all environments, on all devices, and differentiate its return."""
         shape = (self.settings.num_environments, self.settings.window, self.environment.num_actions)
         noise = jax.random.normal(key, shape, environments.obs.dtype)
 
@@ -177,14 +177,14 @@ class ActorCritic(Method):
                 own, state, model_key, noise, policy.actor, critic, policy.normaliser, stddev, self.settings.discount
             )
 
-        # The environment is one of them: closed over, arrays of all devices are refused where each has its part (jax 0.11).
+        # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
         shared = (arrays, learner.policy, learner.target, stddev)
         return over_devices(one, num_shared=1)(shared, environments, learner.model_keys, noise)
 
     def _improve(
         self, learner: Learner, window: Window, gradients: Gradients
     ) -> tuple[Policy, optax.OptState, Metrics]:
-        """Move the policy along the mixture, unless that is not finite; and say what it was made of."""
+        """Return the policy moved along the mixture, if that is finite, with its optimiser's state and the metrics."""
         policy = learner.policy
         gradients, is_shortened = gradients.shortened(self.settings.largest_sample)
         mixture, weights, evidence = mix(gradients, self.settings.rule)
@@ -193,7 +193,7 @@ class ActorCritic(Method):
             return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(window.obs)
 
         _, pull_back = jax.vjp(acted, policy.actor)
-        # Down the negative mean return per step, as optimisers take it.
+        # Optimisers descend, so the gradient is that of the negative mean return per step.
         (gradient,) = pull_back(-mixture / (self.settings.num_environments * self.settings.window))
         norm = optax.tree.norm(gradient)
         is_finite = jnp.isfinite(norm)
@@ -217,7 +217,7 @@ class ActorCritic(Method):
     def _fit_critic(
         self, learner: Learner, window: Window, key: PRNGKeyArray
     ) -> tuple[Network, optax.OptState, Float[Array, ""]]:
-        """Fit the value function to the window's targets, in batches of shuffled states."""
+        """Return the value function fitted to the window's targets, its optimiser's state and the last pass's loss."""
         normaliser = learner.policy.normaliser
 
         def targets(window: Window) -> Float[Array, " steps"]:
@@ -248,11 +248,11 @@ class ActorCritic(Method):
 def optimisers(
     settings: Settings, num_updates: int
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Return those of policy and value function."""
+    """Return the optimisers of the policy and of the value function."""
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
         clip = optax.clip_by_global_norm(settings.largest_norm)
-        # Of one vector it is a few operations, of each layer's arrays as many each.
+        # Flattened to one vector, which takes a few operations instead of as many for each layer's arrays.
         return optax.flatten(optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95)))
 
     per_update = settings.critic_iterations * settings.critic_batches
@@ -271,7 +271,7 @@ def _stepped(
 
 
 def _episodes(window: Window, so_far: Float[Array, " environments"]) -> tuple[Float[Array, " environments"], Metrics]:
-    """Return what running episodes have returned so far, and the mean of those that ended, NaN if none did."""
+    """Return the running episodes' returns so far, and the mean return of those that ended, NaN without any."""
 
     def add(total: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
         reward, is_over = now

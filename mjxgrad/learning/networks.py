@@ -1,4 +1,4 @@
-"""What learns: networks with layer normalisation, and running moments of what they see."""
+"""Networks with layer normalisation, and running moments of observations."""
 
 from collections.abc import Sequence
 
@@ -24,14 +24,14 @@ class Network(eqx.Module):
     def make(
         cls, sizes: Sequence[int], key: PRNGKeyArray, *, hidden_scale: float = 1.0, final_scale: float = 1.0
     ) -> "Network":
-        """Draw one.
+        """Draw a network.
 
         Args:
-            sizes: numbers of inputs, of each hidden layer, of outputs.
+            sizes: number of inputs, sizes of the hidden layers, number of outputs.
             key: consumed here.
-            hidden_scale: what gains and offsets of the hidden layers are multiplied with. Normalisation makes up for it; what
-                differs is how far a step of the optimiser goes.
-            final_scale: what the gains of the last layer are multiplied with.
+            hidden_scale: factor of the gains and offsets of the hidden layers. Normalisation undoes it in the output, but
+                it changes the relative size of the optimiser's steps.
+            final_scale: factor of the gains of the last layer.
         """
         keys = jax.random.split(key, len(sizes) - 1)
         layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]
@@ -48,7 +48,7 @@ class Network(eqx.Module):
 
 
 class Normaliser(eqx.Module):
-    """Mean and variance of all observations so far, by which they are shifted and scaled.
+    """A normalisation of observations by the mean and variance of all observations so far.
 
     References:
         Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample variances. COMPSTAT 1982,
@@ -61,16 +61,16 @@ class Normaliser(eqx.Module):
 
     @classmethod
     def make(cls, size: int) -> "Normaliser":
-        """Begin with no observations, by which nothing is changed."""
+        """Return the normalisation without observations, the identity."""
         return cls(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
 
     def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
         variance = jnp.where(self.count > 1, self.squares / jnp.maximum(self.count, 1), 1.0)
-        # A number that never changes is left as it is.
+        # A number that never changes is not scaled.
         return (obs - self.mean) / jnp.where(variance > 1e-8, jnp.sqrt(variance), 1.0)
 
     def with_more(self, obs: Float[Array, "*batch obs"]) -> "Normaliser":
-        """Return the moments with more observations in them; those that are not finite are left out."""
+        """Return the normalisation with more observations; those that are not finite are left out."""
         rows = obs.reshape(-1, obs.shape[-1])
         is_sound = jnp.isfinite(rows).all(axis=1, keepdims=True)
         added = is_sound.sum().astype(self.count.dtype)
@@ -85,7 +85,7 @@ class Normaliser(eqx.Module):
 def make_actor(
     num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray, hidden_scale: float = 1.0
 ) -> Network:
-    """Draw a network for actions before their squashing, which begin near zero."""
+    """Draw a network for actions before squashing, near zero at first."""
     return Network.make(
         [num_observations, *hidden, num_actions], key, hidden_scale=hidden_scale, final_scale=FINAL_SCALE
     )

@@ -1,4 +1,4 @@
-"""How to learn by short windows; the defaults are SHAC's, `apg` has those of analytic policy gradients."""
+"""Settings for learning from short windows: SHAC's, and those of analytic policy gradients (`apg`)."""
 
 import dataclasses
 from typing import Any
@@ -8,30 +8,31 @@ from mjxgrad.estimators.rules import Consistent, FixedAlpha, Rule
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How to learn; the defaults are SHAC's.
+    """The settings of a learner; the defaults are SHAC's.
 
     Attributes:
-        num_environments: side by side.
+        num_environments: number of environments side by side.
         window: steps of each environment per update.
-        discount: per step.
+        discount: discount per step.
         trace: λ of the value function's targets.
-        rule: from the evidence of a step and action to the weight of its first-order gradient. It is asked for every one of
-            them: one that sees bias by chance in a twentieth brings in much noise, so the default is surer.
-        stddev: of the noise on actions before their squashing, in the first and in the last update.
+        rule: map from the evidence of a step and action to the weight of its first-order gradient. It is asked for each of
+            them. A failure probability of a twentieth would bring in much noise, so the default is smaller.
+        stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
         actor_layers: hidden sizes of the policy.
-        actor_scale: what the first gains of its hidden layers are multiplied with.
+        actor_scale: factor of the initial gains of the policy's hidden layers.
         critic_layers: hidden sizes of the value function.
-        actor_rate: learning rate, which decreases linearly to zero.
-        actor_decay: what the rate is multiplied with at every update instead, unless None.
-        critic_rate: of the value function, likewise.
+        actor_rate: learning rate of the policy, which decreases linearly to zero.
+        actor_decay: factor of the policy's rate per update, in place of the linear decrease; None for the latter.
+        critic_rate: learning rate of the value function, which decreases linearly to zero.
         critic_iterations: passes over a window's states per update.
-        critic_batches: parts of such a pass.
+        critic_batches: number of batches in a pass.
         target_rate: share by which the target value function follows the value function.
-        largest_norm: to which gradients are clipped.
-        largest_sample: to which the first-order gradient of one environment's step is shortened, in root mean squares of the
-            zeroth-order one over environments: at 0.3 its variance is at most a tenth of that. Infinity shortens none.
-        has_critic: whether a value function stands for what comes after a window; otherwise nothing does.
-        is_episodic: whether every window begins anew.
+        largest_norm: norm to which gradients are clipped.
+        largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
+            unit is the root mean square of the zeroth-order gradient over environments: 0.3 limits the first-order variance
+            to a tenth of the zeroth-order one. Infinity shortens none.
+        has_critic: whether a value function estimates the rewards after a window; otherwise they are left out.
+        is_episodic: whether every window starts a new episode.
     """
 
     num_environments: int = 64
@@ -73,13 +74,14 @@ class Settings:
 
 
 def apg(**changes: Any) -> Settings:
-    """Return the settings of analytic policy gradients in brax, by which MuJoCo's notebook learns to trot: no value function.
+    """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
 
-    Windows follow one another. Two things are not as there. The noise, from 0.07, is not learned, but falls linearly to 0.01.
-    Gradients are clipped as a whole, not number by number, and long derivatives are shortened: that stands larger rates.
+    There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
+    falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
+    which allows larger rates.
 
     Args:
-        changes: settings that are to be others.
+        changes: settings that replace these.
 
     References:
         Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281

@@ -1,15 +1,15 @@
-r"""One short window in all environments, and two gradients of what it returns, by the action of every step.
+r"""One short window in all environments, and two gradients of its return by the action of every step.
 
-A window of $H$ steps under the policy $u_t = \mu_\theta(o_t) + \sigma w_t$, action $\tanh u_t$, returns
-$J = \sum_{t<H} \gamma^t r_t + \gamma^H V(o_H)$; where an episode ends within, the sum starts anew, after $V$ of its last
-observation if only its time was up. Two gradients by $u_t$:
+A window of $H$ steps under the policy $u_t = \mu_\theta(o_t) + \sigma w_t$, action $\tanh u_t$, has the return
+$J = \sum_{t<H} \gamma^t r_t + \gamma^H V(o_H)$. Where an episode ends within the window, the sum starts anew; if only its
+time was up, $V$ of its last observation is added first. There are two gradients by $u_t$:
 
 - first order, $\lambda_t = dJ/du_t$ through physics, policy and value function, by one reverse pass;
 - zeroth order, $z_t = \gamma^t A_t\, w_t/\sigma$ with the advantage $A_t = \sum_{k \ge t} \gamma^{k-t} r_k + \ldots - V(o_t)$.
 
-Both are $J$'s gradient in the mean where nothing jumps, the second everywhere. Either goes to the parameters by one pull-back,
-$\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the observations as they were. So they can be compared, and mixed, by
-step and action, and a derivative that is not finite is seen where it arises.
+The mean of the second is the gradient of $J$; so is the mean of the first where nothing jumps. One pull-back takes either to
+the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. The two can therefore be
+compared and mixed by step and action, and a derivative that is not finite is found where it arises.
 
 References:
     Xu et al. Accelerated Policy Learning with Parallel Differentiable Simulation. ICLR 2022, arXiv:2204.07137 (the window).
@@ -33,12 +33,12 @@ Value = Callable[[Float[Array, " obs"]], Float[Array, ""]]
 
 
 class Window(eqx.Module):
-    """What happened in one environment, step by step (of one step there is no axis); under `jax.vmap` fields gain leading axes.
+    """The steps of one environment, or a single step without the axis; under `jax.vmap` fields gain leading axes.
 
     Attributes:
-        obs: in which an action was chosen.
-        next_obs: to which it led, before any reset.
-        rewards: for it.
+        obs: observation in which an action was chosen.
+        next_obs: observation after the action, before any reset.
+        rewards: reward of the action.
         terminated: whether the episode ended for good.
         truncated: whether its time was up.
         metrics: the terms of the rewards, and `diverged`.
@@ -52,7 +52,7 @@ class Window(eqx.Module):
     metrics: dict[str, Float[Array, "*steps"]]
 
     def next_values(self, value: Value) -> Float[Array, " steps"]:
-        """Return the values after each step; an episode that ended for good has none."""
+        """Return the values after each step; zero after an episode that ended for good."""
         return jnp.where(self.terminated, 0.0, jax.vmap(value)(self.next_obs))
 
     @property
@@ -61,12 +61,12 @@ class Window(eqx.Module):
 
 
 class Gradients(eqx.Module):
-    """Both gradients of what a window returns, by step and action before squashing; under `jax.vmap` of many.
+    """Both gradients of a window's return by step and action before squashing; under `jax.vmap` fields gain leading axes.
 
     Attributes:
-        first: of first order.
-        zeroth: of zeroth order.
-        is_finite: whether the first-order one is a number, for all actions of a step.
+        first: first-order gradient.
+        zeroth: zeroth-order gradient.
+        is_finite: whether the first-order gradient of all actions of a step is finite.
     """
 
     first: Float[Array, "*environments steps nu"]
@@ -74,10 +74,11 @@ class Gradients(eqx.Module):
     is_finite: Bool[Array, "*environments steps"]
 
     def shortened(self, most: float) -> tuple["Gradients", Bool[Array, "environments steps"]]:
-        """Shorten first-order gradients to so many times the zeroth-order ones' root mean square, and say which were.
+        """Return first-order gradients of at most `most` zeroth-order root mean squares, and which were shortened.
 
-        Through contact a few are a million times the others, so that a mean over any batch is that of a few. Those as long as
-        zeroth-order noise tell no more than that does; shortened they have a small bias, which the rules see.
+        Through contact a few gradients are a million times longer than the others and dominate the mean of any batch.
+        Gradients as long as zeroth-order noise are no more informative than it. Shortening adds a small bias, which the rules
+        can see.
         """
         norms = jnp.linalg.norm(self.first, axis=-1)
         limit = most * jnp.sqrt((self.zeroth**2).sum(axis=-1).mean(axis=0))
@@ -87,7 +88,7 @@ class Gradients(eqx.Module):
 
 
 def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
-    r"""Return $J$ of a window."""
+    r"""Return the return $J$ of a window."""
     following = window.next_values(value)
     is_last = window.done.at[-1].set(True)
 
@@ -101,9 +102,9 @@ def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
 
 
 def lambda_returns(window: Window, value: Value, discount: float, trace: float) -> Float[Array, " steps"]:
-    r"""Return TD($\lambda$) targets of the values, $G_t = r_t + \gamma((1 - \lambda)V_{t+1} + \lambda G_{t+1})$.
+    r"""Return the TD($\lambda$) targets of the values, $G_t = r_t + \gamma((1 - \lambda)V_{t+1} + \lambda G_{t+1})$.
 
-    With $\lambda = 1$ they are the discounted sums to the end of the window.
+    With $\lambda = 1$ they are the discounted sums of rewards to the end of the window.
 
     References:
         Sutton, Barto. Reinforcement Learning: An Introduction, 2nd edition, 2018, equation 12.20.
@@ -138,18 +139,18 @@ def run_window(
     noise: Float[Array, "steps nu"],
     change: Float[Array, "steps nu"] | None = None,
 ) -> tuple[Window, EnvState]:
-    """Let a policy act for as many steps as there are rows of noise.
+    """Run a policy for one step per row of noise.
 
     Args:
-        environment: of one copy.
-        state: to go on from.
-        actor: from normalised observations to actions before their squashing.
-        normaliser: of observations.
-        noise: added before the squashing.
-        change: added, too; to differentiate by.
+        environment: one copy of the environment.
+        state: state at the start.
+        actor: network from normalised observations to actions before squashing.
+        normaliser: normalisation of observations.
+        noise: noise added to actions before squashing.
+        change: a further addition, to differentiate by.
 
     Returns:
-        What happened, and where to go on.
+        The window, and the state from which the next one starts.
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
@@ -173,18 +174,18 @@ def window_gradients(
     stddev: Float[Array, ""],
     discount: float,
 ) -> tuple[Window, EnvState, Gradients]:
-    """Run a window in one environment and differentiate what it returns; under `jax.vmap`, in many.
+    """Run a window in one environment and differentiate its return; under `jax.vmap`, in many.
 
     Args:
-        environment: before it is randomised.
-        state: to go on from.
-        model_key: of this copy's model.
-        noise: standard normal.
-        actor: of the actions' means.
-        critic: of the values.
-        normaliser: of observations.
-        stddev: of the noise on the actions before their squashing.
-        discount: per step.
+        environment: the environment before it is randomised.
+        state: state at the start.
+        model_key: key of this copy's model.
+        noise: standard normal noise.
+        actor: network of the actions' means.
+        critic: network of the values.
+        normaliser: normalisation of observations.
+        stddev: standard deviation of the noise on actions before squashing.
+        discount: discount per step.
     """
     copy = environment.randomised(model_key)
 
@@ -202,17 +203,17 @@ def window_gradients(
 
 
 def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
-    """Weigh both gradients by step and action.
+    """Mix both gradients by step and action.
 
-    Where a first-order one is not finite, the zeroth-order one stands in.
+    Where a first-order gradient is not finite, the zeroth-order one replaces it.
 
     Args:
-        gradients: of all environments.
-        rule: from the evidence of a step and action to its weight. It learns nothing of differences between costs
-            (`inconsistency` is zero), since no two environments share a start.
+        gradients: gradients of all environments.
+        rule: map from the evidence of a step and action to its weight. Costs are not compared (`inconsistency` is zero),
+            since no two environments share a start.
 
     Returns:
-        The mixture, the weights by step and action, and what they were made of.
+        The mixture, the weights by step and action, and their evidence.
     """
     by_step = jax.vmap(Moments.of, in_axes=1)
     first = by_step(gradients.first, gradients.is_finite)
@@ -227,7 +228,7 @@ def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments st
 
 
 def _evidence(first: Moments, zeroth: Moments, difference: Moments) -> Evidence:
-    """Return what a rule may look at, of each step and action."""
+    """Return the evidence for a rule, for each step and action."""
     variance = jax.vmap(Moments.variance)
     zero, unknown = jnp.zeros_like(first.offset), jnp.full_like(first.offset, jnp.nan)
     return Evidence(

@@ -1,4 +1,4 @@
-"""A run on disk, complete or not at all."""
+"""Checkpoints: a run on disk, complete or not at all."""
 
 import hashlib
 import io
@@ -18,7 +18,7 @@ FORMAT = 2
 
 
 def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
-    """Write a pytree of arrays so that an interruption leaves the former file as it was."""
+    """Write a pytree of arrays atomically: an interruption leaves the former file intact."""
     buffer = io.BytesIO()
     leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
     header = json.dumps({"format": FORMAT, **fingerprint}).encode()
@@ -37,10 +37,10 @@ def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
 
 
 def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
-    """Read what `save` wrote, of the structure and types of `like`, whatever its shapes.
+    """Return the pytree that `save` wrote, with the structure and types of `like` and its own shapes.
 
     Raises:
-        ValueError: if the file is damaged, or its fingerprint is another; the message says in what.
+        ValueError: if the file is damaged, or its fingerprint differs; the message names the difference.
     """
     try:
         if not zipfile.is_zipfile(path):
@@ -59,14 +59,14 @@ def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
         changes = ", ".join(_difference(name, header.get(name), expected[name]) for name in differing)
         raise ValueError(
             f"checkpoint must be of the same run, got {path} of one with other settings: {changes}; "
-            "give it the settings it had, or another path"
+            "use the settings of that run, or another path"
         )
     wanted = jax.tree.leaves(like)
     return jax.tree.unflatten(jax.tree.structure(like), [_restored(x, y) for x, y in zip(leaves, wanted, strict=True)])
 
 
 def digest(tree: PyTree) -> str:
-    """Give a short name for the content of arrays."""
+    """Return a short hash of the content of arrays."""
     sha = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         array = _as_numpy(leaf)

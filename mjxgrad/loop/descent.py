@@ -1,4 +1,4 @@
-"""Descents: methods that improve a vector of parameters, with a history, the best of it, and reasons to stop."""
+"""Descents: methods that improve a vector of parameters, with a history, the best parameters and reasons to stop."""
 
 import dataclasses
 import math
@@ -19,11 +19,11 @@ from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
 from mjxgrad.loop.run import Log, Method, Progress, mean
 
-# Progress shows in steps of five per cent; each costs one return from the device.
+# Progress is shown every five per cent; each time costs one return from the device.
 NUM_SEGMENTS = 20
 
-# Where nothing was felt and nothing moved, the next step differs by its noise alone. Three draws of it: a jump that one
-# sample in thirty meets goes unseen by three steps of 50 with a chance of 0.6 %.
+# Where nothing was felt and nothing moved, the next step differs only in its noise. Three steps of 50 samples miss a jump
+# that one sample in thirty meets with a probability of 0.6 %.
 STILL_STEPS = 3
 
 
@@ -32,19 +32,19 @@ def _as_path(path: str | Path | None) -> Path | None:
 
 
 class RunOptions(eqx.Module):
-    """What every run can be told besides its method.
+    """The options of every descent.
 
     Attributes:
-        num_steps: at most.
-        evaluate: cost of a point without noise, or any other measure of it; traceable. It is measurement: the rollouts
-            in it are not counted, and nothing but the choice of the best parameters depends on it.
+        num_steps: largest number of steps.
+        evaluate: cost of a point without noise, or any other measure of it; traceable. Its rollouts are not counted, and
+            only the choice of the best parameters depends on it.
         evaluate_every: steps between two evaluations. The last point is always evaluated.
         patience: steps in a row whose estimate is not finite, or whose samples feel nothing (`Reason.nothing_felt`), before
-            the run gives up; if such steps do not move the parameters either, three in a row are enough.
-        log: called after every twentieth of the steps with those done and what `History` has of the last one, the mean over
-            the seeds that took it, and `best_cost`: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
-        checkpoint: file to save the run in, as often, and to resume it from. A resumed run gives, on the same device, bit
-            for bit what the uninterrupted one would have given, its seconds apart.
+            the run gives up. If such steps do not move the parameters either, three in a row are enough.
+        log: function called after every twentieth of the steps: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
+            The metrics are the fields of `History` at the last step, the mean over the seeds that took it, and `best_cost`.
+        checkpoint: file to save the run in, as often, and to resume it from. On the same device a resumed run gives the
+            result of an uninterrupted one to the bit, except for the seconds.
         checkpoint_every: twentieths of the steps between two saves. An interrupted run is saved in any case.
     """
 
@@ -65,10 +65,18 @@ class RunOptions(eqx.Module):
 
 
 class Carry(eqx.Module):
-    """One run between two steps.
+    """The state of one run between two steps.
 
-    Of the steps done, `num_steps`, some were not taken, the last `num_in_a_row` of them in a row; the last `num_still` felt
-    nothing. The noise of a step comes from `key` and its number.
+    Attributes:
+        params: parameters.
+        state: the method's own state.
+        key: key of the run; the noise of a step comes from it and the number of the step.
+        best: best parameters so far.
+        num_steps: steps done, those not taken included.
+        num_skipped: steps not taken.
+        num_in_a_row: length of the present row of steps not taken.
+        num_still: length of the present row of steps that felt nothing.
+        stopped: an item of `Stopped`.
     """
 
     params: Float[Array, " dim"]
@@ -83,20 +91,20 @@ class Carry(eqx.Module):
 
 
 class Descent(Method):
-    """A method for a vector of parameters: a subclass gives `init_state`, and a `step` that ends in `moved`."""
+    """A method for a vector of parameters; a subclass gives `init_state`, and a `step` that ends in `moved`."""
 
     options: RunOptions
 
     @abstractmethod
     def init_state(self, params: Float[Array, " dim"]) -> PyTree:
-        """Return what the method carries from step to step besides the parameters."""
+        """Return the first state of the method, carried from step to step beside the parameters."""
 
     def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
-        """Return what `run` is to be told besides the method: one start, or one for each key along an axis that there may be."""
+        """Return the arguments of `run` besides the method; with a leading axis of keys, one start per key."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, params, key))):
             raise ValueError(
-                "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles itself, and takes "
-                "several seeds by several keys"
+                "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles its own program, "
+                "and takes one key per seed"
             )
         key, params = jnp.asarray(key), jnp.asarray(params)
         if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim > 1:
@@ -133,14 +141,14 @@ class Descent(Method):
     def moved(
         self, carry: Carry, index: Int[Array, ""], params: Float[Array, " dim"], state: PyTree, record: Record
     ) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
-        """Return the carry after a step that led to these, and the step's record; nothing changes where a run has stopped.
+        """Return the carry after a step, and the record of the step; nothing changes where a run has stopped.
 
         Args:
-            carry: before the step.
+            carry: carry before the step.
             index: number of the step.
-            params: after it; where it could not be taken, as they were, and `record.is_taken` False.
-            state: likewise.
-            record: of it.
+            params: parameters after the step; unchanged, with `record.is_taken` False, if it could not be taken.
+            state: state after the step; unchanged if it could not be taken.
+            record: record of the step.
         """
         options, at, nan = self.options, carry.params, jnp.full((), jnp.nan, carry.params.dtype)
         noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)
@@ -150,7 +158,7 @@ class Descent(Method):
             candidate = Best.measured(at, noise_free)
         num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
         num_still = jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0)
-        # The weightiest reason to stop comes last.
+        # Later reasons to stop override earlier ones.
         stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, Stopped.running)
         enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
         stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
@@ -159,7 +167,7 @@ class Descent(Method):
         after = Carry(
             params, state, carry.key, best, carry.num_steps + 1, num_skipped, num_in_a_row, num_still, stopped
         )
-        # One of several may have stopped before the others.
+        # One of several runs may have stopped before the others.
         as_it_was, as_it_is = (carry, (Record.blank(at.dtype), nan)), (after, (record, noise_free))
         return jax.tree.map(lambda old, new: jnp.where(self.is_over(carry), old, new), as_it_was, as_it_is)
 
@@ -170,7 +178,7 @@ class Descent(Method):
         return {name: getattr(self.options, name) for name in ("num_steps", "evaluate_every", "patience")}
 
     def metrics(self, progress: Progress, count: int) -> dict[str, float]:
-        """Return the last step, the mean over the seeds that took it; NaN where there is no such thing."""
+        """Return the fields of the last step, the mean over the seeds that took it; NaN for fields without a value."""
         history = History.of(progress)
         last = {f.name: getattr(history, f.name)[..., -1] for f in dataclasses.fields(History) if f.name != "reason"}
         return {name: mean(x) for name, x in (last | {"best_cost": np.asarray(progress.carry.best.cost)}).items()}

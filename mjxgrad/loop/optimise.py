@@ -21,7 +21,7 @@ from mjxgrad.objective.parameters import Restored
 
 AnnealedObjective = Callable[[Float[Array, ""]], Objective]
 Annealing = Callable[[ArrayLike], ArrayLike]
-"""From the number of a step to a scale in (0, 1]."""
+"""A schedule from the number of a step to a scale in (0, 1]."""
 
 
 def optimise(
@@ -45,12 +45,12 @@ def optimise(
         )
         result.best_params, result.history.cost, mg.Stopped[result.stopped]
 
-    One compilation, however many steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
+    There is one compilation for all steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
-    A step whose estimate is not finite is not taken: parameters and optimiser stay as they were, the step is counted in
-    `num_skipped`, and the next one draws other noise. Where all samples cost the same and no derivative differs from zero,
-    such as where a policy touches nothing, the run stops after a few steps with `Stopped.nothing_felt`.
+    A step whose estimate is not finite is not taken: parameters and optimiser stay unchanged, `num_skipped` counts the
+    step, and the next one draws other noise. The run stops with `Stopped.nothing_felt` if for a few steps all samples cost
+    the same and no derivative differs from zero, for instance because a policy touches nothing.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.
@@ -66,30 +66,30 @@ def optimise(
             annealing=optax.exponential_decay(1.0, 10, 0.5, end_value=0.01), ...
         )
 
-    With a bar of tqdm:
+    With a progress bar of tqdm:
 
         mg.optimise(..., log=lambda step, metrics: (bar.update(step - bar.n), bar.set_postfix(cost=metrics["cost"])))
 
     Args:
-        objective: what to minimise, or with `annealing` a function from a scale to it.
+        objective: the objective to minimise, or with `annealing` a function from a scale to an objective.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
-            dict or an equinox module. The function of `parameter_noise` and `evaluate` then take its form, and the
-            result has it. Estimators see all its arrays as one vector.
+            dict or an equinox module. The function of `parameter_noise` and `evaluate` then take a pytree of the same
+            form, and the result has this form. Estimators see all its arrays as one vector.
         key: consumed here; with a leading axis, one per seed.
-        estimator: called as `estimator(objective, params, key)`; any of `mg.estimators` with its settings bound by
-            `functools.partial`, or your own.
-        optimiser: from optax; it is handed the mean cost under noise as `value`, too.
-        num_steps: at most.
+        estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
+            settings bound by `functools.partial`.
+        optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
+        num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
-        clip_norm: longest gradient that the optimiser sees; longer ones are shortened to it.
+        clip_norm: largest norm of the gradient that the optimiser sees; longer gradients are shortened to it.
         **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
 
     Returns:
-        The last and the best parameters, the history, why it stopped and what was spent.
+        The last and the best parameters, the history, the reason for stopping and the rollouts spent.
 
     Raises:
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
-            or a checkpoint is damaged or of another run.
+            or a checkpoint is damaged or from another run.
     """
     vector, restore = flattened(params)
     chosen = RunOptions(num_steps, **options)
@@ -103,7 +103,7 @@ def optimise(
 
 
 class GradientStep(Descent):
-    """Everything that turns an estimate into a step; see `optimise`."""
+    """The method of `optimise`: an estimate, and a step of the optimiser along it."""
 
     objective: Objective | AnnealedObjective
     estimator: Estimator
@@ -136,7 +136,7 @@ class GradientStep(Descent):
 
     @property
     def transformation(self) -> optax.GradientTransformationExtraArgs:
-        """Return the optimiser, clipped; the cost goes along for those that watch it, such as `reduce_on_plateau`."""
+        """The optimiser with clipping; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
         if self.clip_norm is None:
             return optax.with_extra_args_support(self.optimiser)
         return optax.with_extra_args_support(optax.chain(optax.clip_by_global_norm(self.clip_norm), self.optimiser))
@@ -154,7 +154,7 @@ class GradientStep(Descent):
     def annealed(
         self, objective: Objective | AnnealedObjective, params: Float[Array, " dim"], step: Int[Array, ""]
     ) -> tuple[Float[Array, ""], Objective]:
-        """Return the scale of a step, 1 without annealing, and the objective at it."""
+        """Return the scale of a step, 1 without annealing, and the objective at this scale."""
         if self.annealing is None:
             return jnp.ones((), params.dtype), as_objective(objective)
         scale = jnp.asarray(self.annealing(step), params.dtype)
@@ -167,13 +167,13 @@ class GradientStep(Descent):
         estimate: GradientEstimate,
         gradient: Float[Array, " dim"],
     ) -> tuple[Float[Array, " dim"], PyTree, Bool[Array, ""]]:
-        """Ask the optimiser for the change of the parameters.
+        """Return the optimiser's change of the parameters, its state after, and whether the step is taken.
 
-        The gradient is that of the estimate and of anything else in the cost. A step that would not be finite is not
-        taken: the change is zero and the state stays as it was.
+        The gradient is the sum of the estimate and of the gradient of anything else in the cost. A step that would not
+        be finite is not taken: the change is zero and the state stays unchanged.
         """
         is_finite = jnp.isfinite(gradient).all()
-        # NaN must not reach the optimiser: what it does with one that is thrown away later is not defined.
+        # NaN must not reach the optimiser: its behaviour is then undefined, even if the result is discarded.
         gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
         updates, moved = self.transformation.update(gradient, state, params, value=estimate.objective_mean)
         change = jnp.asarray(updates)
@@ -186,10 +186,10 @@ class EstimatedGradientState(eqx.Module):
     """The state of `estimated_gradient`.
 
     Attributes:
-        step: number of updates so far; the noise of each comes from it.
-        num_skipped: of those, the ones that were not finite and so were zero.
-        scale: of the annealing at the last update.
-        estimate: the last one, of the vector; all NaN before the first.
+        step: number of updates so far; the noise of an update comes from it.
+        num_skipped: number of updates that were not finite and therefore zero.
+        scale: scale of the annealing at the last update.
+        estimate: last estimate, as a vector; all NaN before the first update.
         inner: state of the optimiser.
     """
 
@@ -218,14 +218,14 @@ def estimated_gradient(
             params = optax.apply_updates(params, change)
         state.estimate  # the last one, with its error bars
 
-    Update number n draws its noise from `fold_in(key, n)`, as `optimise` does, so both give the same trajectory. The
-    arguments are those of `optimise`, but `optimiser` may be None, which gives the gradient itself, clipped, to be chained
-    with others.
+    Update number n draws its noise from `fold_in(key, n)`, as in `optimise`, so both give the same trajectory. The
+    arguments are those of `optimise`. With `optimiser` None the update is the clipped gradient itself, to be chained with
+    other transformations.
 
     Returns:
-        A transformation of a vector, or of a pytree as in `optimise`. What it is given as updates is added to the
+        A transformation of a vector, or of a pytree as in `optimise`. The updates that it is given are added to the
         estimate: the gradient of anything else in the cost, or None. Its `update` takes two further arguments, `key` and
-        `objective`, in place of its own for that update. Where the estimate is not finite the update is zero, and
+        `objective`, that replace its own for that update. Where the estimate is not finite the update is zero, and
         `num_skipped` counts it.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a run gives: where it ended, what it saw on the way, and why it stopped."""
+"""The result of a descent: last and best parameters, the history, and the reason for stopping."""
 
 import dataclasses
 from typing import Any
@@ -15,7 +15,7 @@ from mjxgrad.loop.run import Progress
 
 
 class Stopped(eqx.Enumeration):
-    """Why a run stopped; `Stopped[optimisation.stopped]` is the sentence, for one run."""
+    """The reason why a run stopped; `Stopped[optimisation.stopped]` is the sentence, for one run."""
 
     running = "it has not stopped"
     finished = "all steps were done"
@@ -26,26 +26,26 @@ class Stopped(eqx.Enumeration):
     )
 
 
-# Of JAX in the loop, of NumPy afterwards.
+# Arrays of JAX in the loop, of NumPy afterwards.
 Numbers, Counts = Float[Any, "..."], Int[Any, "..."]
 
 
 class Record(eqx.Module):
-    """What one step of one run did; NaN where a method has no such thing.
+    """The record of one step of one run; NaN in fields that a method does not have.
 
     Attributes:
         cost: mean cost under noise at the parameters before the step.
-        cost_error: its standard error.
+        cost_error: standard error of `cost`.
         gradient_norm: norm of the estimate.
-        gradient_error: norm of its standard error.
+        gradient_error: norm of the standard error of the estimate.
         alpha: weight of the first-order part, the mean where there are several.
-        reason: why, for the least of them.
-        bias_bound: on the norm of the bias; NaN where nothing is known.
-        scale: of the annealing; 1 without any.
+        reason: reason for the smallest `alpha`.
+        bias_bound: bound on the norm of the bias; NaN where nothing is known.
+        scale: scale of the annealing; 1 without annealing.
         step_norm: norm of the change of the parameters.
         finite_fraction: share of the samples that were finite.
-        num_rollouts: spent by the step.
-        num_gradient_rollouts: of those, the ones differentiated.
+        num_rollouts: rollouts spent by the step.
+        num_gradient_rollouts: rollouts that were differentiated.
         is_taken: False for a step whose estimate was not finite.
     """
 
@@ -67,7 +67,7 @@ class Record(eqx.Module):
     def blank(cls, dtype: jnp.dtype) -> "Record":
         """Return the record of a step that did not happen."""
         nan, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), jnp.int32)
-        # A reason that is an array, as those of steps are.
+        # As an array, like the reasons of steps.
         reason = jax.tree.map(jnp.asarray, Reason.fixed)
         return cls(nan, nan, nan, nan, nan, reason, nan, nan, nan, nan, none, none, jnp.zeros((), bool))
 
@@ -75,7 +75,7 @@ class Record(eqx.Module):
     def of_estimate(
         cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
     ) -> "Record":
-        """Summarise a step along an estimate; of several α the mean, and the reason of the least."""
+        """Return the record of a step along an estimate: the mean of several α, and the reason for the smallest."""
         dtype = estimate.value.dtype
         alpha = jnp.ravel(estimate.alpha)
         reason = jax.tree.map(
@@ -99,7 +99,7 @@ class Record(eqx.Module):
 
 
 class Best(eqx.Module):
-    """The parameters of the lowest cost, NaN before there is one, and how that was measured."""
+    """The parameters of lowest cost, with the cost (NaN before there is one) and how it was measured."""
 
     params: Float[Array, " dim"]
     cost: Float[Array, ""]
@@ -108,14 +108,14 @@ class Best(eqx.Module):
 
     @classmethod
     def measured(cls, params: Float[Array, " dim"], cost: Float[Array, ""]) -> "Best":
-        """Return a point with the cost that `evaluate` gave for it, to be compared with its like alone."""
+        """Return a point with its cost from `evaluate`, to be compared only with other evaluated points."""
         return cls(params, cost, jnp.zeros_like(cost), jnp.ones_like(cost))
 
     def against(self, other: "Best") -> "Best":
-        """Return the better of both, itself if they are equal.
+        """Return the better of both points, this one if they are equal.
 
-        Less smoothing wins first, for costs under different noise are not comparable; then the larger share of finite
-        rollouts, lest leaving out the ones that diverged pay; then the lower cost.
+        Less smoothing wins first, because costs under different noise are not comparable. Then the larger share of finite
+        rollouts wins, so that divergence does not pay; then the lower cost.
         """
         is_better = (other.scale < self.scale) | (
             (other.scale == self.scale)
@@ -129,15 +129,15 @@ class Best(eqx.Module):
 
 
 class History(Record):
-    """A run step by step; leaves have the seeds on their first axis if there are many, and steps on their last.
+    """A run step by step: with many seeds, leaves have seeds on the first axis; steps are on the last.
 
-    The fields are those of `Record`, in NumPy, the counts summed up. A run that stopped before the others goes on as
-    NaN, its counts as they were.
+    The fields are those of `Record`, in NumPy, with cumulative counts. After a run stopped before the others its fields
+    are NaN and its counts stay constant.
 
     Attributes:
-        noise_free_cost: what `evaluate` gave for the parameters before the step, NaN where it was not due.
+        noise_free_cost: result of `evaluate` at the parameters before the step, NaN where it was not due.
         seconds: wall-clock time up to the end of the step, without compilation, the same for all seeds. It is measured
-            per segment and divided evenly among the steps of it.
+            per segment and divided evenly among the steps of the segment.
     """
 
     noise_free_cost: Float[np.ndarray, "..."]
@@ -145,7 +145,7 @@ class History(Record):
 
     @classmethod
     def of(cls, progress: Progress) -> "History":
-        """Put the records together that a descent has found, counts and seconds summed up."""
+        """Return the history from the records of a descent, with cumulative counts and seconds."""
         records, noise_free_cost = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), progress.found)
         fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
         for name in ("num_rollouts", "num_gradient_rollouts"):
@@ -155,24 +155,23 @@ class History(Record):
 
 
 class Optimisation(eqx.Module):
-    """The result of a run, or of one per seed: all but the seconds then have a leading axis.
+    """The result of a run, or of one run per seed; all fields but the seconds then have a leading axis.
 
     Attributes:
-        params: after the last step, in the form of the start.
-        best_params: with the lowest cost seen. With `evaluate` that is the noise-free cost at the steps where it was
-            due, or at the end; without, the mean cost under noise, where less smoothing comes before lower cost and a
-            larger share of finite rollouts before both. The lowest of many noisy means is lower than it should be: prefer
-            `evaluate`.
-        best_cost: that cost; NaN if there is none.
-        final_cost: of `params`, from `evaluate`; NaN without.
-        history: step by step.
+        params: parameters after the last step, in the form of the start.
+        best_params: parameters with the lowest cost seen. With `evaluate` this is the noise-free cost at the steps where
+            it was due, or at the end. Otherwise it is the mean cost under noise: less smoothing comes first, then a larger
+            share of finite rollouts, then lower cost. The lowest of many noisy means is biased low: prefer `evaluate`.
+        best_cost: cost of `best_params`; NaN if there is none.
+        final_cost: cost of `params` from `evaluate`; NaN without it.
+        history: history, step by step.
         stopped: an item of `Stopped`.
         num_steps: steps done, those not taken included.
         num_skipped: steps not taken because the estimate was not finite.
-        num_rollouts: spent by the method. What `evaluate` rolls out is measurement and not counted.
-        num_gradient_rollouts: of those, the ones differentiated.
+        num_rollouts: rollouts spent by the method; those in `evaluate` are not counted.
+        num_gradient_rollouts: rollouts that were differentiated.
         seconds: wall-clock time of the run without compilation, over all sessions if it was resumed.
-        compile_seconds: of tracing and compilation in this session.
+        compile_seconds: time of tracing and compilation in this session.
     """
 
     params: PyTree

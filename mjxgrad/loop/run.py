@@ -1,7 +1,7 @@
 """The loop that every method runs in: steps on the device in segments; logs and checkpoints between them.
 
-A method is two functions, from a start to a carry and from a carry to the next, and the carry is any pytree. Descents (`descent`)
-are methods with a vector of parameters; policies are learned by one, too (`mjxgrad.learning`).
+A method is two functions, from a start to a carry and from a carry to the next; the carry is any pytree. Descents (`descent`)
+are methods with a vector of parameters. Learning a policy is a method, too (`mjxgrad.learning`).
 """
 
 import functools
@@ -27,13 +27,13 @@ Log = Callable[[int, dict[str, float]], Any]
 
 
 class Progress(NamedTuple):
-    """A run so far: all that it needs to go on, and what it found.
+    """The state and the records of a run so far.
 
     Attributes:
-        carry: after the last step.
-        found: what the steps returned besides, in NumPy, with the steps on the first axis.
-        seconds: of the clock for each step. They are measured by segment and divided evenly among its steps.
-        compile_seconds: of tracing and compilation in this session.
+        carry: carry after the last step.
+        found: records of the steps, in NumPy, with the steps on the first axis.
+        seconds: wall-clock time of each step. It is measured per segment and divided evenly among its steps.
+        compile_seconds: time of tracing and compilation in this session.
     """
 
     carry: PyTree
@@ -47,48 +47,48 @@ class Progress(NamedTuple):
 
 
 class Method(eqx.Module):
-    """What the loop repeats; `init` and `step` are needed, the others have a default.
+    """A method that the loop repeats; `init` and `step` are needed, the others have a default.
 
-    Its arrays are arguments of the compiled program, so that a method with other numbers compiles nothing.
+    Its arrays are arguments of the compiled program, so a method with other numbers needs no new compilation.
     """
 
     @abstractmethod
     def init(self, start: PyTree) -> PyTree:
-        """Return the carry before the first step: all that a step needs, random keys too."""
+        """Return the carry before the first step, with everything that a step needs, random keys included."""
 
     @abstractmethod
     def step(self, carry: PyTree, index: Int[Array, ""]) -> tuple[PyTree, PyTree]:
-        """Take the step of this number; return the carry after it, and what is to be kept of every step."""
+        """Take the step of this number; return the carry after it, and the record of the step."""
 
     def is_over(self, carry: PyTree) -> Bool[Array, "..."] | bool:
-        """Say whether a run has ended before the number of its steps; of many, for each."""
+        """Return whether a run has ended before its last step; of many runs, for each."""
         return False
 
     def identity(self) -> dict[str, Any]:
-        """Return what a resumed run must share by name, besides the program, the arrays and the start."""
+        """Return named values that a resumed run must share, besides the program, the arrays and the start."""
         return {}
 
     def metrics(self, progress: Progress, count: int) -> dict[str, float]:
-        """Return what a log is told: the means over the last steps, so many, of what is a number."""
+        """Return the values for a log: the means of the finite records over the last `count` steps."""
         found = progress.found | {"seconds": progress.seconds}
         return {name: mean(values[-count:]) for name, values in found.items()}
 
     def result(self, progress: Progress) -> Any:
-        """Return what the caller of the run gets."""
+        """Return the result of the run for its caller."""
         return progress
 
 
 def side_by_side(methods: Sequence[Any]) -> tuple[Any, list[int | None]]:
-    """Return methods that differ in numbers alone as one, and which axis of each of its arrays goes through them.
+    """Return methods that differ only in numbers as one method, and the axis of each of its arrays over the methods.
 
-    Arrays that all share are not copied for each and have none; the others are stacked along their first.
+    Arrays that differ are stacked along their first axis. Arrays that all methods share are not copied; their axis is None.
 
     Raises:
-        ValueError: if they differ in more than numbers.
+        ValueError: if the methods differ in more than numbers.
     """
     parts = [eqx.partition(one, eqx.is_array) for one in methods]
     if not all(eqx.tree_equal(parts[0][1], other) for _, other in parts):
-        raise ValueError("what runs side by side must differ in numbers alone: run each by itself")
+        raise ValueError("methods side by side must differ in numbers alone; run each separately")
     numbers = list(zip(*(jax.tree.leaves(arrays) for arrays, _ in parts), strict=True))
     is_common = [len(set(map(checkpoints.digest, each))) == 1 for each in numbers]
     joined = [each[0] if same else jnp.stack(each) for each, same in zip(numbers, is_common, strict=True)]
@@ -108,25 +108,25 @@ def run(
     checkpoint_every: int = 1,
     on_all_devices: bool = False,
 ) -> Any:
-    """Repeat a method until it is over, and return what its `result` makes of that.
+    """Repeat a method until it is over, and return its `result`.
 
     Args:
-        method: what to repeat.
-        start: what its `init` takes.
-        num_steps: at most.
-        segment: steps in one program; between two of them are logs and checkpoints.
-        over: for each leading axis that the start has, how arrays of the method go along: None for many starts of one method, or
-            as `side_by_side` says. All run in one program.
-        log: called after every segment with the number of steps done and the method's `metrics`.
-        checkpoint: file to save the run in, and to resume it from as if it had never stopped.
+        method: the method to repeat.
+        start: argument of the method's `init`.
+        num_steps: largest number of steps.
+        segment: steps in one program; logs and checkpoints come between segments.
+        over: axes of the method's arrays for each leading axis of the start: None for many starts of one method, else the
+            list from `side_by_side`. All runs are in one program.
+        log: function called after every segment with the number of steps done and the method's `metrics`.
+        checkpoint: file to save the run in, and to resume it from.
         checkpoint_every: segments between two saves. An interrupted run is saved in any case.
         on_all_devices: whether all devices of all processes get the arrays, for a method that spreads its work over them.
 
     Raises:
-        ValueError: if the checkpoint is damaged, or of a run with another program, other arrays or another start.
+        ValueError: if the checkpoint is damaged, or from a run with another program, other arrays or another start.
     """
     arrays, static = eqx.partition(method, eqx.is_array)
-    # Structures name functions: a list of numbers is that of any run of the same program.
+    # A list, since the structure holds functions: runs of one program then have arguments of equal structure.
     numbers, structure = jax.tree.flatten(arrays)
     sharding = _everywhere() if on_all_devices else None
     numbers, start = _placed((numbers, start), sharding)
@@ -138,10 +138,10 @@ def run(
         return eqx.combine(jax.tree.unflatten(structure, numbers), static).step(carry, index)
 
     for axes in reversed(over):
-        # The number of a step is one for all: what is done at some steps is skipped at the others for all of them.
+        # The step number is not mapped: a `lax.cond` on it stays a branch instead of computing both sides.
         init, step = jax.vmap(init, (axes, 0)), jax.vmap(step, (axes, 0, None))
     carry = compile_once(jax.jit(init, out_shardings=sharding).lower(numbers, start))(numbers, start)
-    # Traced once: for the shapes of what is found, for the text of the program, and within a segment of steps.
+    # Traced once for the shapes of the records, for the text of the program, and for the segment.
     began, step = time.perf_counter(), jax.jit(step)
     traced = step.trace(numbers, carry, np.int32(0))
     steps = jax.jit(_steps(step, traced.out_info[1], method.is_over, segment), out_shardings=sharding)
@@ -166,31 +166,31 @@ def run(
             if log is not None and is_first:
                 log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
     finally:
-        # On the way out of an interruption, too: KeyboardInterrupt goes on to the caller.
+        # Also after an interruption: KeyboardInterrupt goes on to the caller.
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
     return method.result(progress)
 
 
 def _identity(method: Method, start: PyTree, numbers: list[Array], program: str) -> dict[str, Any]:
-    """Say what a resumed run must have in common with this one; a class of the same name may have other code."""
+    """Return the fingerprint that a resumed run must share; a class of the same name may have other code."""
     return {
         **method.identity(),
         "start": checkpoints.digest(start),
         "arrays": checkpoints.digest(numbers),
-        # The lowered program has every number in it that is not an argument, such as a learning rate.
+        # The lowered program contains every number that is not an argument, such as a learning rate.
         "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
     }
 
 
 def mean(values: Shaped[np.ndarray, "..."]) -> float:
-    """Return the mean of what is finite; NaN if nothing is."""
+    """Return the mean of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else math.nan
 
 
 def _after(progress: Progress, program: Callable[[], tuple[Array, PyTree, PyTree]]) -> Progress:
-    """Run a segment and join what it found."""
+    """Run a segment and return the progress with its records appended."""
     began = time.perf_counter()
     reached, carry, rows = jax.block_until_ready(program())
     count = int(reached) - progress.num_steps
@@ -200,7 +200,7 @@ def _after(progress: Progress, program: Callable[[], tuple[Array, PyTree, PyTree
 
 
 def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Callable:
-    """Return the program of a segment: steps up to a number that is an argument, fewer where all is over before."""
+    """Return the program of a segment: steps up to a given number, fewer if all runs are over before."""
 
     def steps(numbers: list[Array], carry: PyTree, first: Array, end: Array) -> tuple[Array, PyTree, PyTree]:
         def is_going(now: tuple[Array, PyTree, PyTree]) -> Bool[Array, ""]:
@@ -212,6 +212,7 @@ def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Ca
             put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=index - first, axis=0)
             return index + 1, carry, jax.tree.map(put, rows, row)
 
+        # A while_loop can end early but stacks no outputs, so the records are written into arrays of full length.
         rows = jax.tree.map(lambda x: jnp.zeros((segment, *x.shape), x.dtype), found)
         return jax.lax.while_loop(is_going, advance, (first, carry, rows))
 
@@ -219,23 +220,23 @@ def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Ca
 
 
 def _everywhere() -> jax.sharding.Sharding | None:
-    """Return the sharding of arrays that all devices of all processes are to have; None where there is one device."""
+    """Return the sharding that replicates arrays on all devices of all processes; None for a single device."""
     devices = all_devices()
     if len(devices) == 1:
         return None
     if jax.process_count() > 1:
-        # Meet before compiling: by how much that differs in time can exceed the deadline for connecting.
+        # Synchronise before compiling: compilation times may differ by more than the deadline for connecting.
         sync_global_devices("loop")
     return jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec())
 
 
 def _placed(tree: PyTree, sharding: jax.sharding.Sharding | None) -> PyTree:
-    """Put arrays where a sharding says."""
+    """Return the arrays placed by a sharding; unchanged if it is None."""
 
     def put(x: Array) -> Array:
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(put(jax.random.key_data(x)), impl=jax.random.key_impl(x))
-        # From the host: what one process has on a device others cannot always be sent.
+        # From the host: arrays on a device cannot always be sent to another process.
         return jax.device_put(np.asarray(x), sharding)
 
     return tree if sharding is None else jax.tree.map(put, tree)

@@ -1,4 +1,4 @@
-"""Objectives: what costs (tasks), what chooses controls (policies), and noise with its score, as an estimator sees them."""
+"""Objectives for estimators: tasks with a cost, policies that choose controls, and noise with its score."""
 
 from mjxgrad.objective.actions import ActionNoise, ClosedLoop, OpenLoop, closed_loop, open_loop
 from mjxgrad.objective.base import Differentiated, Objective

@@ -1,4 +1,4 @@
-"""The cost of a task, with noise on its controls: open loop and closed loop."""
+"""The cost of a task with noise on its controls, in open loop and in closed loop."""
 
 import dataclasses
 from abc import abstractmethod
@@ -26,10 +26,10 @@ from mjxgrad.objective.task import Outcome, Task, as_pytree
 
 
 class ActionNoise(Objective):
-    """What open and closed loop share.
+    """The common part of open loop and closed loop.
 
-    The noise of a rollout is that of its actions; where the task has a distribution of starts, it is the pair of that
-    and the start. The start does not depend on the parameters, so it adds nothing to the score.
+    The noise of a rollout is the noise of its actions, or the pair of action noise and start where the task has a
+    distribution of starts. The start does not depend on the parameters, so it adds nothing to the score.
     """
 
     task: eqx.AbstractVar[Task]
@@ -37,18 +37,18 @@ class ActionNoise(Objective):
 
     @abstractmethod
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out once: the cost, the states, and the costs by step where the task gives them."""
+        """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
 
     @abstractmethod
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        """Give the way from components by action noise, flattened, to the parameters; see `Differentiated`."""
+        """Return the pull-back from components by action noise, flattened, to the parameters; see `Differentiated`."""
 
     @property
     def noise_shape(self) -> tuple[int, int]:
         return (self.task.horizon, self.task.num_controls)
 
     def sample_noise(self, key: PRNGKeyArray) -> PyTree:
-        """Draw noise for every action, and a start where the task has a distribution of them."""
+        """Draw noise for every action, and a start where the task has a distribution of starts."""
         if self._start_shape() is None:
             return gaussian(key, self.stddev, self.noise_shape)
         start_key, action_key = jax.random.split(key)
@@ -73,7 +73,7 @@ class ActionNoise(Objective):
         return self._start_shape() is not None
 
     def zero_noise(self) -> PyTree:
-        """Give no action noise, and the nominal start; it must be built as the random ones."""
+        """Return zero action noise, with the nominal start, which must have the structure of the random ones."""
         actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
         if drawn is None:
             return actions
@@ -86,7 +86,7 @@ class ActionNoise(Objective):
         return actions, jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), nominal, drawn)
 
     def split(self, noise: PyTree) -> tuple[Float[Array, "horizon nu"], PyTree]:
-        """Give the action noise and the start, which is None where it is not random."""
+        """Return the action noise and the start, None where the start is not random."""
         return noise if isinstance(noise, tuple) else (noise, None)
 
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
@@ -105,8 +105,8 @@ class ActionNoise(Objective):
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
         """Differentiate by the action noise through the whole loop, in one reverse pass.
 
-        The total derivative of the cost by the noise of an action is that by the action itself. The parameters act on the
-        cost through the actions alone, so pulling it back at the visited states gives the whole gradient by them.
+        The total derivatives of the cost by the noise of an action and by the action itself are equal. The parameters
+        affect the cost only through the actions. The pull-back at the visited states therefore gives their whole gradient.
         """
         actions, start = self.split(noise)
 
@@ -123,18 +123,18 @@ class ActionNoise(Objective):
 
 
 class OpenLoop(ActionNoise):
-    """The cost of a task under controls with noise on them; see `open_loop`."""
+    """The cost of a task under controls with noise; see `open_loop`."""
 
     task: Task
     stddev: Float[Array, "..."]
     dim: int | None = eqx.field(static=True)
 
     def ravel(self, controls: Float[Array, "horizon nu"]) -> Float[Array, " dim"]:
-        """Flatten controls to parameters."""
+        """Return controls as a vector of parameters."""
         return jnp.ravel(controls)
 
     def unravel(self, params: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
-        """Give parameters the shape of controls."""
+        """Return parameters in the shape of controls."""
         return params.reshape(self.noise_shape)
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
@@ -158,7 +158,7 @@ class ClosedLoop(ActionNoise):
     dim: int | None = eqx.field(static=True)
 
     def ravel(self, policy_params: PyTree) -> Float[Array, " dim"]:
-        """Flatten the policy's parameters."""
+        """Return the policy's parameters as a vector."""
         return _flat(policy_params)[0]
 
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
@@ -166,7 +166,7 @@ class ClosedLoop(ActionNoise):
         return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
-        """Give Σ_t (∂π(x_t)/∂θ)ᵀ w_t/σ²; it takes a rollout."""
+        """Return Σ_t (∂π(x_t)/∂θ)ᵀ w_t/σ²; it takes a rollout."""
         return self.value_and_score(params, noise)[1]
 
     def value_and_score(
@@ -176,21 +176,21 @@ class ClosedLoop(ActionNoise):
         return outcome.cost, self.pull_back_at(params, outcome.states)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
-        # Given the state, the action is Gaussian about the policy; the chance of the next state
-        # given state and action does not depend on the parameters. So the states are data here.
+        # Given the state, the action is Gaussian about the policy; given state and action, the distribution of the next
+        # state does not depend on the parameters. The states are therefore data here.
         states = jax.lax.stop_gradient(states)
-        # What the pull-back holds is copied per sample when a vmapped function returns it: the policy, not the task.
+        # A vmapped function copies the content of the pull-back per sample, so it holds the policy, not the task.
         return Partial(_ActionsTranspose(self.unravel), self.policy, params, states)
 
 
 def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
-    r"""Give the cost of a task as a function of its controls, with noise on each.
+    r"""Return the cost of a task as a function of its controls, with noise on each.
 
     The parameters are the controls, flattened by `objective.ravel`; the score is $w/\sigma^2$. Where the task has a
     distribution of starts, every rollout draws its own.
 
     Args:
-        task: what is controlled, and what it costs.
+        task: the controlled task with its cost.
         stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
 
     Returns:
@@ -210,22 +210,21 @@ def closed_loop(
     *,
     params: PyTree = None,
 ) -> ClosedLoop:
-    r"""Give the cost of a task as a function of a policy's parameters, with noise on its actions.
+    r"""Return the cost of a task as a function of a policy's parameters, with noise on its actions.
 
-    The action is $u_t = \pi_\theta(x_t) + w_t$; the score of a rollout is
-    $\sum_t (\partial\pi_\theta(x_t)/\partial\theta)^\top w_t/\sigma^2$, the states taken as data.
+    The action is $u_t = \pi_\theta(x_t) + w_t$. The score of a rollout is
+    $\sum_t (\partial\pi_\theta(x_t)/\partial\theta)^\top w_t/\sigma^2$, with the states taken as data.
     Value and score come from one rollout. Where the task has a distribution of starts, every rollout draws its own.
 
     Args:
-        task: what is controlled, and what it costs.
-        policy: takes its parameters and a state, gives controls of shape (nu,).
+        task: the controlled task with its cost.
+        policy: function from its parameters and a state to controls of shape (nu,).
         stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
-        params: an example of the policy's parameters, of a dict or an equinox module too; of its floating-point arrays only
-            the shapes count, what else it holds is kept.
-            Without it the policy is handed the flat vector itself.
+        params: an example of the policy's parameters, such as a dict or an equinox module. Only the shapes of its
+            floating-point arrays count; all other leaves are kept. Without it the policy gets the flat vector itself.
 
     Returns:
-        The objective; `objective.ravel` and `objective.unravel` go between the policy's parameters and the flat vector.
+        The objective; `objective.ravel` and `objective.unravel` convert the policy's parameters to the flat vector and back.
 
     Raises:
         ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
@@ -242,7 +241,7 @@ def closed_loop(
 
 def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
     if all(map(eqx.is_array_like, jax.tree.leaves(params))):
-        return ravel_pytree(params)  # whose way back equals another of the same structure
+        return ravel_pytree(params)  # its `unravel` equals that of any pytree of the same structure
     vector, restore = flattened(params)
     assert restore is not None
     return vector, restore
@@ -252,8 +251,8 @@ def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, 
 class _ActionsTranspose:
     """The transpose of the derivative of the mean actions by the parameters, at given states.
 
-    A class, because equal settings must give equal pytrees (a closure never equals another), and a function that
-    evaluates the policy again, because what `jax.vjp` keeps would be another pytree in each trace.
+    It is a class because equal settings must give equal pytrees, and two closures are never equal. It evaluates the policy
+    again because the residuals of `jax.vjp` would be a different pytree in each trace.
     """
 
     unravel: Callable[[Float[Array, " dim"]], PyTree]

@@ -1,8 +1,8 @@
-r"""What an estimator sees: a value under noise, and the score of that noise.
+r"""The interface of an objective to estimators: a value under noise, and the score of the noise.
 
-Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. An estimator of $\nabla F$ needs three things of a problem and
-nothing else: a draw of the noise, the value under it, and the score $s$, the gradient of the log density of the noisy
-quantity with respect to $\theta$, for which $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
+Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. An estimator of $\nabla F$ needs only three functions: a draw of
+the noise, the value under it, and the score $s$. The score is the gradient of the log density of the noisy quantity by
+$\theta$; it satisfies $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
 """
 
 import dataclasses
@@ -17,16 +17,16 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-# Up to here forward mode wins: on the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took 0.53 s
-# and 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
+# Up to this number forward mode is faster. On the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took
+# 0.53 s and 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
 MOST_FORWARD_DIMENSIONS = 3
 
 
 class Differentiated(eqx.Module):
     r"""One rollout, differentiated by the noisy quantity $a = \mu_\theta + w$ in place of the parameters.
 
-    `pull_back` is linear, the transpose of $\partial\mu_\theta/\partial\theta$ at the states of this rollout, so what is
-    weighted, mixed or given baselines by noise component (by step and action) is pulled back once, afterwards:
+    `pull_back` is linear: the transpose of $\partial\mu_\theta/\partial\theta$ at the states of this rollout. Terms can
+    therefore be weighted, mixed or given baselines by noise component (by step and action), and pulled back once at the end:
 
         pull_back(gradient_by_noise) = ∇_θ f(θ, w)    the first-order gradient of this sample
         pull_back(noise_score) = s(θ, w)              the score of this sample
@@ -34,11 +34,11 @@ class Differentiated(eqx.Module):
     It is a pytree: a vmapped function may return it, and `jax.vmap(lambda pull, x: pull(x))` applies it to a batch.
 
     Attributes:
-        cost: of the rollout, NaN if it diverged.
+        cost: cost of the rollout, NaN if it diverged.
         gradient_by_noise: total derivative of the cost by each component of the noise, flattened.
-        noise_score: $w/\sigma^2$, flattened likewise.
-        noise_stddev: $\sigma$, likewise; NaN where the objective does not say.
-        pull_back: from (m,) to (dim,).
+        noise_score: $w/\sigma^2$, flattened in the same order.
+        noise_stddev: $\sigma$, flattened in the same order; NaN where it is not known.
+        pull_back: linear map from shape (m,) to (dim,).
     """
 
     cost: Float[Array, ""]
@@ -49,11 +49,11 @@ class Differentiated(eqx.Module):
 
 
 class Objective(eqx.Module):
-    """A cost under noise, as estimators see it.
+    """A cost under noise, the input of estimators.
 
     A subclass gives `dim`, `sample_noise`, `value` and `score`. It overrides `value_and_score` if both come from one
-    rollout, `mirror` and `zero_noise` if its noise is not symmetric about zero, and `differentiate`, `noise_shape` and
-    `with_stddev` if its noise is Gaussian or not on the parameters.
+    rollout, and `mirror` and `zero_noise` if its noise is not symmetric about zero. It overrides `differentiate`,
+    `noise_shape` and `with_stddev` if its noise is Gaussian or not on the parameters.
     """
 
     dim: eqx.AbstractVar[int | None]
@@ -64,43 +64,43 @@ class Objective(eqx.Module):
 
     @abstractmethod
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
-        """Give the cost of one rollout, NaN if the rollout diverged."""
+        """Return the cost of one rollout, NaN if the rollout diverged."""
 
     @abstractmethod
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
-        """Give the gradient of the log density of the noisy quantity."""
+        """Return the gradient of the log density of the noisy quantity."""
 
     def value_and_score(
         self, params: Float[Array, " dim"], noise: PyTree
     ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
-        """Give the cost and the score; one rollout where the score depends on the states."""
+        """Return the cost and the score, from one rollout where the score depends on the states."""
         return self.value(params, noise), self.score(params, noise)
 
     def mirror(self, noise: PyTree) -> PyTree:
-        """Give the equally likely noise on the other side, for antithetic pairs."""
+        """Return the mirror image of the noise, equally likely, for antithetic pairs."""
         return jax.tree.map(jnp.negative, noise)
 
     def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
-        """Draw other noise under the same circumstances: what is random beside the noise, such as the start, stays."""
+        """Draw other noise under the same circumstances, such as the same random start."""
         return self.sample_noise(key)
 
     def silence(self, noise: PyTree) -> PyTree:
-        """Give the noise that changes nothing, under the circumstances of this one."""
+        """Return zero noise under the same circumstances, such as the same random start."""
         return self.zero_noise()
 
     @property
     def has_circumstances(self) -> bool:
-        """Say whether anything is random beside the noise, so that costs differ for reasons no derivative explains."""
+        """Whether anything else than the noise is random, such as the start; derivatives do not explain its effect."""
         return False
 
     def zero_noise(self) -> PyTree:
-        """Give the noise that changes nothing."""
+        """Return zero noise, under nominal circumstances."""
         shapes = jax.eval_shape(self.sample_noise, jax.random.key(0))
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     @property
     def noise_shape(self) -> tuple[int, ...]:
-        """Give the shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu)."""
+        """Shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu)."""
         if self.dim is None:
             raise ValueError("dim is not known: call objective.sized_for(params) first")
         return (self.dim,)
@@ -108,15 +108,14 @@ class Objective(eqx.Module):
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
         """Roll out once and differentiate by the noisy quantity.
 
-        Unless a subclass knows better, the noisy quantity is the parameters themselves: the derivative is by them, the
-        pull-back is the identity, and both identities of `Differentiated` hold whatever the noise is. Its standard
-        deviation is then not known, and NaN.
+        The default takes the parameters as the noisy quantity: the derivative is by them, and the pull-back is the identity.
+        Both identities of `Differentiated` then hold for any noise. Its standard deviation is not known, and NaN.
         """
         (cost, score), gradient = value_and_gradient(lambda at: self.value_and_score(at, noise), params, has_aux=True)
         return Differentiated(cost, gradient, score, jnp.full_like(gradient, jnp.nan), Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "Objective":
-        """Give the same objective with other noise, in the same units and shape; traceable, for schedules and sweeps.
+        """Return the objective with another standard deviation of the same units and shape; traceable, for schedules.
 
         Raises:
             ValueError: if the noise has no standard deviation, or `stddev` is not positive or of the wrong shape.
@@ -126,7 +125,7 @@ class Objective(eqx.Module):
         )
 
     def sized_for(self, params: Float[Array, " dim"]) -> "Objective":
-        """Give the objective with its `dim` settled by the parameters.
+        """Return the objective with `dim` set by the parameters.
 
         Raises:
             ValueError: if `params` is not a vector of floating-point numbers, or not of length `dim`.
@@ -149,12 +148,12 @@ class Objective(eqx.Module):
 
 
 def unchanged(vector: Float[Array, " dim"]) -> Float[Array, " dim"]:
-    """Return the vector: the pull-back where the noise is on the parameters."""
+    """Return the vector unchanged: the pull-back where the noise is on the parameters."""
     return vector
 
 
 def as_objective(objective: Any) -> Objective:
-    """Return an objective as it is, refusing anything else."""
+    """Return an objective unchanged; raise a ValueError for anything else."""
     if not isinstance(objective, Objective):
         raise ValueError(
             f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
@@ -164,7 +163,7 @@ def as_objective(objective: Any) -> Objective:
 
 
 def as_scalar(value: Any, name: str) -> Float[Array, ""]:
-    """Give the cost as a floating-point number, which a count may be, too; refuse anything else."""
+    """Return a number, integer or real, as a floating-point scalar; raise a ValueError for anything else."""
     if not eqx.is_array_like(value):
         raise ValueError(f"{name} must return one number, got {type(value).__name__}")
     if jnp.shape(value) != ():
@@ -175,9 +174,10 @@ def as_scalar(value: Any, name: str) -> Float[Array, ""]:
 def value_and_gradient(
     function: Callable[[Float[Array, " dim"]], Any], point: Float[Array, " dim"], *, has_aux: bool = False
 ) -> tuple[Any, Float[Array, " dim"]]:
-    """Differentiate a scalar function of a vector, as `jax.value_and_grad` does, in the mode that is cheaper.
+    """Differentiate a scalar function of a vector, as `jax.value_and_grad` does, in the cheaper mode.
 
-    Forward mode for up to three dimensions, reverse mode beyond and for what has no forward mode (`jax.custom_vjp`).
+    This is forward mode up to three dimensions, and reverse mode above or for functions without forward mode
+    (`jax.custom_vjp`).
     """
 
     def scalar(at: Float[Array, " dim"]) -> Any:
@@ -190,7 +190,7 @@ def value_and_gradient(
         try:
             value, gradient, *besides = jax.vmap(along, out_axes=out_axes)((jnp.eye(point.size, dtype=point.dtype),))
             return (value, *besides) if has_aux else value, gradient
-        except TypeError:  # a rule of jax.custom_vjp has no forward mode; any other mistake comes again below
+        except TypeError:  # jax.custom_vjp has no forward mode; any other TypeError is raised again below
             pass
     value, pull_back, *besides = jax.vjp(scalar, point, has_aux=has_aux)
     (gradient,) = pull_back(jnp.ones_like(value))
@@ -198,14 +198,14 @@ def value_and_gradient(
 
 
 def gaussian(key: PRNGKeyArray, stddev: Float[Array, "..."], shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Draw noise of a shape that `stddev` broadcasts to."""
+    """Draw Gaussian noise of a shape that `stddev` broadcasts to."""
     return stddev * jax.random.normal(key, shape, stddev.dtype)
 
 
 def positive(stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
-    """Give the standard deviation as an array, refusing one that is known and not positive."""
+    """Return the standard deviation as an array; raise a ValueError if it is known and not positive."""
     stddev = jnp.asarray(stddev, jnp.result_type(stddev, float))
-    # A traced value (a noise schedule, a sweep) cannot be looked at here.
+    # A traced value (a noise schedule, a sweep) cannot be checked here.
     if not isinstance(stddev, jax.core.Tracer) and not bool((stddev > 0).all()):
         raise ValueError(f"stddev must be positive, got {stddev}")
     return stddev

@@ -1,4 +1,4 @@
-"""Any function of parameters, with noise on them; and parameters that are a pytree, as the vector that estimators see."""
+"""Functions of parameters with noise on them, and pytrees of parameters as the vector that estimators use."""
 
 import dataclasses
 from collections.abc import Callable
@@ -62,10 +62,9 @@ def parameter_noise(
     $F(\theta) = \mathbb{E}[f(\theta + w)]$, $w \sim N(0, \sigma^2 I)$, with score $w/\sigma^2$.
 
     Args:
-        function: takes a vector, or the pytree that the parameters are, and gives a scalar; traceable by JAX.
+        function: function from a vector, or from the pytree of parameters, to a scalar; traceable by JAX.
         stddev: $\sigma > 0$, in the parameters' units; one number, or one per parameter.
-        dim: number of parameters. Needed only to draw noise by hand: an estimator takes it from
-            the parameters it is given.
+        dim: number of parameters, needed only to draw noise by hand: an estimator takes it from its parameters.
 
     Returns:
         The objective.
@@ -78,7 +77,7 @@ def parameter_noise(
 
 
 class Restored(eqx.Module):
-    """A function of a pytree of parameters, as a function of the vector of them."""
+    """A function of a pytree of parameters, as a function of their vector."""
 
     function: Callable[[PyTree], Any]
     restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
@@ -88,13 +87,13 @@ class Restored(eqx.Module):
 
 
 def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return the floating-point arrays of a pytree as a vector, and the way back; an array as it is, with None.
+    """Return the floating-point arrays of a pytree as a vector, with its inverse; or an array unchanged, with None.
 
-    The way back also takes one vector per seed.
+    The inverse also takes one vector per seed.
     """
     if eqx.is_array_like(params):
         return jnp.asarray(params), None
-    # A tracer's `__jax_array__` is None, which `is_inexact_array_like` calls (jax 0.10.2, equinox 0.13.8).
+    # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
     is_parameter = lambda x: eqx.is_inexact_array(x) if eqx.is_array(x) else eqx.is_inexact_array_like(x)  # noqa: E731
     arrays, others = eqx.partition(params, is_parameter)
     vector, unravel = ravel_pytree(arrays)
@@ -108,9 +107,9 @@ def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Arra
 
 
 def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] | None) -> Any:
-    """Return an objective, or a function from a scale to one, that takes parameters as `flattened` does.
+    """Return an objective, or a function from a scale to one, that takes the vector of `flattened`.
 
-    Noise on actions leaves it as it is: it takes a vector in any case, and its policy has its own way back.
+    An objective with noise on actions is unchanged: it takes a vector already, and restores its policy's parameters itself.
     """
     if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
         return objective
@@ -122,10 +121,9 @@ def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] 
 def as_vector(
     objective: Objective, params: PyTree
 ) -> tuple[Objective, Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
-    """Return what an estimator works on: an objective of a vector, sized for it, and the vector.
+    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form.
 
-    The third is the way from a gradient to the form of the parameters, with None in place of what is no floating-point
-    array.
+    The latter has None in place of leaves that are no floating-point arrays.
     """
     vector, restore = flattened(params)
     objective = of_vector(as_objective(objective), restore).sized_for(vector)
@@ -135,7 +133,7 @@ def as_vector(
 
 
 def _fitting(stddev: float | Float[Array, "..."], dim: int | None) -> tuple[Float[Array, "*dim"], int | None]:
-    """Give the standard deviation as an array, and the number of parameters if it tells."""
+    """Return the standard deviation as an array, and the number of parameters, `dim` or its length."""
     stddev = positive(stddev)
     if stddev.ndim > 1 or (stddev.ndim == 1 and dim not in (None, stddev.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {stddev.shape}")

@@ -1,4 +1,4 @@
-"""Policies from states to controls, with their parameters apart: linear, and a multilayer perceptron."""
+"""Policies from states to controls, with separate parameters: linear, and a multilayer perceptron."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 
 # The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend
-# little on the state; the choice that mattered most among initialisations in Andrychowicz et al. (below).
+# little on the state. Among initialisations this choice mattered most in Andrychowicz et al. (below).
 FINAL_SCALE = 0.01
 
 
@@ -32,7 +32,7 @@ class Affine(eqx.Module):
 
 
 class FeedforwardPolicy(eqx.Module):
-    """See `linear_policy` and `mlp_policy`, which differ in the number of layers."""
+    """The policy of `linear_policy` and `mlp_policy`, which differ in the number of layers."""
 
     observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
     limits: Float[Array, "nu 2"] | None = None
@@ -52,7 +52,7 @@ class FeedforwardPolicy(eqx.Module):
 
 
 def whole_state(state: Any) -> Float[Array, " observed"]:
-    """Observe everything: a vector as it is; of a scene's state positions, velocities and activations, in this order."""
+    """Return a vector unchanged, or the positions, velocities and activations of a scene's state, in this order."""
     if isinstance(state, State):
         return jnp.concatenate([state.qpos, state.qvel, state.act])
     if not isinstance(state, jax.Array) or state.ndim != 1:
@@ -67,7 +67,7 @@ def linear_policy(
     bias: bool = True,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
 ) -> tuple[FeedforwardPolicy, Affine]:
-    """Make the policy u = K x + k, all zero at the start.
+    """Return the policy u = K x + k, with parameters that are zero.
 
         policy, params = linear_policy(4, 1)
         objective = closed_loop(task, policy, stddev=0.1, params=params)
@@ -75,10 +75,10 @@ def linear_policy(
     Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero.
 
     Args:
-        num_states: how many numbers are observed.
-        num_controls: how many controls are given.
+        num_states: number of observed values.
+        num_controls: number of controls.
         bias: whether there is the constant k.
-        observe: from what the task hands over, its state or its observations, to a vector; positions of a free body hold a
+        observe: function from the task's state or observations to a vector. Positions of a free body contain a
             quaternion, and angles do not wrap, so choose what you need.
 
     Returns:
@@ -102,21 +102,21 @@ def mlp_policy(
     limits: Float[ArrayLike, "nu 2"] | None = None,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
 ) -> tuple[FeedforwardPolicy, tuple[Affine, ...]]:
-    r"""Make a multilayer perceptron with tanh between its layers.
+    r"""Return a multilayer perceptron with tanh between its layers.
 
-    After the last layer there is none, unless there are limits: within $m \pm l$ the action is then
-    $m + l\tanh(y/l)$, of slope 1 in the middle, so that its derivative does not end where MuJoCo would clip it.
+    The last layer is linear unless there are limits. Within limits $m \pm l$ the action is $m + l\tanh(y/l)$, of slope 1
+    in the middle. Its derivative is therefore not zero where MuJoCo would clip the action.
 
-    Gains start as $N(0, 1/\text{inputs})$, those of the last layer 100 times smaller; offsets as zero.
+    Gains start as $N(0, 1/\text{inputs})$, in the last layer 100 times smaller; offsets start as zero.
 
     Args:
-        num_states: how many numbers are observed.
-        num_controls: how many controls are given.
-        width: of every hidden layer.
+        num_states: number of observed values.
+        num_controls: number of controls.
+        width: size of every hidden layer.
         depth: number of hidden layers.
-        key: for the gains; consumed here.
-        limits: the least and largest of each control, such as `scene.ctrlrange`; those that are not finite do not bound.
-        observe: from the task's state to a vector; see `linear_policy`.
+        key: key of the gains; consumed here.
+        limits: the least and largest value of each control, such as `scene.ctrlrange`; infinite limits do not bound.
+        observe: function from the task's state to a vector; see `linear_policy`.
 
     Returns:
         The policy, called as `policy(params, state)`, and its parameters, layer by layer.

@@ -1,4 +1,4 @@
-"""What an objective needs of a thing to be controlled: how long, how many controls, where it starts, a cost."""
+"""Tasks: horizon, number of controls, start and cost of a controlled system, the input of an objective."""
 
 import dataclasses
 from abc import abstractmethod
@@ -18,14 +18,13 @@ from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient
 
 
 class Outcome(eqx.Module):
-    """What came of one rollout; under `jax.vmap` every field gains leading axes.
+    """The result of one rollout; under `jax.vmap` every field gains leading axes.
 
     Attributes:
-        cost: of the whole rollout, NaN if it diverged.
-        states: in which the controls were chosen, with a leading axis of `horizon`: what a policy was called with.
-        step_costs: what was charged at steps 0 to `horizon`, with the sum `cost`. Entry t depends only on states and
-            controls up to t, so a control at t answers for the entries from t on and for no others. None where only
-            the total is known.
+        cost: cost of the whole rollout, NaN if it diverged.
+        states: states in which the controls were chosen, the inputs of a policy; the leading axis is `horizon`.
+        step_costs: costs charged at steps 0 to `horizon`, with the sum `cost`. Entry t depends only on states and
+            controls up to t, so a control at t affects only the entries from t on. None where only the total is known.
     """
 
     cost: Float[Array, ""]
@@ -34,10 +33,10 @@ class Outcome(eqx.Module):
 
 
 class Task(eqx.Module):
-    """Anything that turns controls into a cost; its dynamics need not be MuJoCo's.
+    """A map from controls to a cost; its dynamics need not be MuJoCo's.
 
-    A subclass gives `horizon`, `num_controls` and `run`. One whose rollouts may start in different states gives
-    `nominal_start` too, and one whose start is random `sample_start`.
+    A subclass gives `horizon`, `num_controls` and `run`. If rollouts may start in different states it also gives
+    `nominal_start`, and if the start is random `sample_start`.
     """
 
     horizon: eqx.AbstractVar[int]
@@ -54,34 +53,33 @@ class Task(eqx.Module):
         """Roll out once.
 
         Args:
-            controls: what to apply at each step, or a policy from parameters and a state to
-                what to apply.
+            controls: the controls of each step, or a policy from parameters and a state to controls.
             params: the policy's parameters.
-            noise: added to the controls.
-            start: where to begin; None is the nominal start.
+            noise: noise added to the controls.
+            start: state at the start; None is the nominal start.
 
         Returns:
-            The cost, and the states that the controls were chosen in.
+            The cost, and the states in which the controls were chosen.
         """
 
     def nominal_start(self) -> PyTree:
-        """Return where a rollout begins if nothing else is said; None if that has no name outside the task."""
+        """Return the default start of a rollout; None if it is not defined outside the task."""
         return None
 
     def sample_start(self, key: PRNGKeyArray) -> PyTree:
-        """Draw where a rollout begins, shaped as `nominal_start`; None if it always begins at the same place."""
+        """Draw the start of a rollout, with the shapes of `nominal_start`; None if the start is fixed."""
         return None
 
 
 def as_pytree(function: Callable) -> Callable:
-    """Wrap a plain function so that what holds it is a pytree of arrays, fit for jit and vmap."""
+    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap."""
     if isinstance(function, eqx.Module | jax.tree_util.Partial):
         return function  # pyright: ignore[reportReturnType]
     return jax.tree_util.Partial(function)
 
 
 def optional_pytree(function: Callable | None) -> Callable | None:
-    """Wrap a function as `as_pytree` does, if there is one."""
+    """Return a function as a pytree, see `as_pytree`, or None."""
     return None if function is None else as_pytree(function)
 
 
@@ -90,13 +88,14 @@ Same = TypeVar("Same", bound="InScene")
 
 
 class InScene(eqx.Module):
-    """What moves in a scene, whose contacts may be stepped in several ways.
+    """A scene with a choice of how its contacts are stepped.
 
     Attributes:
-        scene: from `load_scene`.
-        gradient: of each step, "slope" or "discrete", see `rollout`. The slope is that of the outcome, hit or miss apart.
-        onset: None for MuJoCo's own motion, or how contacts begin within the step: a continuous motion of its own. A leaf.
-        smoothing: of the contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
+        scene: the scene, from `load_scene`.
+        gradient: derivative of each step, "slope" or "discrete", see `rollout`. "slope" is the slope of the outcome, except
+            for jumps between hit and miss.
+        onset: onset of contacts within the step, a continuous motion; None for MuJoCo's own motion. A leaf.
+        smoothing: average over contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
         engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
     """
 
@@ -107,38 +106,38 @@ class InScene(eqx.Module):
     engine: Engine | None = eqx.field(static=True, default=None, kw_only=True)
 
     def with_gradient(self: Same, gradient: Gradient) -> Same:
-        """Return the same with MuJoCo's own motion and one of its derivatives."""
+        """Return a copy with MuJoCo's own motion and one of its derivatives."""
         check_gradient(gradient)
         return dataclasses.replace(self, gradient=gradient, onset=None)
 
     def with_onset(self: Same, onset: Onset | None) -> Same:
-        """Return the same with contacts that begin within the step; None is MuJoCo's motion and the slope."""
+        """Return a copy with contacts that begin within the step; None is MuJoCo's motion and the slope."""
         return dataclasses.replace(self, gradient="slope" if onset is None else "discrete", onset=onset)
 
     def with_engine(self: Same, engine: Engine) -> Same:
-        """Return the same in MuJoCo's own motion, by MJX or by C MuJoCo."""
+        """Return a copy with MuJoCo's own motion, by MJX or by C MuJoCo."""
         return dataclasses.replace(self, onset=None, engine=engine)
 
     def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
-        """Return the same with contact averaged over noise."""
+        """Return a copy with contact averaged over noise."""
         return dataclasses.replace(self, smoothing=smoothing)
 
     def with_softness(self: Same, softness: Softness) -> Same:
-        """Return the same with other contact softness."""
+        """Return a copy with other contact softness."""
         return dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
 class SceneTask(Task, InScene):
-    """A scene, where it starts, how long it runs, and what the trajectory costs.
+    """A scene with a start, a horizon, and a cost of the trajectory.
 
     Attributes:
         state: the nominal start.
-        cost: from a trajectory to a number, or to one number per state of it (`horizon + 1`), the one at t from states
-            and controls up to t, whose sum is the cost; traceable. It may read `trajectory.observations`.
+        cost: function from a trajectory to a number, or to one number per state (`horizon + 1`) whose sum is the cost;
+            traceable. The number at t must depend on states and controls up to t. It may read `trajectory.observations`.
         horizon: number of steps.
-        start_distribution: from a key to the state where a rollout begins; None if it is always `state`.
-        observe: from model and data to anything made of arrays, for the cost and the policy; see `rollout`.
-        policy_sees: "state", or "observations": what a policy is called with; see `rollout`.
+        start_distribution: function from a key to the start of a rollout; None if it is always `state`.
+        observe: function from model and data to a pytree of arrays, for the cost and the policy; see `rollout`.
+        policy_sees: the input of a policy, "state" or "observations"; see `rollout`.
     """
 
     state: State
@@ -156,7 +155,7 @@ class SceneTask(Task, InScene):
         return self.state
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:
-        """Draw from `start_distribution`, if there is one."""
+        """Return a draw from `start_distribution`, or None without one."""
         return None if self.start_distribution is None else self.start_distribution(key)
 
     def run(
@@ -202,5 +201,5 @@ class SceneTask(Task, InScene):
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
-    """Return the cost, or NaN if the rollout diverged, by which estimators know to leave it out."""
+    """Return the cost, or NaN if the rollout diverged, so that estimators leave it out."""
     return jnp.where(trajectory.diverged, jnp.nan, cost)

@@ -1,4 +1,4 @@
-"""Plans through contact: trajectory optimisation on smoothed linear models."""
+"""Planning through contact: trajectory optimisation on smoothed linear models."""
 
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System

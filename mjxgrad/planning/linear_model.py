@@ -1,19 +1,21 @@
-r"""Smoothed linear models of a step: what state and control do to the next state on average over a little noise.
+r"""Smoothed linear models of a step: the mean next state, over a little noise, as a linear function of state and control.
 
 Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \operatorname{diag} s^2)$, the mean step is
 
     E f(x + dx + w_x, u + du + w_u)  ≈  c + A dx + B du.
 
 Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
-Across a contact the mean is smooth even where f is not: before a touch, A and B already know what a push will do.
+Across a contact the mean is smooth even where f is not: A and B contain the effect of a push already before the touch.
 
-Three ways to the same model: `Sampled` in first order averages Jacobians and misses what they do not see (a jump of f; under
-`gradient="discrete"` the moving time of an impact); in zeroth order it fits a plane to samples of f and misses nothing, at the
-price of noise; `Analytic` differentiates a step whose solver averages the contact force itself. The last takes noise on the
-distance of contacts in place of noise on the state: the force is averaged and the acceleration then solved for, so that it
-agrees with the others as far as a contact's impedance is small against one.
+There are three ways to this model:
 
-A key is consumed. With `wrt_state=False` A has no columns where it is not a plane's, and the state's noise still acts.
+- `Sampled` in first order averages Jacobians. It misses their blind spots: jumps of f, and with `gradient="discrete"` the
+  shift of the time of an impact.
+- `Sampled` in zeroth order fits a plane to samples of f. It misses nothing, at the price of noise.
+- `Analytic` differentiates a step whose solver averages the contact force. The noise is on the distance of contacts, not on
+  the state, and the acceleration is solved for after the average. It agrees with the others for impedances far below one.
+
+A key is consumed. With `wrt_state=False` A has no columns, except for a fitted plane; the state's noise still acts.
 
 References:
     Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
@@ -45,14 +47,13 @@ class LinearModel(eqx.Module):
     """A linear model of a step; under `jax.vmap` every field gains leading axes.
 
     Attributes:
-        A: derivative of the next state's change by the present one's; without columns if it was not asked for.
+        A: derivative of the next state's change by the present state's; without columns if it was not asked for.
         B: derivative of the next state's change by the control.
-        c: the mean next state.
-        A_error: standard error of each entry of `A`; zero where nothing is sampled.
-        B_error: of `B`.
-        c_error: of `c`, in the coordinates of a change.
-        finite_fraction: share of the samples that were finite; the others are left out. If too few are left to fit a model,
-            all numbers are NaN.
+        c: mean next state.
+        A_error: standard error of each entry of `A`; zero without sampling.
+        B_error: standard error of each entry of `B`.
+        c_error: standard error of `c`, in the coordinates of a change.
+        finite_fraction: share of finite samples; the others are left out. If too few are finite, all numbers are NaN.
     """
 
     A: _Errors
@@ -65,7 +66,7 @@ class LinearModel(eqx.Module):
 
 
 class Smoother(eqx.Module):
-    """A smoothed step and its derivative. The same key gives the same step, so that costs can be compared."""
+    """A smoothed step with its derivative. The same key gives the same step, so that costs can be compared."""
 
     @abstractmethod
     def step(self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray) -> StateVector:
@@ -79,18 +80,18 @@ class Smoother(eqx.Module):
 
     @abstractmethod
     def scaled(self, factor: ArrayLike) -> "Smoother":
-        """Give the smoother with its lengths and standard deviations multiplied."""
+        """Return the smoother with its lengths and standard deviations multiplied by a factor."""
 
     def warnings(self, system: System, start: StateVector) -> list[str]:
-        """Say what this smoothing does to a start besides; nothing for numbers that are traced."""
+        """Return warnings about unwanted effects of this smoothing at a start; none for traced numbers."""
         return []
 
 
 class Analytic(Smoother):
-    """Contacts averaged in the solver; without sampling, so each key gives the same.
+    """Contacts averaged in the solver, without sampling: the result does not depend on the key.
 
     Attributes:
-        smoothing: of contacts and limits; None is the system as it is.
+        smoothing: smoothing of contacts and limits; None is the system itself.
     """
 
     smoothing: Smoothing | None
@@ -108,7 +109,7 @@ class Analytic(Smoother):
         return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1)
 
     def scaled(self, factor: ArrayLike) -> "Analytic":
-        # The lengths are its only leaves.
+        # Lengths are its only leaves.
         return jax.tree.map(lambda length: factor * length, self)
 
     def warnings(self, system: System, start: StateVector) -> list[str]:
@@ -118,13 +119,13 @@ class Analytic(Smoother):
         if not resting:
             return []
         return [
-            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then holds at a distance, "
-            "and bodies that should slide or roll hardly move; for planning give them condim=1, or take Sampled"
+            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then acts at a distance, "
+            "and bodies that should slide or roll hardly move; for planning set their condim to 1, or use Sampled"
         ]
 
 
 class Exact(Analytic):
-    """No smoothing: the system as it is."""
+    """No smoothing: the system itself."""
 
     smoothing: Smoothing | None = None
 
@@ -133,9 +134,9 @@ class Sampled(Smoother):
     """The mean over samples of noise on state and control.
 
     Attributes:
-        stddev_state: of the noise on the state, a number or one per coordinate of a change.
-        stddev_control: of the noise on the control, a number or one per control.
-        num_samples: per step and linear model; in all `1 + 2 num_samples` steps for a step, `1 + num_samples` for a model.
+        stddev_state: standard deviation of the noise on the state, a number or one per coordinate of a change.
+        stddev_control: standard deviation of the noise on the control, a number or one per control.
+        num_samples: number of samples. A smoothed step takes `1 + 2 num_samples` steps, a linear model `1 + num_samples`.
         order: "first" averages Jacobians, "zeroth" fits a plane.
     """
 
@@ -149,9 +150,9 @@ class Sampled(Smoother):
             raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
 
     def step(self, system, state, control, key):
-        """Return the mean next state over the finite ones under noise. As a function of the state it is one map for each key.
+        """Return the mean of the finite next states under noise; for one key it is a fixed function of state and control.
 
-        Each sample is taken with its mirror image, so that a linear step is averaged without error.
+        Each sample is taken with its mirror image, so a linear step is averaged without error.
         """
         stddev = self._stddev(system, state.dtype, least=1)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
@@ -168,14 +169,14 @@ class Sampled(Smoother):
     def _first_order(
         self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray, wrt_state: bool
     ) -> LinearModel:
-        """Average Jacobians.
+        """Return the linear model from averaged Jacobians.
 
-        The mean next state is that of the samples less what their mean Jacobian explains of it (each sample's own left out),
-        so that noise adds nothing to a linear step: A, B and c are then exact.
+        From each sample's next state the part that the other samples' mean Jacobian explains is subtracted. The noise then
+        adds nothing to a linear step: A, B and c are exact.
         """
         stddev = self._stddev(system, state.dtype, least=2)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
-        # The step without noise runs in the same batch: a call of its own would be compiled a second time.
+        # The step without noise runs in the same batch: a separate call would be compiled a second time.
         jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
         value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
         is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
@@ -191,12 +192,12 @@ class Sampled(Smoother):
     def _zeroth_order(
         self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
     ) -> LinearModel:
-        """Fit a plane to samples of the step by least squares.
+        """Return the linear model from a plane fitted to samples of the step by least squares.
 
         Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
-        Its errors do not assume that the samples scatter alike everywhere (White's, with leverage taken out, HC3), for across
-        a contact they do not. It takes at least two samples more than there are coordinates of state and control; where the
-        noise is 0 the step is not seen to vary, and that column is zero, with an infinite error.
+        Its errors do not assume that samples scatter alike everywhere (White's, with leverage taken out, HC3): across a contact
+        they do not. The fit needs at least two samples more than coordinates of state and control. A column without noise is
+        zero, with an infinite error.
         """
         least = system.num_changes + system.num_controls + 2
         stddev = self._stddev(system, state.dtype, least)
@@ -204,9 +205,9 @@ class Sampled(Smoother):
         nominal, value = _sampled(system, state, control, stddev * unit)
         is_finite = jnp.all(jnp.isfinite(value), axis=1)
         value = jnp.where(is_finite[:, None], value, 0.0)
-        # In units of the noise the normal equations are well conditioned whatever the units of the coordinates.
+        # In units of the noise the normal equations are well conditioned for any units of the coordinates.
         design = jnp.where(is_finite[:, None], jnp.concatenate([jnp.ones((self.num_samples, 1)), unit], axis=1), 0.0)
-        # Too few finite samples make the equations singular; then the ones on the diagonal keep them solvable, unseen.
+        # Too few finite samples make the equations singular. Ones on the diagonal keep them solvable; the result is NaN later.
         enough = is_finite.sum() >= least
         gram = design.T @ design + jnp.where(enough, 0.0, 1.0) * jnp.eye(least - 1)
         influence = jnp.linalg.solve(gram, design.T)
@@ -239,7 +240,7 @@ class Sampled(Smoother):
 
 
 def _resting(system: SceneSystem, start: np.ndarray) -> list[ContactPair]:
-    """Return the pairs with friction of something fixed that touch at a start, by C MuJoCo; none of a traced scene."""
+    """Return the pairs that touch at a start, have friction and contain a fixed body, by C MuJoCo; none if traced."""
     scene = system.scene
     if not all(is_known(leaf) for leaf in (scene.model.geom_size, scene.model.body_pos, scene.model.geom_pos)):
         return []
@@ -265,7 +266,7 @@ def _perturbed(system: System, state: StateVector, control: ControlVector, noise
 def _sampled(
     system: System, state: StateVector, control: ControlVector, noise: _Samples
 ) -> tuple[StateVector, Float[Array, "N n"]]:
-    """Return the next state without noise, and how far from it those with noise are."""
+    """Return the next state without noise, and the changes from it to the next states with noise."""
     ends = jax.vmap(lambda w: _perturbed(system, state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
     return ends[0], jax.vmap(lambda end: system.difference(end, ends[0]))(ends[1:])
 
@@ -273,7 +274,7 @@ def _sampled(
 def _linearised(
     system: System, state: StateVector, control: ControlVector, noise: _Samples, wrt_state: bool
 ) -> tuple[Float[Array, "N state columns"], Float[Array, "N state"]]:
-    """Return, for each sample of noise, the derivative of the next state, and that state."""
+    """Return the derivative of the next state and the next state, for each sample of noise."""
     columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
 
     def sample(noise):
@@ -289,7 +290,7 @@ def _linearised(
 def _changes(
     system: System, ends: Float[Array, "N state"], nominal: StateVector, jacobian: Float[Array, "N state columns"]
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n columns"]]:
-    """Return states and their derivatives as changes of the nominal one."""
+    """Return states and their derivatives as changes from the nominal state."""
 
     def one(end, jacobian):
         return system.difference(end, nominal), jax.jacfwd(system.difference)(end, nominal) @ jacobian
@@ -300,7 +301,7 @@ def _changes(
 def _mean(
     samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return mean and standard error of the samples that are used."""
+    """Return the mean and standard error of the used samples."""
     weights = is_used.astype(samples.dtype).reshape(-1, *[1] * (samples.ndim - 1))
     count = jnp.maximum(weights.sum(), 1)
     mean = (weights * samples).sum(axis=0) / count
@@ -319,7 +320,7 @@ def _model(
     *,
     least: int,
 ) -> LinearModel:
-    """Split the Jacobian, and refuse to give numbers where too few samples were finite."""
+    """Return the linear model from a Jacobian by state and control; all NaN if too few samples were finite."""
     exists = is_finite.sum() >= least
     jacobian, jacobian_error, change, change_error = (
         jnp.where(exists, x, jnp.nan) for x in (jacobian, jacobian_error, change, change_error)

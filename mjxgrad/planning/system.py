@@ -1,7 +1,7 @@
-"""What is planned with: a map from a state and a control to the next state, and what a plan costs.
+"""Systems and costs for planning: a map from a state and a control to the next state, and the cost of a plan.
 
-A state is one flat vector; a change of it has the coordinates of its tangent space, which for quaternions are fewer. Whoever
-linearises, samples or plans moves states by `retract` and compares them by `difference`, and so need not know which is which.
+A state is one flat vector. A change of it has the coordinates of the tangent space, fewer than the state's for quaternions.
+Code that linearises, samples or plans moves states by `retract` and compares them by `difference`, for any coordinates.
 """
 
 from abc import abstractmethod
@@ -32,7 +32,7 @@ class System(eqx.Module):
 
     Attributes:
         num_changes: dimension n of the tangent space.
-        num_positions: how many of its leading coordinates are positions; the rest are velocities and activations.
+        num_positions: number of its leading coordinates that are positions; the rest are velocities and activations.
         num_controls: dimension m of the control.
     """
 
@@ -53,7 +53,7 @@ class System(eqx.Module):
         return end - start
 
     def __hash__(self) -> int:
-        # `jax.jit(system.step)` asks for one, and arrays have none.
+        # `jax.jit(system.step)` needs a hash, and arrays have none.
         return id(self)
 
     @property
@@ -65,7 +65,7 @@ class System(eqx.Module):
     def limits(
         self, lower: ArrayLike | None, upper: ArrayLike | None, dtype: jnp.dtype
     ) -> tuple[ControlVector, ControlVector]:
-        """Return limits, a number or one per control, for each control; `control_limits` where there is None."""
+        """Return given limits (a number, or one per control) for each control; None takes `control_limits`."""
         low, high = (
             jnp.broadcast_to(jnp.asarray(own if given is None else given, dtype), (self.num_controls,))
             for given, own in zip((lower, upper), self.control_limits, strict=True)
@@ -73,7 +73,7 @@ class System(eqx.Module):
         return low, high
 
     def with_smoothing(self, smoothing: Smoothing | None) -> "System":
-        """Give the system with another analytic smoothing of its contacts.
+        """Return the system with another analytic smoothing of its contacts.
 
         Raises:
             ValueError: if the system has no contacts to smooth.
@@ -86,10 +86,10 @@ class System(eqx.Module):
 
 
 class FunctionSystem(System):
-    """Any function of two vectors, all of whose states are positions.
+    """A function of two vectors as a system; all of its states are positions.
 
     Attributes:
-        function: from state and control to the next state.
+        function: function from state and control to the next state.
     """
 
     function: Callable[[ChangeVector, ControlVector], ChangeVector] = eqx.field(converter=as_pytree)
@@ -108,14 +108,14 @@ class FunctionSystem(System):
 class SceneSystem(System):
     """A scene under a control that is held for one or several time steps.
 
-    The state is (qpos, qvel, act); its tangent space has the coordinates of velocities in place of positions, so that a
+    The state is (qpos, qvel, act). Its tangent space has the coordinates of velocities in place of positions, so a
     quaternion counts three. Time is not part of the state.
 
     Attributes:
-        scene: from `load_scene`.
+        scene: the scene, from `load_scene`.
         num_substeps: time steps per step of the system.
-        gradient: which derivative of contact and limit events, "discrete" or "slope"; see `mjxgrad.step`.
-        smoothing: of contacts and limits in the solver, or None; see `mjxgrad.step`.
+        gradient: derivative of contact and limit events, "discrete" or "slope"; see `mjxgrad.step`.
+        smoothing: smoothing of contacts and limits in the solver, or None; see `mjxgrad.step`.
     """
 
     scene: Scene
@@ -147,7 +147,7 @@ class SceneSystem(System):
         return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
 
     def flatten(self, state: State) -> StateVector:
-        """Return a rollout's state as a vector; time and warm start are left out."""
+        """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
     def positions(self, state: Float[Array, "*batch state"]) -> Float[Array, "*batch nq"]:
@@ -166,7 +166,7 @@ class SceneSystem(System):
         )
 
         def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            # Only what the next step needs is carried: the rest of Data would be copied in every turn.
+            # Only these fields are carried: the rest of Data would be copied in every iteration.
             moved = step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
             names = ("qpos", "qvel", "act", "qacc_warmstart")
             return data.replace(**{name: getattr(moved, name) for name in names}), None
@@ -185,7 +185,7 @@ class SceneSystem(System):
         return jnp.concatenate([moved, end[nq:] - start[nq:]])
 
     def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
-        """Give the system with another smoothing; None takes it away."""
+        """Return the system with another smoothing; None removes it."""
         return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
 
 
@@ -209,14 +209,14 @@ class Cost(eqx.Module):
 
 
 class GoalCost(Cost):
-    """Squared distances to a goal, weighted, and squared controls; each with a factor of one half.
+    """Weighted squared distances to a goal and squared controls, each with a factor of one half.
 
     Attributes:
         goal: state to be reached.
-        stage_weight: of the distance in each step, per coordinate of a change.
-        terminal_weight: of that at the end.
-        control_weight: per control.
-        resting: the control that costs nothing.
+        stage_weight: weight of the distance in each step, per coordinate of a change.
+        terminal_weight: weight of the distance at the end, per coordinate of a change.
+        control_weight: weight of each control.
+        resting: the control without cost.
     """
 
     goal: StateVector
@@ -234,14 +234,14 @@ class GoalCost(Cost):
 
 
 class Quadratic(eqx.Module):
-    """A convex quadratic model in changes of state and then control; the terminal one has no control."""
+    """A convex quadratic model in changes of state, then control; the terminal model has no control."""
 
     gradient: Float[Array, " both"]
     hessian: Float[Array, "both both"]
 
 
 def stage_model(cost: Cost, system: System, state: StateVector, control: ControlVector) -> Quadratic:
-    """Expand the cost of a step around a state and a control."""
+    """Return the expansion of the cost of a step around a state and a control."""
     n = system.num_changes
 
     def moved(change: Float[Array, " both"]) -> Float[Array, ""]:
@@ -251,13 +251,13 @@ def stage_model(cost: Cost, system: System, state: StateVector, control: Control
 
 
 def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
-    """Expand the cost of the last state around it."""
+    """Return the expansion of the terminal cost around the last state."""
     at = jnp.zeros(system.num_changes, state.dtype)
     return _model(lambda change: cost.terminal(system, system.retract(state, change)), at)
 
 
 def _model(function, at: Float[Array, " both"]) -> Quadratic:
-    """Return gradient and Hessian, without the negative curvature that would turn descent into ascent."""
+    """Return gradient and Hessian with negative curvature removed, which would turn descent into ascent."""
     hessian = jax.hessian(function)(at)
     values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
     return Quadratic(jax.grad(function)(at), (vectors * jnp.maximum(values, 0)) @ vectors.T)

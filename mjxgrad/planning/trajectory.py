@@ -19,27 +19,27 @@ _Matrix = Float[Array, "m m"]
 _Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
-# A plan has converged once its model promises to lower the cost by no more than this share of it.
+# A plan has converged once its model predicts to lower the cost by no more than this share of it.
 _TOLERANCE = 1e-4
-# Below this many units of rounding of the largest one, an influence of controls on a coordinate is none.
+# An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
 _ROUNDINGS = 100
-# Newton steps of the projected method. Each settles bounds that are active for good, or shortens the way by backtracking; two or
-# three suffice for a few controls, and the rest cost nothing beside a step of the dynamics.
+# Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or three
+# suffice for a few controls; the others cost little beside a step of the dynamics.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
 
 
 class Iterations(eqx.Module):
-    """What happened in an iteration, or in all of them.
+    """The record of one iteration, or of all.
 
     Attributes:
-        factor: of the smoothing under which the step was chosen and measured.
-        smoothed_cost: of the smoothed system after the iteration, under the smoothing of the next.
-        cost: of the system itself under the same controls, infinite if it diverged.
-        step: the length that was accepted, 0 if none lowered the smoothed cost.
-        promised: by how much the model said that a full step lowers the smoothed cost.
-        regularisation: of the backward pass.
-        finite_fraction: the least share of finite samples behind a linear model.
+        factor: factor of the smoothing under which the step was computed.
+        smoothed_cost: cost of the smoothed system after the iteration, under the next iteration's smoothing.
+        cost: cost of the system itself under the same controls, infinite if it diverged.
+        step: accepted step length, 0 if none lowered the smoothed cost.
+        promised: decrease of the smoothed cost that the model predicts for a full step.
+        regularisation: regularisation of the backward pass.
+        finite_fraction: smallest share of finite samples behind a linear model.
     """
 
     factor: _Row
@@ -55,15 +55,15 @@ class Plan(eqx.Module):
     """The controls of least cost that were found; under `jax.vmap` every field gains leading axes.
 
     Attributes:
-        controls: one row per step.
-        states: that the system itself goes through under them.
-        gain: the last feedback around the smoothed trajectory.
-        start_cost: of the controls that were given.
-        cost: of the best ones, never above `start_cost`; both without smoothing.
-        iterations: the course.
-        unmoved: coordinates of a change of the state that cost something and that no control moves, by the last model. There
-            nothing is touched: their derivatives are zero, and no iteration can improve on them.
-        converged: whether the last model promised almost nothing more; never where a coordinate is unmoved.
+        controls: controls, one row per step.
+        states: states of the system itself under these controls.
+        gain: last feedback gain around the smoothed trajectory.
+        start_cost: cost of the given controls, without smoothing.
+        cost: cost of the best controls, without smoothing; never above `start_cost`.
+        iterations: records of the iterations.
+        unmoved: coordinates of a change of the state that have a cost but that no control moves, by the last model. Their
+            derivatives are zero because nothing is touched, so no iteration can improve them.
+        converged: whether the last model predicts almost no further decrease; never if a coordinate is unmoved.
         diverged: whether the smoothed system left finite numbers, so that iterations were lost.
     """
 
@@ -78,21 +78,22 @@ class Plan(eqx.Module):
     diverged: Bool[Array, ""]
 
     def verdict(self) -> str:
-        """Say in one sentence how it ended; on the host, of a single plan."""
+        """Return one sentence on how the planning ended; on the host, for a single plan."""
         if self.unmoved.any():
             return (
                 f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
-                "which cost, so their derivatives are zero; begin with controls that touch, or smooth by Analytic or Sampled"
+                "which have a cost, so derivatives are zero; start with controls that touch, or smooth by Analytic or Sampled"
             )
         if self.diverged:
-            return "the smoothed system left finite numbers; take smaller steps of time, or tighter limits"
+            return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         return "converged" if self.converged else "not converged; take more iterations"
 
 
 class Feedback(eqx.Module):
-    """The law du = step k + K dx around a trajectory; rows of K of controls that a limit holds are zero.
+    """The feedback law du = step k + K dx around a trajectory; rows of K are zero for controls at a limit.
 
-    `slope` and `curvature` are the derivatives of the cost by the step at 0; it is sound if every step's program was solved.
+    `slope` and `curvature` are the derivatives of the cost by the step length at 0. `is_sound` is whether the quadratic
+    program of every step was solved.
     """
 
     change: _Controls
@@ -102,7 +103,7 @@ class Feedback(eqx.Module):
     is_sound: Bool[Array, ""]
 
     def promised(self, step: ArrayLike = 1.0) -> _Scalar:
-        """Return by how much the model says that the cost falls."""
+        """Return the decrease of the cost that the model predicts."""
         return -jnp.asarray(step) * (self.slope + 0.5 * jnp.asarray(step) * self.curvature)
 
 
@@ -115,7 +116,7 @@ class _Course(eqx.Module):
 
 
 class _Problem(eqx.Module):
-    """What stays the same over all iterations."""
+    """The constants of all iterations."""
 
     system: System
     cost: Cost
@@ -144,7 +145,7 @@ class _Problem(eqx.Module):
         return _Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
     def law(self, smoother: Smoother, course: _Course, regularisation: _Scalar):
-        """Return the feedback law around a course, the least share of finite samples, and which coordinates are unmoved."""
+        """Return the feedback law around a course, the least share of finite samples, and the unmoved coordinates."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
         models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
         stages = jax.vmap(lambda *at: stage_model(cost, system, *at))(states[:-1], controls)
@@ -166,24 +167,23 @@ def optimise_trajectory(
     lower: ArrayLike | None = None,
     upper: ArrayLike | None = None,
 ) -> Plan:
-    """Improve controls by iterating on linear-quadratic models of the smoothed system (iLQR), ever less smoothed.
+    """Improve controls by iterating on linear-quadratic models of the smoothed system (iLQR), with decreasing smoothing.
 
-    In each iteration the system is linearised along its course under the present smoothing, the linear-quadratic problem
-    solved within the control limits, and the best of several step lengths taken, by the cost of the smoothed system under the
-    next, smaller smoothing. What counts in the end is the system itself: its cost under the same controls is recorded, and the
-    best controls of all iterations returned.
+    Each iteration linearises the system along its course under the present smoothing. It solves the linear-quadratic problem
+    within the control limits and takes the best of several step lengths, by the cost of the smoothed system under the next,
+    smaller smoothing. The cost of the system itself under the same controls is recorded, and the controls with the lowest such
+    cost are returned.
 
     Args:
-        system: to be controlled.
-        cost: to be minimised.
+        system: the system to be controlled.
+        cost: the cost to be minimised.
         start: the first state.
-        controls: to begin with, one row per step; clipped to the limits.
-        key: consumed here. All iterations see the same noise, so that costs can be compared.
-        smoother: which linear models, at factor 1; `Exact()` is plain iLQR.
-        schedule: the factor of the smoothing in each iteration, positive. Let it fall to where the smoothed course is the
-            true one.
-        lower: limits of the controls, a number or one per control; None are the actuators' own, `ctrlrange`.
-        upper: likewise.
+        controls: initial controls, one row per step; clipped to the limits.
+        key: consumed here. All iterations use the same noise, so that costs can be compared.
+        smoother: the smoother of the linear models at factor 1; `Exact()` is plain iLQR.
+        schedule: positive factor of the smoothing in each iteration; it should fall until the smoothed course is the true one.
+        lower: lower limits of the controls, a number or one per control; None takes the actuators' own, `ctrlrange`.
+        upper: upper limits of the controls, as `lower`.
 
     Returns:
         The plan; `plan.verdict()` says how it ended.
@@ -210,7 +210,7 @@ def optimise_trajectory(
 
 @compiled
 def _improved(problem: _Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
-    """Return the plan; its data are arguments, so that a receding horizon plans again without compiling."""
+    """Return the plan; its data are arguments, so that a receding horizon needs no new compilation."""
     system, smoother, horizon = problem.system, problem.smoother, len(controls)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
     zero, m = jnp.zeros((), start.dtype), system.num_controls
@@ -228,13 +228,14 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
         course = jax.tree.map(lambda x: x[index], tried)
         true = problem.run(None, course, rest, 0.0)
         best = jax.tree.map(lambda new, old: jnp.where(is_first | (true.cost < best.cost), new, old), true, best)
+        # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
         change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
         after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
         after = jnp.where(is_first, regularisation, after)
         row = Iterations(factor, course.cost, true.cost, steps[index], law.promised(), regularisation, fraction)
         return (course, best, after, law.gain, unmoved), row
 
-    # A turn of the loop before the first finds the given controls' course: outside, it would be compiled once more.
+    # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
     nothing = jnp.zeros(system.num_changes, bool)
@@ -255,17 +256,17 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
 
 
 def shifted(plan: Plan, num_steps: int = 1) -> _Controls:
-    """Return the controls of a plan some steps later, its last one held: where a receding horizon plans again.
+    """Return the controls of a plan some steps later, the last one held, as the next start of a receding horizon.
 
     Args:
-        plan: of which the first steps were taken.
-        num_steps: how many.
+        plan: the plan, whose first steps were taken.
+        num_steps: number of steps taken.
     """
     return plan.controls[np.minimum(np.arange(len(plan.controls)) + num_steps, len(plan.controls) - 1)]
 
 
 def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:
-    """Return which coordinates of the state cost more than rounding, and are moved by no control in any step."""
+    """Return which coordinates of the state cost more than rounding but are moved by no control in any step."""
     n = models.A.shape[-1]
     slopes = jnp.concatenate([stages.gradient[1:, :n], terminal.gradient[None]])
     curvatures = jax.vmap(jnp.diag)(jnp.concatenate([stages.hessian[1:, :n, :n], terminal.hessian[None]]))
@@ -310,7 +311,7 @@ def backward_pass(
 ) -> Feedback:
     """Minimise the quadratic model of the cost-to-go step by step, the last first.
 
-    Models and stages have a leading axis; a control may fall to `lower`, at most 0, and rise to `upper`, from where it is.
+    Models and stages have a leading axis. The change of a control is between `lower`, at most 0, and `upper`, at least 0.
     The regularisation is added to the curvature by the controls, in units of its largest entry; it shortens the steps.
 
     References:
@@ -329,7 +330,7 @@ def backward_pass(
         held = q_uu + regularisation * jnp.max(jnp.diag(q_uu)) * jnp.eye(len(q_u), dtype=q_u.dtype)
         minimum = minimise_in_box(held, q_u, low, high)
         k, K = minimum.value, -_solve_free(held, q_ux, minimum.is_free)
-        # The exact cost-to-go of this law: the shorter forms of it hold without regularisation and limits only.
+        # The exact cost-to-go of this law: its shorter forms hold only without regularisation and limits.
         closed = jnp.concatenate([jnp.eye(n, dtype=K.dtype), K])
         affine = jnp.concatenate([jnp.zeros(n, k.dtype), k])
         value_hessian = closed.T @ hessian @ closed
@@ -346,7 +347,7 @@ def backward_pass(
 
 
 class BoxMinimum(eqx.Module):
-    """The minimiser in a box, which coordinates no bound holds, and whether the gradient of these vanishes, up to rounding."""
+    """The minimiser in a box, its free coordinates, and whether their gradient is zero up to rounding (`is_sound`)."""
 
     value: ControlVector
     is_free: Bool[Array, " m"]
@@ -372,6 +373,7 @@ def minimise_in_box(
     def improve(_, x):
         slope, is_free = free(x)
         direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
+        # Backtracking with all lengths at once: a loop of its own would wait for the slowest problem under vmap.
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
         values = jax.vmap(value)(tried)
         best = jnp.argmin(values)
@@ -387,7 +389,7 @@ def minimise_in_box(
 def _solve_free(
     hessian: _Matrix, right: Float[Array, "m columns"], is_free: Bool[Array, " m"]
 ) -> Float[Array, "m columns"]:
-    """Solve H y = b for the free coordinates, the others held at zero."""
+    """Solve H y = b for the free coordinates, with the others held at zero."""
     both = is_free[:, None] & is_free
     held = jnp.where(both, hessian, jnp.eye(len(hessian), dtype=hessian.dtype))
     return jnp.linalg.solve(held, jnp.where(is_free[:, None], right, 0.0))

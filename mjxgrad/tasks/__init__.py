@@ -1,4 +1,4 @@
-"""Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and what another needs."""
+"""Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and the classes for your own."""
 
 from mjxgrad.objective.task import Outcome, SceneTask, Task
 from mjxgrad.tasks.action_task import ActionTask, scene_path

@@ -1,4 +1,4 @@
-"""A scene to be controlled by actions under noise, with where its optimisation starts; and where the scenes of tasks are."""
+"""A scene controlled by actions under noise, with the start of its optimisation; and the paths of the tasks' scenes."""
 
 from pathlib import Path
 
@@ -18,9 +18,9 @@ class ActionTask(SceneTask):
     """A task with an objective of its own; see `SceneTask`.
 
     Attributes:
-        start_params: where the optimisation starts: the controls, or the policy's parameters.
-        policy: from its parameters and a state to controls; None is open loop.
-        stddev: of the noise on the actions, in their units, unless another is given.
+        start_params: start of the optimisation: the controls, or the policy's parameters.
+        policy: function from its parameters and a state to controls; None is open loop.
+        stddev: default standard deviation of the noise on the actions, in their units.
     """
 
     start_params: PyTree = eqx.field(kw_only=True)
@@ -30,9 +30,11 @@ class ActionTask(SceneTask):
     def objective(
         self, stddev: float | Float[Array, "..."] | None = None, softness: Softness | None = None
     ) -> ActionNoise:
-        """Return the cost under noise on the actions, a function of the controls, or of the policy's parameters.
+        """Return the cost under noise on the actions, a function of the controls or of the policy's parameters.
 
-        The noise is in units of the controls; None takes that of the task, and leaves the softness of contact as it is.
+        Args:
+            stddev: standard deviation in units of the controls; None takes the task's.
+            softness: softness of contact; None leaves it unchanged.
         """
         task = self if softness is None else self.with_softness(softness)
         stddev = self.stddev if stddev is None else stddev
@@ -41,15 +43,15 @@ class ActionTask(SceneTask):
         return closed_loop(task, self.policy, stddev, params=self.start_params)
 
     def initial_params(self) -> Float[Array, " dim"]:
-        """Return where the optimisation starts, as the flat vector that estimators take."""
+        """Return the start of the optimisation as the flat vector that estimators take."""
         return ravel_pytree(self.start_params)[0]
 
 
 def scene_path(name: str) -> Path:
-    """Find the MJCF file of a task by its name.
+    """Return the path of a task's MJCF file by the task's name.
 
     Raises:
-        FileNotFoundError: if there is no such file; the message says where it was looked for.
+        FileNotFoundError: if there is no such file; the message names the folders that were searched.
     """
     for folder in _FOLDERS:
         path = folder / f"{name}.xml"

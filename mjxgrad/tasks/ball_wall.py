@@ -1,7 +1,7 @@
 r"""A ball thrown at an angle over a wall: cleared or blocked.
 
-The example by which the two kinds of gradient part, with real contact in place of a formula. The cost is the squared
-distance between where the ball ends and a target behind the wall, as a function of the angle alone.
+First-order and zeroth-order gradients differ in this example, with real contact in place of a formula. The cost is the
+squared distance between the ball's end and a target behind the wall, a function of the angle alone.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
@@ -19,7 +19,7 @@ from mjxgrad.rollouts import Trajectory, initial_state, rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import scene_path
 
-# The knob is the wall alone: with the floor softened as well, the ball would sink and slide farther, too.
+# Only the wall is softened: on a softer floor the ball would also sink in and slide farther.
 WALL_CONTACT = (("ball", "wall"),)
 
 
@@ -27,9 +27,9 @@ class BallWall(InScene):
     """The throw; see `ball_wall`. Contacts set in without a jump, so derivatives differ only under another impedance.
 
     Attributes:
-        speed: of the throw, in m/s.
-        target: where the ball should end, in m from the start.
-        horizon: number of steps; long enough for the ball to land and stop.
+        speed: speed of the throw, in m/s.
+        target: wanted end of the ball, in m from the start.
+        horizon: number of steps, long enough for the ball to land and stop.
     """
 
     speed: Float[Array, ""]
@@ -37,7 +37,7 @@ class BallWall(InScene):
     horizon: int = eqx.field(static=True)
 
     def trajectory(self, angle: Float[Array, " 1"]) -> Trajectory:
-        """Throw once, at an angle above the floor, in rad."""
+        """Return the trajectory of a throw at an angle above the floor, in rad."""
         qvel = self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])])
         start = initial_state(self.scene, qvel=qvel)
         return rollout(self.scene, start, horizon=self.horizon, gradient=self.gradient, onset=self.onset)
@@ -50,27 +50,27 @@ class BallWall(InScene):
     def objective(self, stddev: float | Float[Array, ""] = 0.1, softness: Softness | None = None) -> ParameterNoise:
         """Return the cost as a function of the angle, with noise on the angle (`stddev` in rad).
 
-        Softness is of all contact, None leaves it as it is; for the wall alone see `wall_softness`.
+        Softness applies to all contacts, and None leaves it unchanged; for the wall alone see `wall_softness`.
         """
         task = self if softness is None else self.with_softness(softness)
         return parameter_noise(task.cost, stddev, dim=1)
 
 
 def ball_wall() -> BallWall:
-    """Load the throw, at 2 m/s at a target 0.38 m away, over 0.42 s, when every throw has landed and stopped.
+    """Return the throw: 2 m/s, a target 0.38 m away, and 0.42 s, by when every throw has landed and stopped.
 
-    With the scene's wall (0.2 m away, 8 cm high) a throw between about 35 and 74 degrees clears the wall, and the
-    landscape jumps at 35; the best throw at the target is at 57 degrees.
+    Throws between about 35 and 74 degrees clear the scene's wall (0.2 m away, 8 cm high). The cost jumps at 35 degrees;
+    the best throw at the target is at 57 degrees.
     """
     return BallWall(load_scene(scene_path("ball_wall")), jnp.asarray(2.0), jnp.asarray(0.38), horizon=210)
 
 
 def wall_softness(stiffness: float | Float[Array, "..."], damping_ratio: float | Float[Array, "..."] = 1.0) -> Softness:
-    """Set the softness of the wall alone.
+    """Return a softness for the wall alone.
 
     Args:
-        stiffness: in 1/s²; 10 is a curtain, 1e5 a brick. At the default time step the wall is stable to 1.7e5.
-        damping_ratio: 1 is critical.
+        stiffness: stiffness in 1/s²: 10 is a curtain, 1e5 a brick. At the default time step the wall is stable up to 1.7e5.
+        damping_ratio: damping ratio; 1 is critical.
 
     Returns:
         The softness, or a stack of them if an argument has an axis.

@@ -1,7 +1,7 @@
 """Gymnasium's hopper, dropped onto its foot under a linear policy that holds a posture.
 
-Nothing in it jumps, and yet its policy gradient is the discrete derivative's hardest case: the foot lands under an impedance
-that is not zero at first touch, so that every parameter that moves the moment of landing is misjudged.
+Nothing in it jumps, and yet its policy gradient is the hardest case of the discrete derivative. The impedance is not zero at
+first touch, so the derivative is wrong for every parameter that shifts the time of landing.
 """
 
 import dataclasses
@@ -16,23 +16,23 @@ from mjxgrad.rollouts import State, Trajectory, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import ActionTask
 
-# Bent, so that the legs take up the landing; moving down, so that it lands after 70 ms.
+# Bent legs absorb the landing; with the downward speed the foot lands after 70 ms.
 START_POSE = (0.0, 1.22, 0.0, -0.4, -0.5, 0.3)  # m, m, rad
 START_VELOCITY = (0.5, -1.0, 0.0, 0.0, 0.0, 0.0)
-# In actions per rad and per rad/s; the motors turn with 200 Nm for an action of 1.
+# In actions per rad and per rad/s; an action of 1 is 200 Nm.
 STIFFNESS, DAMPING = (0.5, 0.5, 0.3), (0.05, 0.05, 0.03)
 
 
 def jump_cost(trajectory: Trajectory) -> Float[Array, ""]:
-    """Return minus the distance forward, less the height of the torso in the end, in m."""
+    """Return minus the forward distance minus the final height of the torso, in m."""
     return -trajectory.qpos[-1, 0] - trajectory.qpos[-1, 1]
 
 
 def hopper(*, horizon: int = 150) -> ActionTask:
-    """Load the drop: the foot lands after 70 ms, and what counts is where the torso is at the end.
+    """Return the drop: the foot lands after 70 ms, and the cost depends on the torso's final position.
 
-    Model and contact are gymnasium's; steps are Euler's, not RK4's, which costs a quarter. The policy sees angles and speeds
-    of the three joints; at the start it holds the posture like springs and dampers. A step is 2 ms.
+    Model and contact are gymnasium's; steps are Euler's, at a quarter of the cost of RK4. The policy observes angles and
+    speeds of the three joints. At first it holds the posture like springs and dampers. A step is 2 ms.
     """
     # Imported here: only this task needs it.
     try:
@@ -48,7 +48,7 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
     posture = dataclasses.replace(zero, gain=gain, offset=stiffness * jnp.array(START_POSE[3:]))
-    # The number of controls is the scene's; pyright takes it for an argument, since `Task` declares it as a variable.
+    # The number of controls is the scene's; pyright expects an argument, since `Task` declares a variable.
     return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,
         state=initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY)),
@@ -60,5 +60,5 @@ def hopper(*, horizon: int = 150) -> ActionTask:
 
 
 def joints(state: State) -> Float[Array, " 6"]:
-    """Observe the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
+    """Return the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
     return jnp.concatenate([state.qpos[3:], state.qvel[3:]])
