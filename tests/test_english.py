@@ -9,12 +9,10 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # "scene: that was checked" sends the reader back for the noun; "scene: the scene that was checked" does not.
 DANGLING = re.compile(r"\s*\W{0,2}(\w+: )?(of|that|by|likewise|what)\b(?!:)", re.IGNORECASE)
-# Folders whose docstrings are mended; the whole library once all are.
-MENDED = ("diagnostics", "identification", "checking", "report", "scene", "rollouts")
 
 
 def test_no_line_of_a_docstring_begins_with_a_dangling_word():
-    paths = [*ROOT.glob("*.py"), *(path for folder in MENDED for path in (ROOT / folder).rglob("*.py"))]
+    paths = [*ROOT.rglob("*.py")]
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
     nodes = [
         (path, node) for path in paths for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds)

@@ -30,7 +30,7 @@ def roll_out(
     Args:
         scene: its model's numbers are arguments of the call, so that they may be traced, mapped over and differentiated by.
         start: `time` of shape (1,), `qpos`, `qvel` and `act`.
-        inputs: what each step is given, by names of `INPUTS`; `ctrl` at least.
+        inputs: arrays with one row per step, under names of `INPUTS`; `ctrl` at least.
         gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `native.events`.
 
     Returns:

@@ -22,7 +22,7 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
   moved together, as one.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
-  Of parameters that do move surfaces (sizes, places) events are not spanned. Jumps that are no event remain unseen: hit or miss,
+  Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
 
 References:
