@@ -2,6 +2,7 @@
 
 import gc
 import os
+from pathlib import Path
 
 import jax
 import pytest
@@ -17,6 +18,8 @@ _QUICK_CODE = (
 if jax.__version_info__ < (0, 11):  # XLA ends the process at a flag that it no longer knows
     _QUICK_CODE += " --xla_cpu_use_fusion_emitters=false"
 
+
+MAPS = Path("/proc/self/maps")
 
 # Traces are large, long-lived graphs of Python objects: to search all of them for garbage each time is a tenth of the time.
 gc.set_threshold(200_000, 50, 1000)
@@ -35,6 +38,17 @@ def pytest_runtest_call():
         if "mjxgrad[mjx]" in str(error):
             pytest.skip("MJX has the maths of another MuJoCo")
         raise
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Give compiled programs back before a process has as many pieces of memory as Linux allows, 65530; XLA then crashes."""
+    if (
+        (nextitem is None or nextitem.path != item.path)
+        and MAPS.exists()
+        and len(MAPS.read_bytes().splitlines()) > 30_000
+    ):
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
