@@ -297,15 +297,12 @@ def _project_poly_onto_poly_plane(poly1: _Polygon, norm1: _Point, poly2: _Polygo
 def _half_way(
     manifold: Callable, one: _Polygon, other: _Polygon, normal: _Point, other_normal: _Point, axis: _Point
 ) -> tuple[Float[Array, "_"], _Polygon, _Polygon]:
-    """Return the contacts of two faces, each once, half way between both; the axis stands upright on the face that clips."""
+    """Return the contacts of two faces, half way between both; the axis stands upright on the face that clips."""
     faces, normals = (one, other), (normal, other_normal)
     if one.shape == other.shape:
         is_other = jnp.abs(axis.dot(other_normal)) > jnp.abs(axis.dot(normal))
         faces, normals = ((jnp.where(is_other, y, x), jnp.where(is_other, x, y)) for x, y in (faces, normals))
     distance, position, normal = manifold(*faces, *normals, axis)
-    # Of fewer than four points MJX takes one several times, which would be as many contacts.
-    is_same = jnp.all(position[:, None] == position[None], axis=2) & (jnp.arange(4)[:, None] > jnp.arange(4))
-    distance = jnp.where(is_same.any(axis=1), 1.0, distance)
     return distance, position + 0.5 * distance[:, None] * normals[0], normal
 
 

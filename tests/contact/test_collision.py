@@ -182,3 +182,18 @@ def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
     assert len(ours) == len(theirs) == 4
     np.testing.assert_allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], atol=1e-8)
     np.testing.assert_allclose(np.asarray(found.dist)[acts], data.contact.dist, atol=1e-9)
+
+
+def test_a_mesh_that_stands_on_three_corners_has_their_contacts():
+    """A prism, 1 mm deep and a little tilted. MJX fills its four places by one of the three corners a second time."""
+    scene = mg.load_scene("""<mujoco><asset><mesh name="prism"
+      vertex="-.1 -.1 0 .12 -.08 0 0 .1 0 -.1 -.1 .1 .12 -.08 .1 0 .1 .1"/></asset><worldbody>
+      <geom type="box" size=".5 .5 .1"/><body pos="0 0 .099" euler=".05 .03 10"><freejoint/>
+        <geom type="mesh" mesh="prism"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    found = mg.forward(scene.model, scene.data)._impl.contact
+    acts = np.asarray(found.dist) < 0
+    ours, theirs = (np.unique(x.round(6), axis=0) for x in (np.asarray(found.pos)[acts], data.contact.pos))
+    assert len(theirs) == 3
+    np.testing.assert_allclose(ours, theirs, atol=2e-6)
