@@ -306,6 +306,14 @@ def _half_way(
     return distance, position + 0.5 * distance[:, None] * normals[0], normal
 
 
+def _once(search: Callable, *shapes: Any) -> tuple[Float[Array, "_"], _Polygon, _Polygon]:
+    """Return contacts as a search of MJX does; of fewer than four it takes one several times, which would count as many."""
+    distance, position, normal = search(*shapes)
+    order = jnp.arange(len(position))
+    is_same = jnp.all(position[:, None] == position[None], axis=2) & (order[:, None] > order)
+    return jnp.where(is_same.any(axis=1), 1.0, distance), position, normal
+
+
 def _arcs_intersect(a: _Point, b: _Point, c: _Point, d: _Point) -> Bool[Array, ""]:
     """Return whether arcs AB and CD of the unit sphere cross by more than rounding."""
     first, second = jnp.cross(b, a), jnp.cross(d, c)
@@ -320,6 +328,10 @@ _convex = copy_of(
     _project_poly_onto_poly_plane=_project_poly_onto_poly_plane,
 )
 _convex._create_contact_manifold = partial(_half_way, _convex._create_contact_manifold)
+# MJX decides between faces and edges by the distances of all four: repeated contacts are marked after that.
+_convex._box_box_impl, _convex._sat_gaussmap = (
+    partial(_once, f) for f in (_convex._box_box_impl, _convex._sat_gaussmap)
+)
 _own = {f: getattr(_convex, name) for name, f in vars(sys.modules[_convex.__name__]).items() if hasattr(f, "ncon")}
 # MJX's function for each pair of types; those of boxes, capsules, meshes and height fields are copies with safe quotients.
 _MJX_FUNCTIONS = {kinds: _own.get(f, f) for kinds, f in _PLAIN.items()}
