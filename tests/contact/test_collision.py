@@ -185,7 +185,7 @@ def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
 
 
 def test_a_mesh_that_stands_on_three_corners_has_their_contacts():
-    """A prism, 1 mm deep and a little tilted. MJX fills its four places by one of the three corners a second time; it counts once."""
+    """A prism, 1 mm deep and a little tilted. MJX takes one of the three corners a second time; it counts once."""
     scene = mg.load_scene("""<mujoco><asset><mesh name="prism"
       vertex="-.1 -.1 0 .12 -.08 0 0 .1 0 -.1 -.1 .1 .12 -.08 .1 0 .1 .1"/></asset><worldbody>
       <geom type="box" size=".5 .5 .1"/><body pos="0 0 .099" euler=".05 .03 10"><freejoint/>
