@@ -1,6 +1,7 @@
 """C MuJoCo on all cores: batches of rollouts, and the Jacobians of their steps by differences."""
 
 import copy
+import dataclasses
 import functools
 import math
 import os
@@ -14,7 +15,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.native.events import Events, Surfaces, levers_of
+from mjxgrad.native.events import Events, Near, Surfaces, levers_of
 from mjxgrad.scene.scene import with_numbers
 
 Gradient = Literal["discrete", "slope"]
@@ -26,6 +27,8 @@ _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
+_RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, while something touches
+_NOTHING = 1e-9  # of a displacement by one
 _TOLERANCE, _ITERATIONS = 1e-14, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 
 _Arrays = Mapping[str, np.ndarray]
@@ -211,21 +214,21 @@ class _Linearisation:
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            events, spanned, clear = self._events(model, row, ends[1])
-            size = max(np.abs(change).max(), np.abs(push).max(initial=0.0), 1e-30)
-            nv, felt = model.nv, np.zeros(0)
-            if events is not None:
-                felt = events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
-                rest = np.concatenate([change[:nv] - events.moves @ felt, change[nv:]])
-            else:
-                rest = change
+            near, spanned, clear = self._near(model, row, ends[1])
+            nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
+            if near is not None and near.events is not None:
+                felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
+                rest[:nv] -= near.events.moves @ felt
+                moved += spanned @ felt
+            if near is not None and near.touches:
+                moved += self._along(model, clear, rest[:nv], near)
+                rest[:nv] = 0.0
+            width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
             sides = []
-            for side in (_WIDTH / size, -_WIDTH / size):
+            for side in (width, -width):
                 sides.append(self._moved(model, clear, side * rest))
                 sides[-1][self.places["ctrl"]] += side * push
-            change = self._difference(model, *sides) * size / (2 * _WIDTH)
-            if events is not None:
-                change += spanned @ felt
+            change = moved + self._difference(model, *sides) / (2 * width)
             for place, end in zip(parts, ends, strict=True):
                 row[place] = end
             row[self.places["time"]] += model.opt.timestep
@@ -238,37 +241,63 @@ class _Linearisation:
         if not np.isfinite(after).all():
             return
         row[self.places["warmstart"]] = self.data.qacc_warmstart
-        events, spanned, clear = self._events(model, row, after)
-        self._small(model, clear, found)
+        near, spanned, clear = self._near(model, row, after)
+        self._small(model, clear, found, self._width(near))
+        if near is None:
+            return
+        matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
         if events is not None:
-            matrix = found["state"]
-            nv, change = model.nv, spanned - matrix[:, : model.nv] @ events.moves
-            matrix[:, :nv] += change @ events.rows
-            matrix[:, nv : 2 * nv] += self.surfaces.lead * change @ events.rows
+            rest -= events.moves @ events.rows
+            jumps = spanned - matrix[:, :nv] @ events.moves
+            matrix[:, nv : 2 * nv] += self.surfaces.lead * jumps @ events.rows
+        if near.touches:
+            for column, direction in enumerate(rest.T):
+                matrix[:, column] = self._along(model, clear, direction, near)
+        else:
+            matrix[:, :nv] = matrix[:, :nv] @ rest
+        if events is not None:
+            matrix[:, :nv] += spanned @ events.rows
 
-    def _events(
+    def _along(
+        self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, near: Near
+    ) -> Float[np.ndarray, " size"]:
+        """Return the derivative along a displacement, by as much as moves surfaces visibly."""
+        if np.abs(change).max() < _NOTHING:  # what an event leaves of a coordinate that moves it alone
+            return np.zeros(2 * model.nv + model.na)
+        width = near.width(change)
+        return self._difference(model, *(self._moved(model, row, side * width * change) for side in (1, -1))) / (
+            2 * width
+        )
+
+    def _width(self, near: Near | None) -> float:
+        """Return the width of differences by all but positions: under friction, small ones see what comes of rounding.
+
+        The stages of Runge-Kutta have other positions at other velocities, and would meet surfaces.
+        """
+        return _WIDTH if near is None or not near.touches or self.surfaces.lead else _RUBBING
+
+    def _near(
         self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
-    ) -> tuple[Events | None, np.ndarray, np.ndarray]:
-        """Return what a step may begin or end, D, and the state about which small differences cross no surface."""
-        nothing = (None, np.zeros((0, 0)), row)
-        if self.gradient != "slope" or not np.isfinite(after).all():
-            return nothing
-        mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
-        events = self.surfaces.events(self.far, row[self.places["qvel"]], after)
-        if events is None:
-            return nothing
-        spanned = self._spanned(model, row, events)
+    ) -> tuple[Near | None, np.ndarray, np.ndarray]:
+        """Return what is near, D of what a step may begin or end, and the state about which differences cross no surface."""
+        near, nothing = None, np.zeros((0, 0))
+        if self.gradient == "slope" and np.isfinite(after).all():
+            mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
+            near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
+        if near is None or near.events is None:
+            return near, nothing, row
+        spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
-            return nothing
-        near, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
+            return dataclasses.replace(near, events=None), nothing, row
+        least, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
         off = events.gaps - surfaces
         off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
-        shift = np.where(np.abs(off) < near, np.where(off < 0, -near, near) - off, 0.0)
+        shift = np.where(np.abs(off) < least, np.where(off < 0, -least, least) - off, 0.0)
         clear = self._moved(model, row, events.moves @ shift)
         if self.surfaces.lead:
-            for move, width in zip(events.moves.T, near / 4, strict=True):
+            for move, width in zip(events.moves.T, least / 4, strict=True):
                 clear = self._off_stages(model, clear, width * move)
-        return events, spanned, clear
+        return near, spanned, clear
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.
@@ -294,16 +323,16 @@ class _Linearisation:
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 
-    def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
-        """Write differences of small width by all that is wanted."""
+    def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
+        """Write differences of this width by all that is wanted."""
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))
         if is_refused:  # by MuJoCo's own function
-            self._by_columns(model, row, found)
+            self._by_columns(model, row, found, width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
-            mujoco.mjd_transitionFD(model, self.data, _WIDTH, True, found["state"], by_control, *sensors)
+            mujoco.mjd_transitionFD(model, self.data, width, True, found["state"], by_control, *sensors)
         for name in found.keys() - {"state", "C", "D"} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
@@ -311,17 +340,17 @@ class _Linearisation:
             for column in range(found[name].shape[1]):
                 ends = [row.copy(), row.copy()]
                 for end, side in zip(ends, (1, -1), strict=True):
-                    end[self.places[name].start + column] += side * _WIDTH
-                found[name][:, column] = self._difference(model, *ends) / (2 * _WIDTH)
+                    end[self.places[name].start + column] += side * width
+                found[name][:, column] = self._difference(model, *ends) / (2 * width)
                 if name == "ctrl" and "D" in found:
-                    found["D"][:, column] = self.sensed / (2 * _WIDTH)
+                    found["D"][:, column] = self.sensed / (2 * width)
 
-    def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
+    def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
         for column, change in enumerate(np.eye(len(found["state"]))):
-            ends = [self._moved(model, row, side * _WIDTH * change) for side in (1, -1)]
-            found["state"][:, column] = self._difference(model, *ends) / (2 * _WIDTH)
+            ends = [self._moved(model, row, side * width * change) for side in (1, -1)]
+            found["state"][:, column] = self._difference(model, *ends) / (2 * width)
             if "C" in found:
-                found["C"][:, column] = self.sensed / (2 * _WIDTH)
+                found["C"][:, column] = self.sensed / (2 * width)
 
     def _by_number(self, model: mujoco.MjModel, row: np.ndarray, name: str, jacobian: np.ndarray) -> None:
         """Write differences by the entries of an array of the model."""

@@ -21,6 +21,9 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
   moved together, as one.
+- **Geometry.** Where contacts act, A₀ is by displacements along 1 - P J that move a body's farthest point by 0.06 mm, not by
+  small ones: the lowest point of a cylinder that stands, or of a mesh that lies, runs along its rim at tilts of rounding size,
+  and a derivative of that multiplied motions by 1e30 in fifty steps.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
@@ -38,6 +41,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
+_HAIR = 6e-5  # m, over which the geometry of contacts is averaged
+_LARGEST_TURN = 0.02  # rad, of the smallest bodies
+_NOTHING = 1e-30
 _STAGES = 1.2  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
 _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
 _USUAL_WIDTH = 1e-3  # m or rad; wider impedances, of soft limits, reach states that come to no surface
@@ -68,6 +74,31 @@ class Events:
     moves: Float[np.ndarray, "nv events"]
 
 
+@dataclass(frozen=True)
+class Near:
+    """Contacts and limits near a position.
+
+    Attributes:
+        events: those that the step may begin or end, or None.
+        touches: whether a contact acts, or may.
+        rows: J of the others.
+        gaps: gaps of the others (m or rad).
+        lengths: how far each joint velocity moves the farthest point of its bodies (m or 1).
+    """
+
+    events: Events | None
+    touches: bool
+    rows: Float[np.ndarray, "others nv"]
+    gaps: Float[np.ndarray, " others"]
+    lengths: Float[np.ndarray, " nv"]
+
+    def width(self, change: Float[np.ndarray, " nv"]) -> float:
+        """Return by how many times a displacement moves a body's farthest point a hair's breadth, across no surface."""
+        crossing = np.abs(self.gaps) / np.maximum(np.abs(self.rows @ change), _NOTHING)
+        by_turn = _LARGEST_TURN / np.abs(change).max()
+        return min(_HAIR / np.max(self.lengths * np.abs(change)), by_turn, 0.9 * crossing.min(initial=np.inf))
+
+
 class Surfaces:
     """The gaps of a model's contacts and limits, also of those that do not act yet."""
 
@@ -90,27 +121,29 @@ class Surfaces:
         far.tendon_margin[:] += self.limit_reach
         far.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
-    def events(
+    def near(
         self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
-    ) -> Events | None:
-        """Return what begins or ends within half a step of the position in `data`, moving as before and after the step."""
+    ) -> "Near | None":
+        """Return what is near the position in `data`, moving as before and after the step; None if nothing is."""
         mujoco.mj_fwdPosition(self.model, data)
         if not data.nefc:
             return None
-        rows, gaps, least, jumps = self._gaps(data)
+        num_contacts, rows, gaps, least, jumps = self._gaps(data)
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.lead:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
             centres, widths = -self.lead * rate, _STAGES * widths
         widths = np.maximum(widths, least)
+        touches = bool(np.any((gaps - centres < widths)[:num_contacts]))
         chosen = (np.abs(gaps - centres) < widths) & jumps
-        if not chosen.any():
-            return None
-        return _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
+        events = None
+        if chosen.any():
+            events = _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
+        return Near(events, touches, rows[~chosen], gaps[~chosen], self.lengths)
 
-    def _gaps(self, data: mujoco.MjData) -> tuple[_Rows, _PerRow, _PerRow, Bool[np.ndarray, " rows"]]:
-        """Return J, gap, least width and whether force jumps, of each contact, along its normal, and of each limit."""
+    def _gaps(self, data: mujoco.MjData) -> tuple[int, _Rows, _PerRow, _PerRow, Bool[np.ndarray, " rows"]]:
+        """Return how many contacts come first, and J, gap, least width, and whether force jumps, of contacts and limits."""
         model, jacobian = self.model, data.efc_J.reshape(-1, self.model.nv)
         contact = data.contact
         first = np.asarray(contact.efc_address)
@@ -131,6 +164,7 @@ class Surfaces:
         width = np.where(width > 0, np.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
         return (
+            len(first),
             rows,
             data.efc_pos[address] - data.efc_margin[address] + margin,
             _LEAST_WIDTH * width,
