@@ -51,6 +51,7 @@ _SOLVE, _WIDTH = 1e-15, 1e-6
 _HORIZON, _INTERVAL = 50, (-0.25, 0.25)
 _PHASES = (33, 129, 513)  # starts, and how many where fewer do not tell
 _LONGEST = 12.0  # s, after which no more starts are taken
+_WILD = 10.0  # scatter of single derivatives over the slope, from which flags are asked for
 _FEWEST_TEETH = 4  # steps' phases that starts must cover
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
 # condition of contact, stiff rows on light bodies, up to 1e5; C's engine computes in double precision in any case.
@@ -182,7 +183,8 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
             shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
             shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
-    if shown["steps"] == "off" or shown["lost"]:
+    is_wild = shown["steps"] == "consistent" and shown["spread"] > _WILD * max(abs(shown["slope"]), shown["resolution"])
+    if shown["steps"] == "off" or shown["lost"] or is_wild:
         outcomes, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
         shown["lost"] = int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients) & ~flags))
         shown["steps"] = "flagged" if flags.any() else shown["steps"]
