@@ -15,6 +15,7 @@ from scipy.stats import mannwhitneyu
 import mjxgrad as mg
 from experiments import ppo
 from experiments.bundle import bundled
+from experiments.problems.quadruped import quadruped
 from experiments.problems.trot import trot
 from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
@@ -40,7 +41,7 @@ NAMES = {
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
-    "quadruped": envs.quadruped,
+    "quadruped": quadruped,
     "trot": trot,
     **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name not in ("quadruped", "trot")},
 }

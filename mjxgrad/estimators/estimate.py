@@ -55,8 +55,8 @@ class GradientEstimate(eqx.Module):
         num_rollouts: rollouts spent, a zero-noise baseline included.
         num_gradient_rollouts: rollouts that were differentiated.
         diagnosis: an item of `Diagnosis`.
-        alpha: weight of the first-order part: one number, or from `per_step` one per step and action.
-        reason: an item of `Reason` for each `alpha`; every estimator may give `Reason.nothing_felt`.
+        alpha: weight of the first-order part.
+        reason: an item of `Reason`; every estimator may give `Reason.nothing_felt`.
         bias_bound: an upper bound on the norm of the bias of `value`, if the rule that chose `alpha` knows one. Zero for
             an unbiased estimate, NaN where nothing is known.
     """
@@ -71,7 +71,7 @@ class GradientEstimate(eqx.Module):
     num_rollouts: Int[Array, ""]
     num_gradient_rollouts: Int[Array, ""]
     diagnosis: Diagnosis
-    alpha: Float[Array, "*blocks"]
+    alpha: Float[Array, ""]
     reason: Reason
     bias_bound: Float[Array, ""]
 

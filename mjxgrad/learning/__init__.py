@@ -1,7 +1,7 @@
 """Policies learned through contact: short windows with a value function, by first order, zeroth order, or a mixture."""
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
-from mjxgrad.learning.learn import Learned, learn, to_csv
+from mjxgrad.learning.learn import Learned, learn
 from mjxgrad.learning.learner import Learner, Policy
 from mjxgrad.learning.settings import Settings, apg
 from mjxgrad.loop import Log
@@ -16,5 +16,4 @@ __all__ = [
     "apg",
     "evaluate",
     "learn",
-    "to_csv",
 ]

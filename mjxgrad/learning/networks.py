@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.objective.policy import FINAL_SCALE
-
 
 class Network(eqx.Module):
     """A multilayer perceptron whose hidden layers end in an exponential linear unit and layer normalisation.
@@ -80,19 +78,3 @@ class Normaliser(eqx.Module):
         count, shift = self.count + added, mean - self.mean
         share = added / jnp.maximum(count, 1)
         return Normaliser(count, self.mean + share * shift, self.squares + squares + shift**2 * self.count * share)
-
-
-def make_actor(
-    num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray, hidden_scale: float = 1.0
-) -> Network:
-    """Draw a network for actions before squashing, near zero at first."""
-    return Network.make(
-        [num_observations, *hidden, num_actions], key, hidden_scale=hidden_scale, final_scale=FINAL_SCALE
-    )
-
-
-def make_critic(
-    num_observations: int, hidden: Sequence[int], key: PRNGKeyArray, *, final_scale: float = 1.0
-) -> Network:
-    """Draw a network for the value of an observation."""
-    return Network.make([num_observations, *hidden, 1], key, final_scale=final_scale)

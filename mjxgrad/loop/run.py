@@ -105,7 +105,6 @@ def run(
     over: Sequence[list[int | None] | None] = (),
     log: Log | None = None,
     checkpoint: Path | None = None,
-    checkpoint_every: int = 1,
     on_all_devices: bool = False,
 ) -> Any:
     """Repeat a method until it is over, and return its `result`.
@@ -118,8 +117,7 @@ def run(
         over: axes of the method's arrays for each leading axis of the start: None for many starts of one method, else the
             list from `side_by_side`. All runs are in one program.
         log: function called after every segment with the number of steps done and the method's `metrics`.
-        checkpoint: file to save the run in, and to resume it from.
-        checkpoint_every: segments between two saves. An interrupted run is saved in any case.
+        checkpoint: file to save the run in after every segment, and to resume it from.
         on_all_devices: whether all devices of all processes get the arrays, for a method that spreads its work over them.
 
     Raises:
@@ -151,24 +149,18 @@ def run(
     if checkpoint is not None and checkpoint.exists():
         carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
         progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
-    on_disk, compiled, is_first = progress.num_steps, None, jax.process_index() == 0
-    try:
-        while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
-            given = numbers, progress.carry, np.int32(done), np.int32(min(done + segment, num_steps))
-            if compiled is None:
-                began = time.perf_counter()
-                compiled = compile_once(steps.lower(*given))
-                progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
-            progress = _after(progress, functools.partial(compiled, *given))
-            if checkpoint is not None and is_first and progress.num_steps - on_disk >= checkpoint_every * segment:
-                checkpoints.save(checkpoint, progress[:3], identity)
-                on_disk = progress.num_steps
-            if log is not None and is_first:
-                log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
-    finally:
-        # Also after an interruption: KeyboardInterrupt goes on to the caller.
-        if checkpoint is not None and is_first and progress.num_steps > on_disk:
+    compiled, is_first = None, jax.process_index() == 0
+    while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
+        given = numbers, progress.carry, np.int32(done), np.int32(min(done + segment, num_steps))
+        if compiled is None:
+            began = time.perf_counter()
+            compiled = compile_once(steps.lower(*given))
+            progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
+        progress = _after(progress, functools.partial(compiled, *given))
+        if checkpoint is not None and is_first:
             checkpoints.save(checkpoint, progress[:3], identity)
+        if log is not None and is_first:
+            log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
     return method.result(progress)
 
 

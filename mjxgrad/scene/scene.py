@@ -99,7 +99,7 @@ class Scene(eqx.Module):
             ValueError: as `Softness.apply`.
         """
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
-        for message in softness_warnings(softness, scene.model, self.mj_model) + scene.warnings():
+        for message in softness_warnings(softness, scene.model) + scene.warnings():
             _warn(self, message)
         return scene
 

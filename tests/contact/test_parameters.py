@@ -21,7 +21,7 @@ GEOMS = {
     "winner": 'priority="2" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.1 0 0" condim="6" margin="0.002"',
     "loser": 'priority="-1" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="3 0 0"',
     "direct": 'solref="-3000 -70" solimp="0.5 0.7 0.01 0.5 2"',
-    "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0 0.5 2"',
+    "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0.002 0.5 2"',
     "explicit": 'solref="0.9 1" friction="9 9 9"',
 }
 PAIR = (

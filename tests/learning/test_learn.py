@@ -238,15 +238,6 @@ def test_settings_out_of_range_are_refused(change, message):
         learning.Settings(**change)
 
 
-def test_logs_reach_a_file(tmp_path):
-    log = learning.to_csv(tmp_path / "run.csv")
-    log(10, {"reward": 1.5, "alpha": 1.0})
-    log(20, {"reward": 2.5, "alpha": 0.5})
-    assert (tmp_path / "run.csv").read_text().splitlines() == ["step,reward,alpha", "10,1.5,1.0", "20,2.5,0.5"]
-    with pytest.raises(ValueError, match="must have the columns step, cost"):
-        learning.to_csv(tmp_path / "run.csv")(30, {"cost": 1.0})
-
-
 _PROGRAM = """
     import sys
 
