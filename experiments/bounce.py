@@ -17,14 +17,13 @@ from matplotlib.colors import LogNorm
 from pydantic import Field, model_validator
 
 from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, at_time_step, motion
-from experiments.problems.restitution import integrated_restitution
 from experiments.problems.textbook import bounce_scene
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.words import joined, percent
 from experiments.workspace import Workspace
-from mjxgrad.contact.bounce import Bounce
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.scene import Scene
 

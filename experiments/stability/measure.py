@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
-from experiments.problems.restitution import integrated_restitution
 from experiments.stability.classes import (
     UNSOLVED,
     Derivative,
@@ -37,7 +36,7 @@ from experiments.stability.simulators import (
     simulate,
 )
 from experiments.workspace import Workspace
-from mjxgrad.contact.bounce import Bounce
+from mjxgrad.contact.bounce import Bounce, integrated_restitution
 from mjxgrad.diagnostics import soundness
 
 C_MUJOCO = "C MuJoCo"

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
@@ -165,10 +165,9 @@ class Softness(eqx.Module):
             model = self._set_margin(model, selected, list(explicit))
         if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
             return model
-        _refuse_shared_geoms(model, selected)
+        _refuse_shared_geoms(model, selected, functools.partial(deciding_geoms, model))
         # The pair of each geom to write.
         geoms = {geom: i for i, p in enumerate(selected) for geom in deciding_geoms(model, p)}
-
         model = model.replace(
             geom_solimp=self._set_solimp(model.geom_solimp, list(geoms)),
             pair_solimp=self._set_solimp(model.pair_solimp, list(explicit)),
@@ -224,7 +223,7 @@ class Softness(eqx.Module):
                     "where they touch; select other pairs, or replace the mesh by primitive geoms"
                 )
         _refuse_shared_geoms(model, pairs, _summed_geoms)
-        geoms = sorted({geom for pair in pairs for geom in _summed_geoms(model, pair)})
+        geoms = sorted({geom for pair in pairs for geom in _summed_geoms(pair)})
         geom_margin, pair_margin = model.geom_margin, model.pair_margin
         if geoms:
             geom_margin = geom_margin.at[np.array(geoms)].set(0.5 * self.margin)
@@ -249,23 +248,19 @@ def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
     return values.at[np.array(list(places))].set(per_pair[np.array(list(places.values()))])
 
 
-def _summed_geoms(model: mjx.Model, pair: ContactPair) -> tuple[int, ...]:
+def _summed_geoms(pair: ContactPair) -> tuple[int, ...]:
     """Return the geoms whose margins add up to that of a pair: none if it is explicit."""
-    del model
     return () if pair.explicit >= 0 else (pair.geom1, pair.geom2)
 
 
 def _refuse_shared_geoms(
-    model: mjx.Model,
-    selected: _Pairs,
-    deciding: Callable[[mjx.Model, ContactPair], tuple[int, ...]] = deciding_geoms,
+    model: mjx.Model, selected: _Pairs, geoms_of: Callable[[ContactPair], tuple[int, ...]]
 ) -> None:
     """Refuse to change pairs whose geoms also determine the contacts of other pairs."""
-    decided_by = {geom: pair for pair in selected for geom in deciding(model, pair)}
-    for other in contact_pairs(model):
-        if other in selected:
-            continue
-        for geom in deciding(model, other):
+    decided_by = {geom: pair for pair in selected for geom in geoms_of(pair)}
+    chosen = set(selected)
+    for other in (pair for pair in contact_pairs(model) if pair not in chosen):
+        for geom in geoms_of(other):
             if geom in decided_by:
                 name = other.names[0] if geom == other.geom1 else other.names[1]
                 raise ValueError(

@@ -117,20 +117,9 @@ def assemble(
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over independent units: samples, or pairs of them.
-
-    Args:
-        value: mean over the units.
-        squared_error: squared standard error of `value`.
-        costs: moments of the costs.
-        plan: the rollouts that were asked for.
-        count: number of finite units.
-        num_felt: number of units whose noise made a difference, or cannot tell.
-        restore: map from a vector to the form of the parameters.
-        has_baseline: whether the baseline is finite.
-        alpha: weight of the first-order part.
-        reason: an item of `Reason`.
-        bias_bound: upper bound on the norm of the bias.
+    Moments and counts are over independent units: samples, or pairs of them. `count` is the number of finite units,
+    `num_felt` that of units whose noise made a difference, or cannot tell. `restore` maps a vector to the form of the
+    parameters, and `has_baseline` says whether the baseline is finite.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

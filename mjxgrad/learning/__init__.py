@@ -3,7 +3,7 @@
 from mjxgrad.learning.evaluate import Evaluation, evaluate
 from mjxgrad.learning.learn import Learned, learn
 from mjxgrad.learning.learner import Learner, Policy
-from mjxgrad.learning.settings import Settings, apg
+from mjxgrad.learning.settings import Settings
 from mjxgrad.loop import Log
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "Log",
     "Policy",
     "Settings",
-    "apg",
     "evaluate",
     "learn",
 ]

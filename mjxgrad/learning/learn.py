@@ -11,7 +11,7 @@ mixing rule:
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
 | `rules.Consistent(failure_probability=1e-3)` | the same with a test for bias: α-order, the default |
 
-With the settings `apg()` there is no value function: analytic policy gradients (APG).
+Without a value function (`has_critic=False`) first order is analytic policy gradients (APG).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.

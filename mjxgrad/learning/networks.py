@@ -22,14 +22,10 @@ class Network(eqx.Module):
     def make(
         cls, sizes: Sequence[int], key: PRNGKeyArray, *, hidden_scale: float = 1.0, final_scale: float = 1.0
     ) -> "Network":
-        """Draw a network.
+        """Draw a network; `sizes` are the number of inputs, the sizes of the hidden layers, and the number of outputs.
 
-        Args:
-            sizes: number of inputs, sizes of the hidden layers, number of outputs.
-            key: consumed here.
-            hidden_scale: factor of the gains and offsets of the hidden layers. Normalisation undoes it in the output, but
-                it changes the relative size of the optimiser's steps.
-            final_scale: factor of the gains of the last layer.
+        `hidden_scale` is a factor of the gains and offsets of the hidden layers. Normalisation undoes it in the output, but
+        it changes the relative size of the optimiser's steps. `final_scale` is a factor of the gains of the last layer.
         """
         keys = jax.random.split(key, len(sizes) - 1)
         layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]

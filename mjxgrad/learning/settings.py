@@ -1,9 +1,8 @@
-"""Settings for learning from short windows: SHAC's, and those of analytic policy gradients (`apg`)."""
+"""Settings for learning from short windows; the defaults are SHAC's."""
 
 import dataclasses
-from typing import Any
 
-from mjxgrad.estimators.rules import Consistent, FixedAlpha, Rule
+from mjxgrad.estimators.rules import Consistent, Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,30 +61,3 @@ class Settings:
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
                 f"got {self.critic_batches}"
             )
-
-
-def apg(**changes: Any) -> Settings:
-    """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
-
-    There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
-    falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
-    which allows larger rates.
-
-    Args:
-        changes: settings that replace these.
-
-    References:
-        Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
-        (`brax/training/agents/apg`).
-    """
-    settings = {
-        "discount": 1.0,
-        "rule": FixedAlpha(1.0),
-        "stddev": (0.07, 0.01),
-        "actor_layers": (256, 128),
-        "actor_scale": 0.01,
-        "actor_rate": 1e-4,
-        "actor_decay": 0.997,
-        "has_critic": False,
-    }
-    return Settings(**(settings | changes))

@@ -37,13 +37,6 @@ def optimise(
 ) -> Optimisation:
     r"""Minimise a cost under noise by descent along estimated gradients.
 
-        estimator = functools.partial(mg.estimators.zeroth_order, num_samples=64)
-        result = mg.optimise(
-            objective, params, jax.random.key(0),
-            estimator=estimator, optimiser=optax.adam(1e-2), num_steps=300,
-        )
-        result.best_params, result.history.cost, mg.Stopped[result.stopped]
-
     There is one compilation for all steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
@@ -54,27 +47,18 @@ def optimise(
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.
 
-        noisy = mg.parameter_noise(function, stddev=0.3)
-        mg.optimise(
-            lambda scale: noisy.with_stddev(0.3 * scale), params, key,
-            annealing=optax.exponential_decay(1.0, 100, 0.5, end_value=0.05), ...
-        )
-        # Contact from soft to stiff:
+        # Contact from soft to stiff; likewise objective.with_stddev(0.3 * scale) for less and less noise.
         mg.optimise(
             lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
             annealing=optax.exponential_decay(1.0, 10, 0.5, end_value=0.01), ...
         )
-
-    With a progress bar of tqdm:
-
-        mg.optimise(..., log=lambda step, metrics: (bar.update(step - bar.n), bar.set_postfix(cost=metrics["cost"])))
 
     Args:
         objective: the objective to minimise, or with `annealing` a function from a scale to an objective.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
             dict or an equinox module. The function of `parameter_noise` and `evaluate` then take a pytree of the same
             form, and the result has this form. Estimators see all its arrays as one vector.
-        key: consumed here; with a leading axis, one per seed.
+        key: key of all noise; with a leading axis, one per seed.
         estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
             settings bound by `functools.partial`.
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.

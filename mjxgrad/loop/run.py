@@ -110,7 +110,7 @@ def run(
     """Repeat a method until it is over, and return its `result`.
 
     Args:
-        method: the method to repeat.
+        method: the method.
         start: argument of the method's `init`.
         num_steps: largest number of steps.
         segment: steps in one program; logs and checkpoints come between segments.

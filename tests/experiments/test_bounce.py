@@ -100,18 +100,3 @@ def test_settings_that_cannot_be_are_a_sentence(tmp_path, override, sentence):
     (tmp_path / "ball.toml").write_text(SETTINGS)
     with pytest.raises(ConfigurationError, match=sentence):
         load_runs(str(tmp_path / "ball.toml"), [override])
-
-
-@pytest.mark.parametrize("damping_ratio", [0.1, 0.6, 1.0, 1.00003, 2.0])
-def test_quadrature_of_the_contact_agrees_with_the_closed_form(damping_ratio):
-    """Its tolerance is 1e-10 per step; errors of a few hundred steps add up."""
-    bounce = Bounce(0.02, damping_ratio, 2.0)
-    restitution, duration = integrated_restitution(0.02, damping_ratio, (0.7, 0.7, 0.001), speed=2.0)
-    assert restitution == pytest.approx(float(bounce.restitution), rel=1e-8)
-    assert duration == pytest.approx(float(bounce.duration), rel=1e-8)
-
-
-def test_a_ball_that_is_not_released_in_time_is_refused():
-    """An impedance that hardly rises within a kilometre hardly stops it."""
-    with pytest.raises(ValueError, match="the ball must be released within 2"):
-        integrated_restitution(0.02, 1.0, (0.0, 0.95, 1e3))

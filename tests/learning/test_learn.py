@@ -183,7 +183,10 @@ def test_an_evaluation_ends_with_the_episode(cartpole, key):
 
 def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     """The gradient of one update against that of a plain sum over all windows; with hardly any noise, from the same starts."""
-    settings = learning.apg(num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf)
+    settings = learning.Settings(
+        num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
+        discount=1.0, rule=FixedAlpha(1.0), has_critic=False,
+    )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
     before = ActorCritic(cartpole, settings, 1).init(key)
 
