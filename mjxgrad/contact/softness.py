@@ -162,7 +162,7 @@ class Softness(eqx.Module):
         before = contact_parameters(model, selected)
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
         if self.margin is not None:
-            model = self._set_margin(model, selected, list(explicit))
+            model = _with_margin(model, self.margin, selected, list(explicit))
         if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
             return model
         _refuse_shared_geoms(model, selected, functools.partial(deciding_geoms, model))
@@ -214,23 +214,6 @@ class Softness(eqx.Module):
         damping = 2.0 * damping_ratio * safe_sqrt(stiffness)
         return jnp.stack([-stiffness, -jnp.broadcast_to(damping, stiffness.shape)], axis=-1)
 
-    def _set_margin(self, model: mjx.Model, pairs: _Pairs, explicit: list[int]) -> mjx.Model:
-        """Write the margin to explicit pairs, and half of it to each geom of other pairs, since MuJoCo adds the two."""
-        for pair in pairs:
-            if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
-                raise ValueError(
-                    f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only "
-                    "where they touch; select other pairs, or replace the mesh by primitive geoms"
-                )
-        _refuse_shared_geoms(model, pairs, _summed_geoms)
-        geoms = sorted({geom for pair in pairs for geom in _summed_geoms(pair)})
-        geom_margin, pair_margin = model.geom_margin, model.pair_margin
-        if geoms:
-            geom_margin = geom_margin.at[np.array(geoms)].set(0.5 * self.margin)
-        if explicit:
-            pair_margin = pair_margin.at[np.array(explicit)].set(self.margin)
-        return model.replace(geom_margin=geom_margin, pair_margin=pair_margin)
-
     def _set_solimp(self, solimp: Array, rows: list[int]) -> Array:
         """Write impedance and width; `solimp` mixes linearly, so its other numbers keep their mixed values."""
         if not rows:
@@ -240,6 +223,23 @@ class Softness(eqx.Module):
         if self.width is not None:
             solimp = solimp.at[np.array(rows), 2].set(self.width)
         return solimp
+
+
+def _with_margin(model: mjx.Model, margin: Array, pairs: _Pairs, explicit: list[int]) -> mjx.Model:
+    """Write the margin to explicit pairs, and half of it to each geom of other pairs, since MuJoCo adds the two."""
+    for pair in pairs:
+        if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
+            raise ValueError(
+                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only "
+                "where they touch; select other pairs, or replace the mesh by primitive geoms"
+            )
+    _refuse_shared_geoms(model, pairs, _summed_geoms)
+    geom_margin, pair_margin = model.geom_margin, model.pair_margin
+    if geoms := sorted({geom for pair in pairs for geom in _summed_geoms(pair)}):
+        geom_margin = geom_margin.at[np.array(geoms)].set(0.5 * margin)
+    if explicit:
+        pair_margin = pair_margin.at[np.array(explicit)].set(margin)
+    return model.replace(geom_margin=geom_margin, pair_margin=pair_margin)
 
 
 def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:

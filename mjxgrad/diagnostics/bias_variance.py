@@ -478,7 +478,7 @@ def _in_batches(
 def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Return the unbiased part of α-order and its standard error; see `control_variate`."""
     (parts,) = both_parts(samples, control_variate=True)
-    value, squared_error = parts.mixture(jnp.zeros(()))
+    value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
     return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
 
 

@@ -141,7 +141,7 @@ class Parts(Summary):
             scaled_first_norm=_norm(self.scaled.mean),
         )
 
-    def mixture(self, alpha: Float[Array, ""]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    def mixture(self, alpha: Float[Array, "..."]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
         """Return the weighted mean and its squared error; without finite derivatives, those of the unbiased part."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)

@@ -141,8 +141,8 @@ def run_window(
 ) -> tuple[Window, EnvState]:
     """Run a policy for one step per row of noise.
 
-    The noise is added to actions before squashing, and so is `change`, to differentiate by. The state after the window is
-    that from which the next one starts.
+    The noise is added to actions before squashing, and so is `change`, to differentiate by. The next window starts from the
+    returned state.
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:

@@ -11,7 +11,6 @@ import optax
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.estimators import Reason
 from tests.loop import problems
 from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
 
@@ -162,16 +161,6 @@ def test_the_best_has_no_advantage_from_samples_left_out(key):
     result = run(key, spoiled)
     full = result.history.finite_fraction == 1
     assert result.best_cost == result.history.cost[full].min() > result.history.cost.min()
-
-
-def test_the_reason_of_the_least_weight_is_kept(key):
-    def in_blocks(objective, params, key):
-        reason = jax.tree.map(lambda a, b: jnp.stack([a, b]), Reason.inverse_variance, Reason.uncertain)
-        return dataclasses.replace(made_up([1.0, 1.0]), alpha=jnp.array([0.8, 0.2]), reason=reason)
-
-    history = run(key, in_blocks, num_steps=2).history
-    np.testing.assert_allclose(history.alpha, 0.5)
-    assert np.all(history.reason == Reason.uncertain)
 
 
 def test_the_optimiser_is_told_the_cost(key):
