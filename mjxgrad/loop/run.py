@@ -149,18 +149,24 @@ def run(
     if checkpoint is not None and checkpoint.exists():
         carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
         progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
-    compiled, is_first = None, jax.process_index() == 0
-    while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
-        given = numbers, progress.carry, np.int32(done), np.int32(min(done + segment, num_steps))
-        if compiled is None:
-            began = time.perf_counter()
-            compiled = compile_once(steps.lower(*given))
-            progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
-        progress = _after(progress, functools.partial(compiled, *given))
-        if checkpoint is not None and is_first:
+    on_disk, compiled, is_first = progress.num_steps, None, jax.process_index() == 0
+    try:
+        while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
+            given = numbers, progress.carry, np.int32(done), np.int32(min(done + segment, num_steps))
+            if compiled is None:
+                began = time.perf_counter()
+                compiled = compile_once(steps.lower(*given))
+                progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
+            progress = _after(progress, functools.partial(compiled, *given))
+            if checkpoint is not None and is_first:
+                checkpoints.save(checkpoint, progress[:3], identity)
+                on_disk = progress.num_steps
+            if log is not None and is_first:
+                log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
+    finally:
+        # Also after an interruption of a save: KeyboardInterrupt goes on to the caller.
+        if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
-        if log is not None and is_first:
-            log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
     return method.result(progress)
 
 
