@@ -50,7 +50,7 @@ def _bundled(kind: type[Environment], bundle: Bundle) -> type[Environment]:
             after = jax.tree.map(
                 lambda x, y: jax.lax.stop_gradient(x) + (y - jax.lax.stop_gradient(y)).mean(axis=0), plain.physics, ends
             )
-            action = jnp.clip(action, -self.action_limit, self.action_limit)
+            action = jnp.clip(action, -1, 1)
             terms = self.rewards(state.physics, action, after, state.memory)
             return dataclasses.replace(
                 plain,

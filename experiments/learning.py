@@ -15,7 +15,8 @@ from scipy.stats import mannwhitneyu
 import mjxgrad as mg
 from experiments import ppo
 from experiments.bundle import bundled
-from experiments.problems.trot import trot
+from experiments.problems.quadruped import quadruped
+from experiments.problems.trot import apg, trot
 from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
@@ -40,7 +41,7 @@ NAMES = {
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
-    "quadruped": envs.quadruped,
+    "quadruped": quadruped,
     "trot": trot,
     **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name not in ("quadruped", "trot")},
 }
@@ -298,7 +299,7 @@ def _judged_course(
 def _how(settings: Settings, method: Method) -> learning.Settings:
     rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
     changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
-    return (learning.apg if settings.algorithm == "apg" else learning.Settings)(
+    return (apg if settings.algorithm == "apg" else learning.Settings)(
         num_environments=settings.sizes.num_environments,
         window=settings.window,
         critic_rate=settings.critic_rate,

@@ -17,6 +17,7 @@ from scipy import stats
 
 from experiments import theme
 from experiments.config import ExperimentError, suggest
+from experiments.problems import estimators as library
 from experiments.problems import textbook
 from experiments.problems.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from experiments.problems.textbook import Textbook
@@ -25,7 +26,6 @@ from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
-from mjxgrad import estimators as library
 from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import rules
 
@@ -186,8 +186,7 @@ def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tabl
 
 def _estimator(settings: EstimatorSettings) -> functools.partial:
     # Those that give one estimate of parameters with noise on them.
-    others = ("first_and_zeroth_order", "per_step", "rules")
-    names = [name for name in library.__all__ if name[0].islower() and name not in others]
+    names = [name for name in library.__all__ if name != "reinforce"]
     if settings.name not in names:
         raise ExperimentError(f'there is no estimator "{settings.name}"; {suggest(settings.name, names)}')
     options = settings.model_dump(exclude={"name"}, exclude_none=True)

@@ -21,8 +21,7 @@ def compiled(function: _Function) -> _Function:
     """Compile a function of arrays, or trees with arrays, once per shape and structure.
 
     Called with traced values it becomes part of the outer program, where more values may be known. The function must depend
-    on
-    its arguments alone: other variables are read only once.
+    on its arguments alone: other variables are read only once.
     """
     program = eqx.filter_jit(function)
 
@@ -63,8 +62,7 @@ def keep_compiled() -> Path | None:
     """Keep compiled programs in the user's cache folder, for the next process. Call it before any computation.
 
     It sets JAX's global `jax_compilation_cache_dir`, unless it is set already. Programs hold for one processor and one
-    jaxlib,
-    so each combination has its own folder. Nothing removes old programs; the folder may be deleted at any time.
+    jaxlib, so each combination has its own folder. Nothing removes old programs; the folder may be deleted at any time.
 
     Returns:
         The folder in use; None if it cannot be written, and nothing is kept.

@@ -17,7 +17,7 @@ from experiments.config import ExperimentError
 from experiments.motion import own_task
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.problems import published_scenes
+from experiments.problems import estimators, published_scenes
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
@@ -258,7 +258,7 @@ def estimator(method: MethodSettings, task: Published) -> Callable[..., Gradient
             "concavity": rules.Concavity,
             "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
         }[method.rule]()
-    return functools.partial(getattr(mg.estimators, method.name), **options)
+    return functools.partial(getattr(estimators, method.name), **options)
 
 
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Callable[..., mg.Optimisation]:
@@ -334,7 +334,7 @@ def _run(method: MethodSettings, task: Published, settings: Settings, key: jax.A
     final = np.where(np.isfinite(final), final, np.inf)
     history = result.history
     steps = np.arange(0, history.alpha.shape[-1], every)
-    has_choice = method.name in ("alpha_order", "per_step")
+    has_choice = method.name == "alpha_order"
     return Run(
         method=method,
         final_cost=final,

@@ -17,7 +17,7 @@ class MethodSettings(SettingsTable):
     """One method, with what is set of its options: an estimator for gradient descent, or a search."""
 
     name: Literal[
-        "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "per_step", "reinforce",
+        "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "reinforce",
         "cross_entropy", "mppi", "predictive_sampling",
     ]  # fmt: skip
     """Of a function in `mjxgrad.estimators` or `mjxgrad.baselines`."""

@@ -14,14 +14,18 @@ References:
     MuJoCo, `mjx/training_apg.ipynb`, study 1 (Google DeepMind, 2024).
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from mjxgrad import learning
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs import Environment
+from mjxgrad.estimators.rules import FixedAlpha
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.state import data_of
 from mjxgrad.scene import load_scene
@@ -139,3 +143,30 @@ def _length(x: Float[Array, " n"]) -> Float[Array, ""]:
     """Return a vector's length, with derivative zero where it is zero: at the start the robot rests, as does the reference."""
     square = (x**2).sum()
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def apg(**changes: Any) -> learning.Settings:
+    """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
+
+    There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
+    falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
+    which allows larger rates.
+
+    Args:
+        changes: settings that replace these.
+
+    References:
+        Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
+        (`brax/training/agents/apg`).
+    """
+    settings = {
+        "discount": 1.0,
+        "rule": FixedAlpha(1.0),
+        "stddev": (0.07, 0.01),
+        "actor_layers": (256, 128),
+        "actor_scale": 0.01,
+        "actor_rate": 1e-4,
+        "actor_decay": 0.997,
+        "has_critic": False,
+    }
+    return learning.Settings(**(settings | changes))

@@ -1,14 +1,44 @@
-"""Linear and bilinear maps and Einstein sums of many short vectors, with derivatives of the same kind; see `primitives`.
+r"""Linear and bilinear maps and Einstein sums of many short vectors: JAX primitives with fast derivatives.
+
+Their derivatives are sums of the same kind. Components written out would be slices, products and a concatenation. JAX's
+derivative of a slice, though, is a padded array, and sums of many of these make reverse mode slow. The derivative of a gather
+is a scatter, which XLA's CPU backend runs entry by entry.
+
+**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory. Operations then run along whole vectors of
+states, and each number of a state is contiguous over the batch. XLA propagates layouts, so it suffices that all primitives
+request this one for their inputs and outputs: a hopper's gradient takes less than half the time. A matrix product would need
+the batch first, so Einstein sums are written out.
+
+**On a GPU** any operation takes at least a microsecond, and so does a slice of an array with other uses, or the transpose that
+a matrix product needs. There linear and bilinear maps are sums of gathers, which XLA fuses with their neighbours.
 
 The norms here have a derivative of zero at zero, where the usual norm has none.
 """
 
+import inspect
+import itertools
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.layout import Layout, with_layout_constraint
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching
 from jaxtyping import Array, Float, Int
 
-from mjxgrad.batched import primitives
+from mjxgrad.batched import device
+from mjxgrad.batched.linear import LONGEST_SUM, add
+
+# (entry of the result, entry of the first factor, entry of the second, coefficient)
+Term = tuple[int, int, int, float]
+# Longest sum that a GPU gathers; a longer one is a matrix product.
+_MOST_GATHERED = 32
+# Largest total number of terms that are sliced, since each slice is an operation to compile.
+_MOST_SLICED = 96
+# Longest gathered sum that is fused with its inputs, which XLA then computes again for every term.
+_MOST_FUSED = 4
 
 
 class Bilinear:
@@ -17,18 +47,18 @@ class Bilinear:
     def __init__(self, table: np.ndarray):
         """Keep the terms of T that are not zero."""
         self._size = len(table)
-        self._terms = primitives.ordered((*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table))  # pyright: ignore[reportArgumentType]
+        self._terms = _ordered((*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table))  # pyright: ignore[reportArgumentType]
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
         """Return c; both factors have the same leading axes."""
-        return primitives.bilinear(a, b, self._terms, self._size)
+        return _bilinear.bind(a, b, terms=self._terms, size=self._size, batch=0)
 
 
 def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *item"]:
     """Return the weighted sums of items, one for each row of a constant matrix."""
     if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(len(matrix))):
         return x
-    return primitives.linear(x, np.asarray(matrix, float))
+    return _linear.bind(x, matrix=_Matrix(np.asarray(matrix, float)), batch=0)
 
 
 def pick(
@@ -82,7 +112,8 @@ def _scale_jvp(primals, tangents):
 def contract(subscripts: str, a: Array, b: Array) -> Array:
     """Return an Einstein sum at full precision; each index of one factor is in the other or in the result."""
     dtype = jnp.result_type(a, b)
-    return primitives.contract(jnp.asarray(a, dtype), jnp.asarray(b, dtype), subscripts)
+    letters = _Subscripts(*subscripts.replace("->", ",").split(","))
+    return _contract.bind(jnp.asarray(a, dtype), jnp.asarray(b, dtype), subscripts=letters, batch=0)
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -94,3 +125,267 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Return the Euclidean norm over the last axis, with derivative zero at the zero vector."""
     return safe_sqrt(jnp.sum(x * x, axis=-1))
+
+
+# Shared by all primitives. The first `batch` axes of all arrays are those of `jax.vmap`.
+
+
+def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
+    """Return a primitive without its derivative."""
+    primitive = Primitive(name)
+
+    def infer(*factors, **parameters):
+        return jax.core.ShapedArray(shape(*factors, **parameters), factors[0].dtype)
+
+    def batch_last(*factors, batch, **parameters):
+        factors = [_batch_last(x, batch) for x in factors]
+        return _batch_last(evaluate(*factors, batch=batch, **parameters), batch)
+
+    def batched(factors, axes, *, batch, **parameters):
+        size = next(x.shape[axis] for x, axis in zip(factors, axes, strict=True) if axis is not None)
+        spread = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(factors, axes, strict=True)
+        ]
+        return primitive.bind(*spread, batch=batch + 1, **parameters), 0
+
+    names = [one.name for one in inspect.signature(evaluate).parameters.values() if one.kind is one.KEYWORD_ONLY]
+    primitive.def_impl(jax.jit(evaluate, static_argnames=names))
+    primitive.def_abstract_eval(infer)
+    device.set_lowerings(primitive, default=evaluate, cpu=batch_last, gpu=on_gpu)
+    batching.primitive_batchers[primitive] = batched
+    return primitive
+
+
+def _batch_last(x: Array, batch: int) -> Array:
+    """Return the array, laid out in memory with the batch last."""
+    if not 0 < batch < x.ndim:
+        return x
+    return with_layout_constraint(x, Layout(major_to_minor=(*range(batch, x.ndim), *range(batch))))
+
+
+# The bilinear map.
+
+
+def _ordered(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """Return the terms sorted by entry of the result, added terms before subtracted ones."""
+    return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
+
+
+def _bilinear_by_slices(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
+    last = a.ndim - 1
+    a_entries, b_entries = (jax.lax.split(x, (1,) * x.shape[last], last) for x in (a, b))
+    entries: list[Array | None] = [None] * size
+    for k, i, j, coefficient in terms:
+        product, so_far = a_entries[i] * b_entries[j], entries[k]
+        if abs(coefficient) != 1:
+            product = abs(coefficient) * product
+        if coefficient < 0:
+            entries[k] = -product if so_far is None else so_far - product
+        else:
+            entries[k] = product if so_far is None else so_far + product
+    none = jnp.zeros((*a.shape[:last], 1), a.dtype)
+    return jnp.concatenate([none if x is None else x for x in entries], axis=last)
+
+
+def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
+    """Return the same map as sums of gathers: the first terms of all entries, then the second ones, and so on."""
+    by_entry = [[term for term in terms if term[0] == k] for k in range(size)]
+    layers = []
+    for layer in range(max(map(len, by_entry), default=0)):
+        # Missing terms repeat a term of the same entry with weight zero, so that no other entry can make it NaN.
+        chosen = [
+            of_one[layer] if layer < len(of_one) else (*(of_one or [(k, 0, 0)])[0][:3], 0.0)
+            for k, of_one in enumerate(by_entry)
+        ]
+        _, i, j, coefficients = map(np.array, zip(*chosen, strict=True))
+        product = _entries(a, i, a.ndim - 1) * _entries(b, j, b.ndim - 1)
+        layers.append(product if (coefficients == 1).all() else product * jnp.asarray(coefficients, a.dtype))
+    if not layers:
+        return jnp.zeros((*a.shape[:-1], size), a.dtype)
+    return _where_terms(add(layers), np.array([bool(of_one) for of_one in by_entry]))
+
+
+def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
+    """Return sums, zero where there are no terms."""
+    return total if has_terms.all() else jnp.where(has_terms, total, 0.0)
+
+
+def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
+    """Return entries at constant places along an axis."""
+    if np.array_equal(index, np.arange(x.shape[axis])):
+        return x
+    return jnp.take(x, index, axis=axis, mode="clip")
+
+
+def _transpose_first(cotangent, a, b, *, terms, size, batch):
+    swapped = _ordered([(i, k, j, c) for k, i, j, c in terms])
+    return _bilinear.bind(cotangent, b, terms=swapped, size=a.aval.shape[-1], batch=batch)
+
+
+def _transpose_second(cotangent, a, b, *, terms, size, batch):
+    swapped = _ordered([(j, i, k, c) for k, i, j, c in terms])
+    return _bilinear.bind(a, cotangent, terms=swapped, size=b.aval.shape[-1], batch=batch)
+
+
+_bilinear = _define(
+    "bilinear",
+    lambda a, b, *, terms, size, batch: (*a.shape[:-1], size),
+    _bilinear_by_slices,
+    _bilinear_by_gathers,
+)
+ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
+
+
+# The linear map.
+
+
+class _Matrix:
+    """A constant matrix, compared by its entries."""
+
+    def __init__(self, entries: np.ndarray):
+        self.entries = entries
+        self._contents = entries.shape, entries.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Matrix) and self._contents == other._contents
+
+    def __hash__(self) -> int:
+        return hash(self._contents)
+
+
+def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    count = (matrix.entries != 0).sum(axis=1)
+    most = count.max(initial=0)
+    if not batch or not 0 < most <= LONGEST_SUM or (most > 1 and count.sum() > _MOST_SLICED):
+        return _linear_by_product(x, matrix=matrix, batch=batch)
+    items = jax.lax.split(x, (1,) * x.shape[batch], batch)
+    none = jnp.zeros_like(items[0])
+
+    def row(weights: np.ndarray) -> Array:
+        terms = [
+            items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights).tolist()
+        ]
+        return add(terms or [none])
+
+    rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
+    sums = [row(weights) for weights in rows]
+    return jnp.concatenate([sums[k] for k in place.reshape(-1)], axis=batch)
+
+
+def _linear_by_product(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    # The batch last, as in a CPU's memory.
+    x = jnp.moveaxis(x, range(batch), range(x.ndim - batch, x.ndim))
+    product = jnp.tensordot(jnp.asarray(matrix.entries, x.dtype), x, axes=1, precision="highest")
+    return jnp.moveaxis(product, range(x.ndim - batch, x.ndim), range(batch))
+
+
+def _linear_by_gathers(x: Array, *, matrix: _Matrix, batch: int) -> Array:
+    """Return the same map as sums of gathers, as for bilinear maps; sums of many terms are formed separately."""
+    rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
+    count = (rows != 0).sum(axis=1)
+    order = np.argsort(count, kind="stable")
+    if count.max(initial=0) > _MOST_FUSED:
+        x = jax.lax.optimization_barrier(x)
+    parts = [_gathered(x, rows[part], batch) for part in np.split(order, _where_longer(count[order])) if part.size]
+    if not parts:
+        return _linear_by_product(x, matrix=matrix, batch=batch)
+    return _entries(jnp.concatenate(parts, axis=batch), np.argsort(order)[place.reshape(-1)], batch)
+
+
+def _where_longer(count: np.ndarray) -> list[int]:
+    """Return where to split sums sorted by length, since every sum of a part costs as much as its longest one."""
+    lengths = [n * count[n - 1] + (len(count) - n) * count[-1] for n in range(1, len(count))]
+    best = int(np.argmin(lengths)) if lengths else 0
+    return [best + 1] if lengths and 2 * lengths[best] <= len(count) * count[-1] else []
+
+
+def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
+    """Return sums of similar lengths."""
+    is_term = rows != 0
+    count = int(is_term.sum(axis=1).max(initial=0))
+    if not 0 < count <= _MOST_GATHERED:
+        return _linear_by_product(x, matrix=_Matrix(rows), batch=batch)
+    order = np.argsort(~is_term, axis=1, kind="stable")[:, :count]
+    weights = np.take_along_axis(rows, order, axis=1)
+    order = np.where(weights != 0, order, order[:, :1])
+    along = (-1,) + (1,) * (x.ndim - batch - 1)
+    layers = []
+    for index, weight in zip(order.T, weights.T, strict=True):
+        part = _entries(x, index, batch)
+        layers.append(part if (weight == 1).all() else part * jnp.asarray(weight.reshape(along), x.dtype))
+    return _where_terms(add(layers), is_term.any(axis=1).reshape(along))
+
+
+def _transpose_linear(cotangent, x, *, matrix, batch):
+    return (_linear.bind(cotangent, matrix=_Matrix(matrix.entries.T.copy()), batch=batch),)
+
+
+_linear = _define(
+    "linear",
+    lambda x, *, matrix, batch: (*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]),
+    _linear_by_slices,
+    _linear_by_gathers,
+)
+ad.deflinear2(_linear, _transpose_linear)
+
+
+# The Einstein sum.
+
+
+class _Subscripts(NamedTuple):
+    """One letter for each axis of both factors and of the result, without the axes of the batch."""
+
+    first: str
+    second: str
+    result: str
+
+    @property
+    def summed(self) -> str:
+        return "".join(letter for letter in self.first if letter not in self.result)
+
+    def sizes(self, a: Any, b: Any, batch: int) -> dict[str, int]:
+        """Return the length of each letter's axis."""
+        return dict(zip(self.first + self.second, (*a.shape[batch:], *b.shape[batch:]), strict=True))
+
+
+def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
+    sizes = subscripts.sizes(a, b, batch)
+    summed = [range(sizes[letter]) for letter in subscripts.summed]
+    if not batch or not 0 < np.prod([len(places) for places in summed]) <= LONGEST_SUM:
+        return _contract_by_product(a, b, subscripts=subscripts, batch=batch)
+
+    def at(x: Array, letters: str, place: dict[str, int]) -> Array:
+        """Return the entries at a place of the summed letters, with one axis for each letter of the result."""
+        chosen = x[(..., *(place.get(letter, slice(None)) for letter in letters))]
+        kept = [letter for letter in letters if letter not in place]
+        order = [batch + kept.index(letter) for letter in subscripts.result if letter in kept]
+        chosen = chosen.transpose(*range(batch), *order)
+        return jnp.expand_dims(chosen, [batch + k for k, letter in enumerate(subscripts.result) if letter not in kept])
+
+    places = (dict(zip(subscripts.summed, place, strict=True)) for place in itertools.product(*summed))
+    return add(at(a, subscripts.first, place) * at(b, subscripts.second, place) for place in places)
+
+
+def _contract_by_product(a: Array, b: Array, *, subscripts: _Subscripts, batch: int) -> Array:
+    first, second, result = subscripts
+    return jnp.einsum(f"...{first},...{second}->...{result}", a, b, precision="highest")
+
+
+def _contract_shape(a, b, *, subscripts, batch):
+    sizes = subscripts.sizes(a, b, batch)
+    return (*a.shape[:batch], *(sizes[letter] for letter in subscripts.result))
+
+
+def _contract_first(cotangent, a, b, *, subscripts, batch):
+    first, second, result = subscripts
+    return _contract.bind(cotangent, b, subscripts=_Subscripts(result, second, first), batch=batch)
+
+
+def _contract_second(cotangent, a, b, *, subscripts, batch):
+    first, second, result = subscripts
+    return _contract.bind(a, cotangent, subscripts=_Subscripts(first, result, second), batch=batch)
+
+
+_contract = _define("contract", _contract_shape, _contract_written_out, _contract_written_out)
+ad.defbilinear(_contract, _contract_first, _contract_second)

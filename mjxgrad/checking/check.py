@@ -252,7 +252,7 @@ def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) ->
         return
     count = count_pairs(model)
     if count >= MANY_PAIRS:
-        say(f"about {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
+        say(f"at least {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
 
 
 def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
@@ -264,9 +264,7 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
     room = 2 * needed + _SPARE_CONTACTS
     if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
         return scene, None
-    return dataclasses.replace(
-        scene, data=load_scene(scene.to_mujoco(), max_contacts=room, distance_fields=True).data
-    ), room
+    return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:

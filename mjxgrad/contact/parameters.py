@@ -82,11 +82,6 @@ class ContactParameters(eqx.Module):
         return safe_sqrt(self.stiffness)
 
     @property
-    def time_constant(self) -> Float[Array, "*batch pairs"]:
-        """$2 / b$, in s: the decay time of a critically damped contact; infinite if undamped."""
-        return 2.0 / self.damping
-
-    @property
     def damping_ratio(self) -> Float[Array, "*batch pairs"]:
         r"""$b / (2 \sqrt k)$; infinite without stiffness."""
         return self.damping / (2.0 * self.natural_frequency)
@@ -113,24 +108,15 @@ class ContactParameters(eqx.Module):
 
 def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
     """Return the name of a geom, or of its body with the geom's place in it."""
-    place = geom - int(model.body_geomadr[int(model.geom_bodyid[geom])])
-    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{body_name(model, geom)}[{place}]"
-
-
-def body_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
-    """Return the name of a geom's body, or its number."""
     body = int(model.geom_bodyid[geom])
-    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
+    of_body = mjx.id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
+    return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{of_body}[{geom - int(model.body_geomadr[body])}]"
 
 
 def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
-    """List the pairs of geoms that MJX tests for contact, in no particular order.
+    """List the pairs of geoms that MJX tests for contact, in no particular order; none if contacts are disabled.
 
-    Args:
-        model: a model of C MuJoCo or of MJX. Only its static structure is read.
-
-    Returns:
-        The pairs; none if contacts or constraints are disabled.
+    Only the static structure of the model is read.
     """
     if int(model.opt.disableflags) & _DISABLES_CONTACT:
         return ()
@@ -173,16 +159,9 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
 # Compiled as one program: one operation after another takes seconds for the first scene of a kind.
 @eqx.filter_jit
 def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
-    """Compute the effective contact parameters of a model.
+    """Compute the effective parameters of pairs, one row each; by default of all that can touch.
 
     Differentiable with respect to the model's leaves, and traceable.
-
-    Args:
-        model: a model of MJX; leaves may be traced.
-        pairs: pairs of that model; by default all that can touch.
-
-    Returns:
-        One row per pair, in the order given.
     """
     pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from mjxgrad.envs import diffrl, playground
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
-from mjxgrad.envs.quadruped import quadruped
-from mjxgrad.envs.task_environment import TaskEnvironment, from_task
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "ant": ant,
@@ -19,23 +17,19 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "diffrl_half_cheetah": diffrl.half_cheetah,
     "diffrl_hopper": diffrl.hopper,
     "diffrl_humanoid": diffrl.humanoid,
-    "quadruped": quadruped,
 }
 
 __all__ = [
     "ENVIRONMENTS",
     "EnvState",
     "Environment",
-    "TaskEnvironment",
     "ant",
     "diffrl",
-    "from_task",
     "half_cheetah",
     "hopper",
     "humanoid",
     "load",
     "playground",
-    "quadruped",
     "walker2d",
 ]
 

@@ -23,20 +23,11 @@ from mjxgrad.tasks.action_task import scene_path
 
 Memory = dict[str, Float[Array, "..."]]
 _TILT = jnp.pi / 24  # rad, largest tilt of a floating base at the start
+_UPRIGHT = jnp.pi / 6  # rad, tilt of a planar torso at which its reward is zero
 
 
-class _Remembers(Environment):
-    """An environment whose policy sees its last action."""
-
-    def first_memory(self, key: PRNGKeyArray) -> Memory:
-        return {"action": jnp.zeros(self.num_actions)}
-
-    def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
-        return {"action": action}
-
-
-class Walker(_Remembers):
-    """A floating base that is to run upright along x: ant and humanoid.
+class Walker(Environment):
+    """A floating base that is to run upright along x: ant and humanoid; the policy sees its last action.
 
     Attributes:
         fallen: height of the torso below which the episode is over (m).
@@ -47,6 +38,12 @@ class Walker(_Remembers):
     fallen: float = eqx.field(static=True, kw_only=True)
     action_weight: float = eqx.field(static=True, default=0.0, kw_only=True)
     rise_scale: float | None = eqx.field(static=True, default=None, kw_only=True)
+
+    def first_memory(self, key: PRNGKeyArray) -> Memory:
+        return {"action": jnp.zeros(self.num_actions)}
+
+    def next_memory(self, memory: Memory, action: Float[Array, " nu"], after: State, key: PRNGKeyArray) -> Memory:
+        return {"action": action}
 
     def start(self, key: PRNGKeyArray) -> State:
         place, axis, angle, joints, speeds = jax.random.split(key, 5)
@@ -82,28 +79,17 @@ class Planar(Environment):
     """A body in a plane that is to run along x: hopper and cheetah.
 
     Attributes:
-        action_weight: cost per squared action.
         fallen: change of the torso's height below which the episode is over (m). With None it is never over, and height and
             tilt are not rewarded.
-        rise_scale: reward per m above the wanted height, 0.15 m above `fallen`.
-        most_tilt: angle at which the reward for an upright torso is zero (rad).
     """
 
-    action_weight: float = eqx.field(static=True, default=0.1, kw_only=True)
     fallen: float | None = eqx.field(static=True, default=None, kw_only=True)
-    rise_scale: float = eqx.field(static=True, default=1.0, kw_only=True)
-    most_tilt: float = eqx.field(static=True, default=jnp.pi / 6, kw_only=True)
 
     def start(self, key: PRNGKeyArray) -> State:
         place, tilt, joints, speeds = jax.random.split(key, 4)
         rest = self.scene.data
-        change = jnp.concatenate(
-            [
-                jax.random.uniform(place, (2,), minval=-0.05, maxval=0.05),
-                jax.random.uniform(tilt, (1,), minval=-0.1, maxval=0.1),
-                jax.random.uniform(joints, (rest.qpos.size - 3,), minval=-0.05, maxval=0.05),
-            ]
-        )
+        draws = ((place, 2, 0.05), (tilt, 1, 0.1), (joints, rest.qpos.size - 3, 0.05))
+        change = jnp.concatenate([jax.random.uniform(k, (n,), minval=-most, maxval=most) for k, n, most in draws])
         speed = jax.random.uniform(speeds, rest.qvel.shape, minval=-0.05, maxval=0.05)
         return initial_state(self.scene, rest.qpos + change, speed)
 
@@ -113,12 +99,12 @@ class Planar(Environment):
     def rewards(
         self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
     ) -> dict[str, Float[Array, ""]]:
-        terms = {"forward": after.qvel[0], "action": -self.action_weight * (action**2).sum()}
+        terms = {"forward": after.qvel[0], "action": -0.1 * (action**2).sum()}
         if self.fallen is None:
             return terms
         rest = self.scene.data.qpos[1]
-        rise = _rise(after.qpos[1] - rest - self.fallen - 0.15, self.rise_scale, 0.3)
-        return {**terms, "height": rise, "upright": 1 - (after.qpos[2] / self.most_tilt) ** 2}
+        rise = _rise(after.qpos[1] - rest - self.fallen - 0.15, 1.0, 0.3)
+        return {**terms, "height": rise, "upright": 1 - (after.qpos[2] / _UPRIGHT) ** 2}
 
     def is_over(self, state: State) -> Bool[Array, ""]:
         return jnp.array(False) if self.fallen is None else state.qpos[1] - self.scene.data.qpos[1] < self.fallen

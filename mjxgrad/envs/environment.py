@@ -125,11 +125,6 @@ class Environment(InScene):
         return middle + half * action
 
     @property
-    def action_limit(self) -> Float[Array, " nu"]:
-        """Largest magnitude of each action, to which actions are clipped."""
-        return jnp.ones(self.num_actions)
-
-    @property
     def num_actions(self) -> int:
         return self.scene.model.nu
 
@@ -167,7 +162,7 @@ class Environment(InScene):
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
-        action = jnp.clip(action, -self.action_limit, self.action_limit)
+        action = jnp.clip(action, -1, 1)
         key, memory_key = jax.random.split(state.key)
         course = self._move(self.disturbed(state.physics, state.memory), self.control(action))
         after = course.final

@@ -26,7 +26,28 @@ _Info = dict[str, Any]
 _METADATA: _Info = {"render_modes": ["rgb_array"]}
 
 
-class GymEnv(gymnasium.Env):
+class _Adapter:
+    """The parts that one copy and many have in common: the environment, its spaces, and pictures of it."""
+
+    def _prepare(self, environment: Environment | str, render_mode: str | None, view: _Info) -> None:
+        self.environment = load(environment) if isinstance(environment, str) else environment
+        if render_mode not in (None, *_METADATA["render_modes"]):
+            raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
+        self.render_mode, self._view = render_mode, view
+        self.metadata = {**_METADATA, "render_fps": round(1 / float(self.environment.interval))}
+
+    def _spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+        obs = jax.eval_shape(self.environment.reset, jax.random.key(0)).obs
+        seen = gymnasium.spaces.Box(-np.inf, np.inf, obs.shape, obs.dtype)
+        return seen, gymnasium.spaces.Box(-1, 1, (self.environment.num_actions,))
+
+    def _drawn(self, qpos: Float[Array, "states nq"]) -> np.ndarray:
+        first = 0 if self.environment.scene.mj_model.ncam else None
+        # One state and one frame per second, so that every state is drawn.
+        return render.frames(self.environment.scene, qpos, timestep=1.0, fps=1.0, **{"camera": first, **self._view})
+
+
+class GymEnv(_Adapter, gymnasium.Env):
     """One copy of an environment. `reset` draws its friction, masses and gains anew, if they are random.
 
     The environment's own `episode_length` is the only limit of steps.
@@ -45,11 +66,8 @@ class GymEnv(gymnasium.Env):
         Raises:
             ValueError: if there is no such environment or render mode.
         """
-        self.environment = load(environment) if isinstance(environment, str) else environment
-        self.render_mode = _checked(render_mode)
-        self.metadata = _metadata(self.environment)
-        self.observation_space, self.action_space = _spaces(self.environment)
-        self._view = view
+        self._prepare(environment, render_mode, view)
+        self.observation_space, self.action_space = self._spaces()
         self._begin = jax.jit(lambda key: _begin(self.environment, key))
         self._advance = jax.jit(
             lambda changes, state, action: self.environment.with_changes(changes).step(state, action)
@@ -66,14 +84,10 @@ class GymEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
-        return (
-            None
-            if self.render_mode is None
-            else _drawn(self.environment, self._state.physics.qpos[None], self._view)[0]
-        )
+        return None if self.render_mode is None else self._drawn(self._state.physics.qpos[None])[0]
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv):
+class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
     """Many copies of an environment in one program, each with its own friction, masses and gains, if they are random.
 
     A copy whose episode ends starts the next one in the same step: the observation is already the new one. `final_obs` and
@@ -85,24 +99,13 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def __init__(
         self, environment: Environment | str, num_envs: int = 1, *, render_mode: str | None = None, **view: Any
     ):
-        """Prepare the copies; nothing is compiled before `reset` and `step`.
-
-        Args:
-            environment: the environment, or its name in `mjxgrad.envs.ENVIRONMENTS`.
-            num_envs: number of copies.
-            render_mode: "rgb_array" or None.
-            view: see `GymEnv`.
-
-        Raises:
-            ValueError: if there is no such environment or render mode.
-        """
-        self.environment = load(environment) if isinstance(environment, str) else environment
-        self.num_envs, self.render_mode = num_envs, _checked(render_mode)
-        self.metadata = {**_metadata(self.environment), "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.single_observation_space, self.single_action_space = _spaces(self.environment)
+        """Prepare `num_envs` copies; the other arguments, and errors, are those of `GymEnv`."""
+        self._prepare(environment, render_mode, view)
+        self.num_envs = num_envs
+        self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._view = view
 
         def begin(key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
             return jax.vmap(lambda one: _begin(self.environment, one))(jax.random.split(key, num_envs))
@@ -126,9 +129,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the present state of each copy, in the render mode "rgb_array"."""
-        return (
-            None if self.render_mode is None else tuple(_drawn(self.environment, self._state.physics.qpos, self._view))
-        )
+        return None if self.render_mode is None else tuple(self._drawn(self._state.physics.qpos))
 
     def _info(self, state: EnvState) -> _Info:
         """Return the metrics in gymnasium's layout: arrays, each with a mask of the copies that have it."""
@@ -168,35 +169,12 @@ def _begin(environment: Environment, key: PRNGKeyArray) -> tuple[PyTree, EnvStat
     return changes, environment.with_changes(changes).reset(reset_key)
 
 
-def _spaces(environment: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    obs = jax.eval_shape(environment.reset, jax.random.key(0)).obs
-    limit = np.asarray(environment.action_limit, np.float32)
-    seen = gymnasium.spaces.Box(-np.inf, np.inf, obs.shape, obs.dtype)
-    return seen, gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
-
-
-def _metadata(environment: Environment) -> _Info:
-    return {**_METADATA, "render_fps": round(1 / float(environment.interval))}
-
-
-def _checked(render_mode: str | None) -> str | None:
-    if render_mode not in (None, *_METADATA["render_modes"]):
-        raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
-    return render_mode
-
-
 def _key(generator: np.random.Generator) -> PRNGKeyArray:
     return jax.random.key(int(generator.integers(2**31)))
 
 
 def _info(state: EnvState) -> _Info:
     return {name: float(value) for name, value in state.metrics.items()}
-
-
-def _drawn(environment: Environment, qpos: Float[Array, "states nq"], view: _Info) -> np.ndarray:
-    first = 0 if environment.scene.mj_model.ncam else None
-    # One state and one frame per second, so that every state is drawn.
-    return render.frames(environment.scene, qpos, timestep=1.0, fps=1.0, **{"camera": first, **view})
 
 
 register()

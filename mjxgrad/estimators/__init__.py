@@ -3,9 +3,7 @@
 from mjxgrad.estimators import rules
 from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason
 from mjxgrad.estimators.first_and_zeroth import first_and_zeroth_order, first_order, zeroth_order
-from mjxgrad.estimators.least_squares import least_squares
-from mjxgrad.estimators.mixture import alpha_order, control_variate, per_step
-from mjxgrad.estimators.reinforce import reinforce
+from mjxgrad.estimators.mixture import alpha_order, control_variate
 
 __all__ = [
     "Diagnosis",
@@ -15,9 +13,6 @@ __all__ = [
     "control_variate",
     "first_and_zeroth_order",
     "first_order",
-    "least_squares",
-    "per_step",
-    "reinforce",
     "rules",
     "zeroth_order",
 ]

@@ -55,8 +55,8 @@ class GradientEstimate(eqx.Module):
         num_rollouts: rollouts spent, a zero-noise baseline included.
         num_gradient_rollouts: rollouts that were differentiated.
         diagnosis: an item of `Diagnosis`.
-        alpha: weight of the first-order part: one number, or from `per_step` one per step and action.
-        reason: an item of `Reason` for each `alpha`; every estimator may give `Reason.nothing_felt`.
+        alpha: weight of the first-order part.
+        reason: an item of `Reason`; every estimator may give `Reason.nothing_felt`.
         bias_bound: an upper bound on the norm of the bias of `value`, if the rule that chose `alpha` knows one. Zero for
             an unbiased estimate, NaN where nothing is known.
     """
@@ -71,7 +71,7 @@ class GradientEstimate(eqx.Module):
     num_rollouts: Int[Array, ""]
     num_gradient_rollouts: Int[Array, ""]
     diagnosis: Diagnosis
-    alpha: Float[Array, "*blocks"]
+    alpha: Float[Array, ""]
     reason: Reason
     bias_bound: Float[Array, ""]
 
@@ -117,20 +117,9 @@ def assemble(
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over independent units: samples, or pairs of them.
-
-    Args:
-        value: mean over the units.
-        squared_error: squared standard error of `value`.
-        costs: moments of the costs.
-        plan: the rollouts that were asked for.
-        count: number of finite units.
-        num_felt: number of units whose noise made a difference, or cannot tell.
-        restore: map from a vector to the form of the parameters.
-        has_baseline: whether the baseline is finite.
-        alpha: weight of the first-order part.
-        reason: an item of `Reason`.
-        bias_bound: upper bound on the norm of the bias.
+    Moments and counts are over independent units: samples, or pairs of them. `count` is the number of finite units,
+    `num_felt` that of units whose noise made a difference, or cannot tell. `restore` maps a vector to the form of the
+    parameters, and `has_baseline` says whether the baseline is finite.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

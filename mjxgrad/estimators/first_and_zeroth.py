@@ -39,8 +39,8 @@ def first_order(
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy
         Gradients? ICML 2022, arXiv:2202.00817, definition 2.2.
     """
-    plan = Plan(num_samples, chunk_size, with_gradient=True)
     objective, vector, restore = as_vector(objective, params)
+    plan = Plan(num_samples, chunk_size, with_gradient=True)
     return first_order_result(stream(objective, vector, key, plan, first_order_summary), plan, restore)
 
 
@@ -60,23 +60,16 @@ def zeroth_order(
     $\mathbb{E}[(f_i - b_i)\, s_i]$ with the score $s_i$. None of the three baselines $b_i$ depends on sample $i$,
     so the estimate is unbiased even where $f$ jumps.
 
-    Args:
-        objective: its `value` is called once under `jax.vmap`.
-        params: the point $\theta$, as in `first_order`.
-        key: consumed here; do not use it again.
-        num_samples: rollouts with noise to spend. At least 2; even and at least 4 with antithetic pairs.
-        baseline: "leave_one_out", the mean cost of the other samples or pairs; "zero_noise", the cost without noise;
-            or "none". Zero noise costs one more rollout; with random starts, one per sample or pair, from its start.
-        antithetic: whether every noise is used together with its mirror image. The standard error is then over pairs.
-            Where the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
-        chunk_size: rollouts at a time. Memory grows with it; the result depends on it only by rounding.
+    The other arguments, and the units, are those of `first_order`.
 
-    Returns:
-        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
+    - `num_samples`: rollouts with noise to spend. At least 2; even and at least 4 with antithetic pairs.
+    - `baseline`: "leave_one_out", the mean cost of the other samples or pairs; "zero_noise", the cost without noise; or
+      "none". Zero noise costs one more rollout; with random starts, one per sample or pair, from its start.
+    - `antithetic`: whether every noise is used together with its mirror image. The standard error is then over pairs.
+      Where the score is odd in the noise (parameter noise, open loop) all baselines cancel within a pair.
 
     Raises:
-        ValueError: if `num_samples` is too small or odd, `chunk_size` too small, `baseline`
-            unknown, or `params` is not a vector of the objective's dimension.
+        ValueError: as `first_order`; also if `num_samples` is odd, or `baseline` unknown.
 
     References:
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
@@ -100,14 +93,9 @@ def first_and_zeroth_order(
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Estimate the gradient in first and in zeroth order from the same differentiated rollouts.
 
-    The two estimates are those of `first_order` and `zeroth_order` from the same key. They are dependent. Each reports
-    the rollouts spent on both: do not add the two.
-
-    Arguments and errors are those of `zeroth_order`. With antithetic pairs the first-order estimate uses pairs, too.
-
-    Returns:
-        The first-order and the zeroth-order estimate. A sample with a finite cost but no finite derivative counts in
-        the second only.
+    Arguments and errors are those of `zeroth_order`, and so are the estimates of both functions from the same key. The two
+    are dependent, and each reports the rollouts spent on both: do not add them. A sample with a finite cost but no finite
+    derivative counts in the second only.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)

@@ -1,22 +1,19 @@
 """Mixtures of a first-order and an unbiased estimate from the same rollouts, and the evidence that weighs them."""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
-from mjxgrad.estimators.moments import Moments, Summary, Total, as_real
-from mjxgrad.estimators.rules import Consistent, Evidence, Rule, Weights
+from mjxgrad.estimators.moments import Moments, Summary, as_real
+from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights
 from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
 from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
-
-ByNoise = Float[Array, "samples m"]
 
 
 def alpha_order(
@@ -36,18 +33,13 @@ def alpha_order(
     derivatives explain the costs. The rule chooses $\alpha$ and names the reason. It chooses from the same samples, which
     adds a dependence of order 1 / `num_samples` that the standard error does not count.
 
-    Args:
-        objective: differentiated once per sample by its noise, under `jax.vmap`.
-        params: the point $\theta$, a vector or a pytree as in `first_order`.
-        key: consumed here; do not use it again.
-        num_samples: rollouts to spend. At least 2; with random starts even and at least 4, since pairs share a start.
-        rule: the rule that chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
-        control_variate: whether $g^0$ uses derivatives; otherwise it is zeroth order with the leave-one-out baseline.
-        chunk_size: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
-            within groups of at most 64 of a chunk.
+    The other arguments, and the units, are those of `first_order`.
 
-    Returns:
-        The estimate of $\nabla F(\theta)$, in objective units per parameter unit.
+    - `num_samples`: rollouts to spend. At least 2; with random starts even and at least 4, since pairs share a start.
+    - `rule`: the rule that chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
+    - `control_variate`: whether $g^0$ uses derivatives; otherwise it is zeroth order with the leave-one-out baseline.
+    - `chunk_size`: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
+      within groups of at most 64 of a chunk.
 
     Raises:
         ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
@@ -60,8 +52,19 @@ def alpha_order(
     plan = plan_by_noise(objective, num_samples, chunk_size)
     (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
     weights = weigh(rule or Consistent(), parts, plan)
-    facts = {"alpha": weights.alpha, "reason": weights.reason, "bias_bound": weights.bias_bound}
-    return _assembled(parts, plan, restore, jnp.full_like(vector, weights.alpha), **facts)
+    value, squared_error = parts.mixture(weights.alpha)
+    return assemble(
+        value,
+        squared_error,
+        parts.costs,
+        plan,
+        count=parts.unbiased.count,
+        num_felt=parts.num_felt,
+        restore=restore,
+        alpha=weights.alpha,
+        reason=weights.reason,
+        bias_bound=weights.bias_bound,
+    )
 
 
 def control_variate(
@@ -77,71 +80,10 @@ def control_variate(
     The standard error ignores that terms depend on each other through the mean derivative. In the tests it was up to 8 %
     too small at four samples, and less than 2 % from ten samples on.
 
-    Arguments, units and errors are those of `alpha_order`.
+    It is `alpha_order` with a fixed α of zero, whose arguments, units and errors it has.
     """
-    objective, vector, restore = as_vector(objective, params)
-    plan = plan_by_noise(objective, num_samples, chunk_size)
-    (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=True))
-    return _assembled(parts, plan, restore, jnp.zeros_like(vector))
-
-
-def per_step(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    rule: Rule | None = None,
-    control_variate: bool = True,
-    chunk_size: int | None = None,
-) -> GradientEstimate:
-    r"""Mix derivatives and unbiased terms by step and action, then pull the mixture back through the policy, once.
-
-    For the noise of step t and action a, a sample has a derivative $\lambda_{t,a}$ and an unbiased term $z_{t,a}$. The
-    estimate is the mean of $P_j^\top(\alpha\odot\lambda_j + (1 - \alpha)\odot z_j)$. Early in a long rollout derivatives
-    may explode while those near its end are exact. One weight for all steps would waste the exact ones.
-
-    Arguments and errors are those of `alpha_order`. The rule chooses each $\alpha_{t,a}$ within a chunk. `Consistent()`,
-    the default, asks its first question once for all steps; `InverseVariance()` is the published IVW-H.
-    With noise on the parameters the steps are the parameters.
-
-    Returns:
-        The estimate of $\nabla F(\theta)$, in objective units per parameter unit. Its `alpha` has one number per step and
-        action, flattened, the mean over chunks; its `reason` is the most frequent one. The bias is not bounded.
-
-    References:
-        Onoda et al., arXiv:2604.18161 (IVW-H).
-    """
-    objective, vector, restore = as_vector(objective, params)
-    plan = plan_by_noise(objective, num_samples, chunk_size)
-
-    def mixed_chunk(samples: Samples) -> tuple[Summary, ...]:
-        chunk = Group.of(samples)
-        parts, terms_by_noise, has_cost = parts_and_terms(
-            samples, chunk, control_variate=control_variate, take=lambda by_noise: by_noise
-        )
-        weights = weigh(rule or Consistent(), parts, plan, by_coordinate=True)
-        alpha = weights.alpha
-        mixed = alpha * chunk.derivatives + jnp.where(chunk.has_derivative[:, None], 1 - alpha, 1) * terms_by_noise
-        values = Moments.of(chunk.by_unit(chunk.pull_back(samples, mixed)), has_cost)
-        reasons = jax.nn.one_hot(jax.tree.leaves(weights.reason)[0], len(Reason), axis=0)
-        weighed = (parts.num_costs * alpha, parts.num_costs * reasons, parts.num_costs)
-        return values, parts.costs, Total((*weighed, parts.num_felt))
-
-    values, costs, sums = stream(objective, vector, key, plan, mixed_chunk)
-    alpha, reasons, count, num_felt = sums.value
-    return assemble(
-        values.mean,
-        values.squared_error(),
-        costs,
-        plan,
-        count=values.count,
-        num_felt=num_felt,
-        restore=restore,
-        alpha=alpha / jnp.maximum(count, 1),
-        reason=jax.tree.map(lambda _: reasons.argmax(axis=0), Reason.fixed),
-        bias_bound=jnp.where((alpha > 0).any(), jnp.nan, 0),
-    )
+    rule = FixedAlpha(0.0)
+    return alpha_order(objective, params, key, num_samples=num_samples, rule=rule, chunk_size=chunk_size)
 
 
 class Parts(Summary):
@@ -179,33 +121,27 @@ class Parts(Summary):
 
         return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
 
-    def evidence(self, *, by_coordinate: bool) -> Evidence:
-        """Return the evidence for a rule, with all coordinates as one block or each as a block of its own."""
-        pool = jnp.asarray if by_coordinate else jnp.sum
-        dim = pool(jnp.ones_like(self.first.offset))
-
-        def in_all(value: Array) -> Array:
-            return jnp.broadcast_to(value, dim.shape)
-
+    def evidence(self) -> Evidence:
+        """Return the evidence for a rule, with all coordinates as one block."""
         missed, explained = self.secants.missed_variance(), self.linear_variance / jnp.maximum(self.num_costs, 1)
         bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
         return Evidence(
-            count=in_all(self.first.count),
-            dim=dim,
-            first_norm=jnp.sqrt(pool(self.first.mean**2)),
-            zeroth_norm=jnp.sqrt(pool(self.unbiased.mean**2)),
-            difference_norm=jnp.sqrt(pool(self.difference.mean**2)),
-            first_variance=pool(self.first.variance()),
-            zeroth_variance=pool(self.unbiased.variance()),
-            difference_variance=pool(self.difference.variance()),
-            inconsistency=in_all(self.secants.inconsistency()),
-            relative_bias_bound=in_all(jnp.where(missed == 0, 0, bound)),
-            cost_variance=in_all(self.costs.variance()),
-            scaled_first_variance=in_all(self.scaled.variance().sum()),
-            scaled_first_norm=in_all(jnp.sqrt((self.scaled.mean**2).sum())),
+            count=self.first.count,
+            dim=jnp.ones_like(self.first.offset).sum(),
+            first_norm=_norm(self.first.mean),
+            zeroth_norm=_norm(self.unbiased.mean),
+            difference_norm=_norm(self.difference.mean),
+            first_variance=self.first.variance().sum(),
+            zeroth_variance=self.unbiased.variance().sum(),
+            difference_variance=self.difference.variance().sum(),
+            inconsistency=self.secants.inconsistency(),
+            relative_bias_bound=jnp.where(missed == 0, 0, bound),
+            cost_variance=self.costs.variance(),
+            scaled_first_variance=self.scaled.variance().sum(),
+            scaled_first_norm=_norm(self.scaled.mean),
         )
 
-    def mixture(self, alpha: Float[Array, " dim"]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    def mixture(self, alpha: Float[Array, "..."]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
         """Return the weighted mean and its squared error; without finite derivatives, those of the unbiased part."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)
@@ -232,17 +168,6 @@ class Parts(Summary):
 def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
     """Return the summary of a chunk with both parts pulled back to the parameters."""
     chunk = Group.of(samples)
-    take = functools.partial(chunk.pull_back, samples)
-    return (parts_and_terms(samples, chunk, control_variate=control_variate, take=take)[0],)
-
-
-def parts_and_terms(
-    samples: Samples, chunk: Group, *, control_variate: bool, take: Callable[[ByNoise], Array]
-) -> tuple[Parts, ByNoise, Bool[Array, " units"]]:
-    """Return the summary of a chunk, the unbiased terms by noise, and which units have both a cost and a baseline.
-
-    `take` maps the noise to the space of the moments: the pull-back for parameters, the identity for noise.
-    """
     groups = chunk.split()
 
     def compare(group: Group) -> tuple[UnbiasedTerms, SecantSums]:
@@ -254,10 +179,9 @@ def parts_and_terms(
     terms_by_noise = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[:count]
     # A group with a single cost has no baseline.
     num_costs = groups.has_cost.sum(axis=1)
-    is_compared = (groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count]
-    has_cost = chunk.complete(is_compared)
+    has_cost = chunk.complete((groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count])
     has_both = has_cost & chunk.complete(chunk.has_derivative)
-    unbiased, first = chunk.by_unit(take(terms_by_noise)), chunk.by_unit(take(chunk.derivatives))
+    unbiased, first = (chunk.by_unit(chunk.pull_back(samples, x)) for x in (terms_by_noise, chunk.derivatives))
     real_counts = as_real(num_costs, chunk.costs)
     summary = Parts(
         first=Moments.of(first, has_both),
@@ -272,29 +196,19 @@ def parts_and_terms(
         num_groups=as_real((num_costs >= 2).sum(), chunk.costs),
         num_felt=samples.num_felt(),
     )
-    return summary, terms_by_noise, has_cost
+    return (summary,)
 
 
-def weigh(rule: Rule, parts: Parts, plan: Plan, *, by_coordinate: bool = False) -> Weights:
-    """Apply a rule to all coordinates or to each; α is zero without finite derivatives, or if nothing was felt."""
+def weigh(rule: Rule, parts: Parts, plan: Plan) -> Weights:
+    """Apply a rule; α is zero without finite derivatives, or if nothing was felt."""
     if isinstance(rule, type) or not callable(rule):
         raise ValueError(f"rule must be one of mg.estimators.rules, such as rules.Consistent(), got {rule!r}")
-    is_nothing = is_nothing_felt(plan, parts.costs, parts.num_felt)
-
-    def one_block(evidence: Evidence) -> Weights:
-        weights, has_first = rule(evidence), evidence.count >= 2
-        alpha = jnp.where(has_first & ~is_nothing, weights.alpha, 0)
-        reason = Reason.where(has_first, weights.reason, Reason.not_finite)
-        return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))
-
-    evidence = parts.evidence(by_coordinate=by_coordinate)
-    return jax.vmap(one_block)(evidence) if by_coordinate else one_block(evidence)
+    evidence = parts.evidence()
+    weights, has_first = rule(evidence), evidence.count >= 2
+    alpha = jnp.where(has_first & ~is_nothing_felt(plan, parts.costs, parts.num_felt), weights.alpha, 0)
+    reason = Reason.where(has_first, weights.reason, Reason.not_finite)
+    return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))
 
 
-def _assembled(
-    parts: Parts, plan: Plan, restore: Callable, weights: Float[Array, " dim"], **facts: Any
-) -> GradientEstimate:
-    """Return one estimate from both parts; the facts are the arguments of `assemble` about α."""
-    value, squared_error = parts.mixture(weights)
-    count, num_felt = parts.unbiased.count, parts.num_felt
-    return assemble(value, squared_error, parts.costs, plan, count=count, num_felt=num_felt, restore=restore, **facts)
+def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+    return jnp.sqrt((vector**2).sum())

@@ -8,7 +8,6 @@ References:
     variances. COMPSTAT 1982, equation 2.1.
 """
 
-from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -20,9 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 class Summary(eqx.Module):
     """A summary of samples; with all leaves zero it is the summary of none."""
 
-    @abstractmethod
     def merge(self, other: Any) -> Any:
-        """Return the summary of both sets of samples."""
+        """Return the summary of both sets of samples: by default the sums of all leaves."""
+        return jax.tree.map(jnp.add, self, other)
 
 
 class Moments(Summary):
@@ -78,9 +77,6 @@ class Total(Summary):
     """A sum over all samples: any pytree of arrays."""
 
     value: PyTree
-
-    def merge(self, other: "Total") -> "Total":
-        return Total(jax.tree.map(jnp.add, self.value, other.value))
 
 
 class ScoreMoments(Summary):

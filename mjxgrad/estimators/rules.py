@@ -1,7 +1,7 @@
 r"""Rules that weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
 A rule is a function from `Evidence` to `Weights`, both of plain numbers. `alpha_order(..., rule=)` takes any callable, and
-`per_step` maps it over steps and actions. $\delta$ is everywhere the probability of *failure*.
+`mg.learning` maps it over steps and actions. $\delta$ is everywhere the probability of *failure*.
 """
 
 from collections.abc import Callable

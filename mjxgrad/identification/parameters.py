@@ -168,7 +168,7 @@ def friction(
         scene: the scene with the nominal value.
         pairs: pairs of geom names; None for all that can touch.
         bounds: least and greatest coefficient.
-        **subset: `geoms`, `bodies` or `groups` in place of pairs, as in `Softness`.
+        **subset: `geoms` in place of pairs, as in `Softness`.
 
     Raises:
         ValueError: if a name is unknown or can touch nothing.
@@ -198,7 +198,7 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
         part: "stiffness" (1/s²), "damping_ratio", which determines the restitution (`mjxgrad.contact.bounce`), or "width"
             (m).
         bounds: least and greatest value; a tenth and ten times the nominal value by default.
-        **subset: `pairs`, `geoms`, `bodies` or `groups`, as in `Softness`; all contacts by default.
+        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
 
     Raises:
         ValueError: if there is no such part, or as `Softness`.

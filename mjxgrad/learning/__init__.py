@@ -1,9 +1,9 @@
 """Policies learned through contact: short windows with a value function, by first order, zeroth order, or a mixture."""
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
-from mjxgrad.learning.learn import Learned, learn, to_csv
+from mjxgrad.learning.learn import Learned, learn
 from mjxgrad.learning.learner import Learner, Policy
-from mjxgrad.learning.settings import Settings, apg
+from mjxgrad.learning.settings import Settings
 from mjxgrad.loop import Log
 
 __all__ = [
@@ -13,8 +13,6 @@ __all__ = [
     "Log",
     "Policy",
     "Settings",
-    "apg",
     "evaluate",
     "learn",
-    "to_csv",
 ]

@@ -11,15 +11,13 @@ mixing rule:
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
 | `rules.Consistent(failure_probability=1e-3)` | the same with a test for bias: α-order, the default |
 
-With the settings `apg()` there is no value function: analytic policy gradients (APG).
+Without a value function (`has_critic=False`) first order is analytic policy gradients (APG).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
     ICLR 2022, arXiv:2204.07137 (SHAC). Onoda et al., arXiv:2604.18161 (IVW-H).
 """
 
-import csv
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -80,7 +78,7 @@ def learn(
         key: consumed here; an array of keys learns one policy per key side by side, and the result gets an axis for them.
         num_updates: total number of updates, those before a checkpoint included.
         settings: settings of the learner; None takes the defaults.
-        log: function called after every `log_every` updates with their means: `to_csv("run.csv")`, or for a tracker
+        log: function called after every `log_every` updates with their means, such as
             `lambda update, metrics: wandb.log(metrics, step=update)`.
         log_every: updates in one program; logs and checkpoints come between programs.
         checkpoint: file to resume from if it exists, written after every `log_every` updates. Settings, key and environment
@@ -115,30 +113,3 @@ def learn(
     seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (num_updates, *shape))
     history = {name: jnp.asarray(values) for name, values in (progress.found | {"seconds": seconds}).items()}
     return Learned(progress.carry.policy, history, progress.carry)
-
-
-def to_csv(path: str | os.PathLike[str]) -> Log:
-    """Return a `log` for `learn` and `mg.optimise` that appends a row per call; a new file begins with the names.
-
-    Raises:
-        ValueError: when the log is called with other names than those in the file.
-    """
-    path = Path(path)
-
-    def log(step: int, metrics: dict[str, float]) -> None:
-        names = ["step", *metrics]
-        is_new = not path.exists() or not path.stat().st_size
-        if not is_new:
-            with path.open(newline="", encoding="utf-8") as file:
-                there = next(csv.reader(file))
-            if there != names:
-                raise ValueError(
-                    f"{path} must have the columns {', '.join(names)}, got {', '.join(there)}; use another path"
-                )
-        with path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            if is_new:
-                writer.writerow(names)
-            writer.writerow([step, *metrics.values()])
-
-    return log

@@ -14,12 +14,16 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.learning.networks import Network, Normaliser, make_actor, make_critic
+from mjxgrad.learning.networks import Network, Normaliser
 from mjxgrad.learning.settings import Settings
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, window_gradients
 from mjxgrad.loop.run import Method
+from mjxgrad.objective.policy import FINAL_SCALE
 
 Metrics = dict[str, Float[Array, ""]]
+_TRACE = 0.95  # λ of the value function's targets
+_TARGET_RATE = 0.8  # share by which the target value function follows the value function
+_LARGEST_NORM = 1.0  # to which gradients are clipped
 
 
 class Policy(eqx.Module):
@@ -85,15 +89,16 @@ class ActorCritic(Method):
         settings, count = self.settings, self.settings.num_environments
         model_keys = jax.random.split(model_key, count)
         environments = self._starts(model_keys, start_key)
-        if not settings.is_episodic:
-            # Otherwise all episodes would end together, and an update would see only one part of them.
-            spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
-            environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
+        # Otherwise all episodes would end together, and an update would see only one part of them.
+        spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
+        environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
         num_seen, num_actions = environments.obs.shape[-1], self.environment.num_actions
-        actor = make_actor(num_seen, num_actions, settings.actor_layers, actor_key, settings.actor_scale)
+        # Actions before squashing, near zero at first.
+        sizes = num_seen, *settings.actor_layers, num_actions
+        actor = Network.make(sizes, actor_key, hidden_scale=settings.actor_scale, final_scale=FINAL_SCALE)
         # No value function is a network that is zero and is never fitted.
-        scale = 1.0 if settings.has_critic else 0.0
-        critic = make_critic(num_seen, settings.critic_layers, critic_key, final_scale=scale)
+        sizes = num_seen, *settings.critic_layers, 1
+        critic = Network.make(sizes, critic_key, final_scale=float(settings.has_critic))
         actor_optimiser, critic_optimiser = optimisers(settings, self.num_updates)
         return Learner(
             policy=Policy(actor, Normaliser.make(num_seen).with_more(environments.obs)),
@@ -111,24 +116,17 @@ class ActorCritic(Method):
     def step(self, carry: Learner, index: Int[Array, ""]) -> tuple[Learner, Metrics]:
         """Do one update; its metrics are described in `learn`."""
         settings, learner, environments = self.settings, carry, carry.environments
-        noise_key, start_key, critic_key, next_key = jax.random.split(learner.key, 4)
+        noise_key, critic_key, next_key = jax.random.split(learner.key, 3)
         first, last = settings.stddev
         stddev = first + (last - first) * learner.num_updates / self.num_updates
-        if settings.is_episodic:
-            environments = self._starts(learner.model_keys, start_key)
         window, environments, gradients = self._windows(learner, environments, noise_key, stddev)
         policy, actor_moments, found = self._improve(learner, window, gradients)
-        critic, target, critic_moments, critic_loss = (
-            learner.critic,
-            learner.target,
-            learner.critic_moments,
-            jnp.zeros(()),
-        )
+        critic, target, critic_moments = learner.critic, learner.target, learner.critic_moments
+        critic_loss = jnp.zeros(())
         if settings.has_critic:
             critic, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
-            target = jax.tree.map(lambda old, new: old + settings.target_rate * (new - old), learner.target, critic)
-        so_far = jnp.zeros_like(learner.episode_return) if settings.is_episodic else learner.episode_return
-        episode_return, ended = _episodes(window, so_far)
+            target = jax.tree.map(lambda old, new: old + _TARGET_RATE * (new - old), learner.target, critic)
+        episode_return, ended = _episodes(window, learner.episode_return)
         following = dataclasses.replace(
             learner,
             policy=eqx.tree_at(lambda p: p.normaliser, policy, learner.policy.normaliser.with_more(window.obs)),
@@ -222,7 +220,7 @@ class ActorCritic(Method):
 
         def targets(window: Window) -> Float[Array, " steps"]:
             return lambda_returns(
-                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, self.settings.trace
+                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, _TRACE
             )
 
         wanted = jax.vmap(targets)(window).reshape(-1)
@@ -251,7 +249,7 @@ def optimisers(
     """Return the optimisers of the policy and of the value function."""
 
     def optimiser(schedule: optax.Schedule) -> optax.GradientTransformation:
-        clip = optax.clip_by_global_norm(settings.largest_norm)
+        clip = optax.clip_by_global_norm(_LARGEST_NORM)
         # Flattened to one vector, which takes a few operations instead of as many for each layer's arrays.
         return optax.flatten(optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95)))
 

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.objective.policy import FINAL_SCALE
-
 
 class Network(eqx.Module):
     """A multilayer perceptron whose hidden layers end in an exponential linear unit and layer normalisation.
@@ -24,14 +22,10 @@ class Network(eqx.Module):
     def make(
         cls, sizes: Sequence[int], key: PRNGKeyArray, *, hidden_scale: float = 1.0, final_scale: float = 1.0
     ) -> "Network":
-        """Draw a network.
+        """Draw a network; `sizes` are the number of inputs, the sizes of the hidden layers, and the number of outputs.
 
-        Args:
-            sizes: number of inputs, sizes of the hidden layers, number of outputs.
-            key: consumed here.
-            hidden_scale: factor of the gains and offsets of the hidden layers. Normalisation undoes it in the output, but
-                it changes the relative size of the optimiser's steps.
-            final_scale: factor of the gains of the last layer.
+        `hidden_scale` is a factor of the gains and offsets of the hidden layers. Normalisation undoes it in the output, but
+        it changes the relative size of the optimiser's steps. `final_scale` is a factor of the gains of the last layer.
         """
         keys = jax.random.split(key, len(sizes) - 1)
         layers = [eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys, strict=True)]
@@ -80,19 +74,3 @@ class Normaliser(eqx.Module):
         count, shift = self.count + added, mean - self.mean
         share = added / jnp.maximum(count, 1)
         return Normaliser(count, self.mean + share * shift, self.squares + squares + shift**2 * self.count * share)
-
-
-def make_actor(
-    num_observations: int, num_actions: int, hidden: Sequence[int], key: PRNGKeyArray, hidden_scale: float = 1.0
-) -> Network:
-    """Draw a network for actions before squashing, near zero at first."""
-    return Network.make(
-        [num_observations, *hidden, num_actions], key, hidden_scale=hidden_scale, final_scale=FINAL_SCALE
-    )
-
-
-def make_critic(
-    num_observations: int, hidden: Sequence[int], key: PRNGKeyArray, *, final_scale: float = 1.0
-) -> Network:
-    """Draw a network for the value of an observation."""
-    return Network.make([num_observations, *hidden, 1], key, final_scale=final_scale)

@@ -1,9 +1,8 @@
-"""Settings for learning from short windows: SHAC's, and those of analytic policy gradients (`apg`)."""
+"""Settings for learning from short windows; the defaults are SHAC's."""
 
 import dataclasses
-from typing import Any
 
-from mjxgrad.estimators.rules import Consistent, FixedAlpha, Rule
+from mjxgrad.estimators.rules import Consistent, Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,7 +13,6 @@ class Settings:
         num_environments: number of environments side by side.
         window: steps of each environment per update.
         discount: discount per step.
-        trace: λ of the value function's targets.
         rule: map from the evidence of a step and action to the weight of its first-order gradient. It is asked for each of
             them. A failure probability of a twentieth would bring in much noise, so the default is smaller.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
@@ -26,19 +24,15 @@ class Settings:
         critic_rate: learning rate of the value function, which decreases linearly to zero.
         critic_iterations: passes over a window's states per update.
         critic_batches: number of batches in a pass.
-        target_rate: share by which the target value function follows the value function.
-        largest_norm: norm to which gradients are clipped.
         largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
             unit is the root mean square of the zeroth-order gradient over environments: 0.3 limits the first-order variance
             to a tenth of the zeroth-order one. Infinity shortens none.
         has_critic: whether a value function estimates the rewards after a window; otherwise they are left out.
-        is_episodic: whether every window starts a new episode.
     """
 
     num_environments: int = 64
     window: int = 32
     discount: float = 0.99
-    trace: float = 0.95
     rule: Rule = dataclasses.field(default_factory=lambda: Consistent(failure_probability=1e-3))
     stddev: tuple[float, float] = (0.4, 0.1)
     actor_layers: tuple[int, ...] = (128, 64, 32)
@@ -49,19 +43,15 @@ class Settings:
     critic_rate: float = 2e-3
     critic_iterations: int = 16
     critic_batches: int = 4
-    target_rate: float = 0.8
-    largest_norm: float = 1.0
     largest_sample: float = 0.3
     has_critic: bool = True
-    is_episodic: bool = False
 
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("discount", "trace", "target_rate"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        if not 0 <= self.discount <= 1:
+            raise ValueError(f"discount must be from 0 to 1, got {self.discount}")
         if not self.largest_sample > 0:
             raise ValueError(f"largest_sample must be positive, got {self.largest_sample}")
         if min(self.stddev) <= 0:
@@ -71,30 +61,3 @@ class Settings:
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
                 f"got {self.critic_batches}"
             )
-
-
-def apg(**changes: Any) -> Settings:
-    """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
-
-    There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
-    falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
-    which allows larger rates.
-
-    Args:
-        changes: settings that replace these.
-
-    References:
-        Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
-        (`brax/training/agents/apg`).
-    """
-    settings = {
-        "discount": 1.0,
-        "rule": FixedAlpha(1.0),
-        "stddev": (0.07, 0.01),
-        "actor_layers": (256, 128),
-        "actor_scale": 0.01,
-        "actor_rate": 1e-4,
-        "actor_decay": 0.997,
-        "has_critic": False,
-    }
-    return Settings(**(settings | changes))

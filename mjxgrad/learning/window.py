@@ -141,16 +141,8 @@ def run_window(
 ) -> tuple[Window, EnvState]:
     """Run a policy for one step per row of noise.
 
-    Args:
-        environment: one copy of the environment.
-        state: state at the start.
-        actor: network from normalised observations to actions before squashing.
-        normaliser: normalisation of observations.
-        noise: noise added to actions before squashing.
-        change: a further addition, to differentiate by.
-
-    Returns:
-        The window, and the state from which the next one starts.
+    The noise is added to actions before squashing, and so is `change`, to differentiate by. The next window starts from the
+    returned state.
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
@@ -176,16 +168,8 @@ def window_gradients(
 ) -> tuple[Window, EnvState, Gradients]:
     """Run a window in one environment and differentiate its return; under `jax.vmap`, in many.
 
-    Args:
-        environment: the environment before it is randomised.
-        state: state at the start.
-        model_key: key of this copy's model.
-        noise: standard normal noise.
-        actor: network of the actions' means.
-        critic: network of the values.
-        normaliser: normalisation of observations.
-        stddev: standard deviation of the noise on actions before squashing.
-        discount: discount per step.
+    The environment is that before `model_key` randomises it. The noise is standard normal; `stddev` is its standard
+    deviation on actions before squashing.
     """
     copy = environment.randomised(model_key)
 
@@ -205,12 +189,8 @@ def window_gradients(
 def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
     """Mix both gradients by step and action.
 
-    Where a first-order gradient is not finite, the zeroth-order one replaces it.
-
-    Args:
-        gradients: gradients of all environments.
-        rule: map from the evidence of a step and action to its weight. Costs are not compared (`inconsistency` is zero),
-            since no two environments share a start.
+    Where a first-order gradient is not finite, the zeroth-order one replaces it. The rule maps the evidence of a step and
+    action to its weight. Costs are not compared (`inconsistency` is zero), since no two environments share a start.
 
     Returns:
         The mixture, the weights by step and action, and their evidence.

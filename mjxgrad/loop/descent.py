@@ -45,7 +45,6 @@ class RunOptions(eqx.Module):
             The metrics are the fields of `History` at the last step, the mean over the seeds that took it, and `best_cost`.
         checkpoint: file to save the run in, as often, and to resume it from. On the same device a resumed run gives the
             result of an uninterrupted one to the bit, except for the seconds.
-        checkpoint_every: twentieths of the steps between two saves. An interrupted run is saved in any case.
     """
 
     num_steps: int
@@ -54,10 +53,9 @@ class RunOptions(eqx.Module):
     patience: int = 10
     log: Log | None = None
     checkpoint: Path | None = eqx.field(default=None, converter=_as_path)
-    checkpoint_every: int = 1
 
     def __check_init__(self):
-        for name in ("num_steps", "evaluate_every", "patience", "checkpoint_every"):
+        for name in ("num_steps", "evaluate_every", "patience"):
             whole(name, getattr(self, name))
         if self.checkpoint is not None and not self.checkpoint.parent.is_dir():
             folder = self.checkpoint.parent
@@ -128,7 +126,7 @@ class Descent(Method):
             "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
             "over": [None] * key.ndim,
             "segment": math.ceil(self.options.num_steps / NUM_SEGMENTS),
-            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint", "checkpoint_every")},
+            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint")},
         }
 
     def init(self, start: tuple[Float[Array, " dim"], PRNGKeyArray]) -> Carry:

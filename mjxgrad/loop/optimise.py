@@ -33,17 +33,9 @@ def optimise(
     optimiser: optax.GradientTransformation,
     num_steps: int,
     annealing: Annealing | None = None,
-    clip_norm: float | None = None,
     **options: Any,
 ) -> Optimisation:
     r"""Minimise a cost under noise by descent along estimated gradients.
-
-        estimator = functools.partial(mg.estimators.zeroth_order, num_samples=64)
-        result = mg.optimise(
-            objective, params, jax.random.key(0),
-            estimator=estimator, optimiser=optax.adam(1e-2), num_steps=300,
-        )
-        result.best_params, result.history.cost, mg.Stopped[result.stopped]
 
     There is one compilation for all steps and seeds: `jax.random.split(jax.random.key(0), 5)` in place of the key runs
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
@@ -55,34 +47,24 @@ def optimise(
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.
 
-        noisy = mg.parameter_noise(function, stddev=0.3)
-        mg.optimise(
-            lambda scale: noisy.with_stddev(0.3 * scale), params, key,
-            annealing=optax.exponential_decay(1.0, 100, 0.5, end_value=0.05), ...
-        )
-        # Contact from soft to stiff:
+        # Contact from soft to stiff; likewise objective.with_stddev(0.3 * scale) for less and less noise.
         mg.optimise(
             lambda scale: task.objective(softness=mg.Softness(stiffness=1e3 / scale, damping_ratio=1.0)), params, key,
             annealing=optax.exponential_decay(1.0, 10, 0.5, end_value=0.01), ...
         )
-
-    With a progress bar of tqdm:
-
-        mg.optimise(..., log=lambda step, metrics: (bar.update(step - bar.n), bar.set_postfix(cost=metrics["cost"])))
 
     Args:
         objective: the objective to minimise, or with `annealing` a function from a scale to an objective.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
             dict or an equinox module. The function of `parameter_noise` and `evaluate` then take a pytree of the same
             form, and the result has this form. Estimators see all its arrays as one vector.
-        key: consumed here; with a leading axis, one per seed.
+        key: key of all noise; with a leading axis, one per seed.
         estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
             settings bound by `functools.partial`.
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
-        clip_norm: largest norm of the gradient that the optimiser sees; longer gradients are shortened to it.
-        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `checkpoint_every`; see `RunOptions`.
+        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`; see `RunOptions`.
 
     Returns:
         The last and the best parameters, the history, the reason for stopping and the rollouts spent.
@@ -95,7 +77,7 @@ def optimise(
     chosen = RunOptions(num_steps, **options)
     if restore is not None and chosen.evaluate is not None:
         chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
-    method = GradientStep(chosen, of_vector(objective, restore), estimator, optimiser, annealing, clip_norm)
+    method = GradientStep(chosen, of_vector(objective, restore), estimator, optimiser, annealing)
     result = run(method, **method.begun(vector, key))
     if restore is None:
         return result
@@ -109,7 +91,6 @@ class GradientStep(Descent):
     estimator: Estimator
     optimiser: optax.GradientTransformation
     annealing: Annealing | None
-    clip_norm: float | None
 
     def __check_init__(self):
         if self.annealing is None:
@@ -131,15 +112,11 @@ class GradientStep(Descent):
             raise ValueError(
                 f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {self.optimiser!r}"
             )
-        if self.clip_norm is not None and not self.clip_norm > 0:
-            raise ValueError(f"clip_norm must be positive, got {self.clip_norm}")
 
     @property
     def transformation(self) -> optax.GradientTransformationExtraArgs:
-        """The optimiser with clipping; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
-        if self.clip_norm is None:
-            return optax.with_extra_args_support(self.optimiser)
-        return optax.with_extra_args_support(optax.chain(optax.clip_by_global_norm(self.clip_norm), self.optimiser))
+        """The optimiser; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
+        return optax.with_extra_args_support(self.optimiser)
 
     def init_state(self, params: Float[Array, " dim"]) -> PyTree:
         return jax.tree.map(jnp.asarray, self.transformation.init(params))
@@ -207,7 +184,6 @@ def estimated_gradient(
     estimator: Estimator,
     optimiser: optax.GradientTransformation | None = None,
     annealing: Annealing | None = None,
-    clip_norm: float | None = None,
 ) -> optax.GradientTransformationExtraArgs:
     """Return the step of `optimise` as an optax transformation, for a loop of your own.
 
@@ -219,8 +195,8 @@ def estimated_gradient(
         state.estimate  # the last one, with its error bars
 
     Update number n draws its noise from `fold_in(key, n)`, as in `optimise`, so both give the same trajectory. The
-    arguments are those of `optimise`. With `optimiser` None the update is the clipped gradient itself, to be chained with
-    other transformations.
+    arguments are those of `optimise`. With `optimiser` None the update is the gradient itself, to be chained with other
+    transformations.
 
     Returns:
         A transformation of a vector, or of a pytree as in `optimise`. The updates that it is given are added to the
@@ -231,7 +207,7 @@ def estimated_gradient(
     Raises:
         ValueError: if `objective` and `annealing` do not belong together.
     """
-    rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing, clip_norm)
+    rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
     def init(params: PyTree) -> EstimatedGradientState:
         vector, restore = flattened(params)

@@ -38,8 +38,8 @@ class Record(eqx.Module):
         cost_error: standard error of `cost`.
         gradient_norm: norm of the estimate.
         gradient_error: norm of the standard error of the estimate.
-        alpha: weight of the first-order part, the mean where there are several.
-        reason: reason for the smallest `alpha`.
+        alpha: weight of the first-order part.
+        reason: reason for `alpha`.
         bias_bound: bound on the norm of the bias; NaN where nothing is known.
         scale: scale of the annealing; 1 without annealing.
         step_norm: norm of the change of the parameters.
@@ -75,19 +75,15 @@ class Record(eqx.Module):
     def of_estimate(
         cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
     ) -> "Record":
-        """Return the record of a step along an estimate: the mean of several α, and the reason for the smallest."""
+        """Return the record of a step along an estimate."""
         dtype = estimate.value.dtype
-        alpha = jnp.ravel(estimate.alpha)
-        reason = jax.tree.map(
-            lambda item: jnp.ravel(jnp.broadcast_to(item, estimate.alpha.shape))[jnp.argmin(alpha)], estimate.reason
-        )
         return cls(
             cost=estimate.objective_mean.astype(dtype),
             cost_error=estimate.objective_standard_error.astype(dtype),
             gradient_norm=jnp.linalg.norm(estimate.value),
             gradient_error=jnp.linalg.norm(estimate.standard_error),
-            alpha=alpha.mean().astype(dtype),
-            reason=reason,
+            alpha=estimate.alpha.astype(dtype),
+            reason=estimate.reason,
             bias_bound=estimate.bias_bound.astype(dtype),
             scale=jnp.asarray(scale, dtype),
             step_norm=jnp.asarray(step_norm, dtype),

@@ -105,21 +105,19 @@ def run(
     over: Sequence[list[int | None] | None] = (),
     log: Log | None = None,
     checkpoint: Path | None = None,
-    checkpoint_every: int = 1,
     on_all_devices: bool = False,
 ) -> Any:
     """Repeat a method until it is over, and return its `result`.
 
     Args:
-        method: the method to repeat.
+        method: the method.
         start: argument of the method's `init`.
         num_steps: largest number of steps.
         segment: steps in one program; logs and checkpoints come between segments.
         over: axes of the method's arrays for each leading axis of the start: None for many starts of one method, else the
             list from `side_by_side`. All runs are in one program.
         log: function called after every segment with the number of steps done and the method's `metrics`.
-        checkpoint: file to save the run in, and to resume it from.
-        checkpoint_every: segments between two saves. An interrupted run is saved in any case.
+        checkpoint: file to save the run in after every segment, and to resume it from.
         on_all_devices: whether all devices of all processes get the arrays, for a method that spreads its work over them.
 
     Raises:
@@ -160,13 +158,13 @@ def run(
                 compiled = compile_once(steps.lower(*given))
                 progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
             progress = _after(progress, functools.partial(compiled, *given))
-            if checkpoint is not None and is_first and progress.num_steps - on_disk >= checkpoint_every * segment:
+            if checkpoint is not None and is_first:
                 checkpoints.save(checkpoint, progress[:3], identity)
                 on_disk = progress.num_steps
             if log is not None and is_first:
                 log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
     finally:
-        # Also after an interruption: KeyboardInterrupt goes on to the caller.
+        # Also after an interruption of a save: KeyboardInterrupt goes on to the caller.
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
     return method.result(progress)

@@ -14,23 +14,12 @@ import numpy as np
 from mjxgrad._mjx import mjx
 from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
-from mjxgrad.scene.refusals import element_name, has_constraints, has_medium, searched_pairs
+from mjxgrad.scene.refusals import element_name, has_constraints, has_medium
 
 _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
-_SPRING, _DAMPER = _DISABLE.mjDSBL_SPRING.value, _DISABLE.mjDSBL_DAMPER.value
 _EULERDAMP = _DISABLE.mjDSBL_EULERDAMP.value
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE.value
-_IMPEDANCES = (
-    "geom_solimp",
-    "pair_solimp",
-    "jnt_solimp",
-    "dof_solimp",
-    "tendon_solimp_lim",
-    "tendon_solimp_fri",
-    "eq_solimp",
-)
-_ENDLESS = 1e12  # metres or radians
 # Newton's method needs a few for most steps and up to 20 for some. It stops by itself, so a high limit costs nothing.
 _FEWEST_ITERATIONS, _ITERATIONS = 20, 100
 
@@ -58,19 +47,20 @@ def _has(model: mujoco.MjModel, flag: int) -> bool:
     return bool(model.opt.disableflags & flag)
 
 
-def _disabled(
-    model: mujoco.MjModel, flag: mujoco.mjtEnableBit, reason: str, exact: bool = True
-) -> Iterator[Conversion]:
-    if model.opt.enableflags & flag.value:
-        model.opt.enableflags &= ~flag.value
-        yield Conversion(f"flag {flag.name.removeprefix('mjENBL_').lower()}", "enable", "disable", reason, exact)
-
-
 def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
-    yield from _disabled(model, _ENABLE.mjENBL_ENERGY, "energy is computed for reading only")
-    yield from _disabled(model, _ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing")
-    asleep = "bodies at rest are stepped too, not frozen below sleep_tolerance as in C MuJoCo"
-    yield from _disabled(model, _ENABLE.mjENBL_SLEEP, asleep, exact=False)
+    for flag, reason, exact in (
+        (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
+        (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing", True),
+        (
+            _ENABLE.mjENBL_SLEEP,
+            "bodies at rest are stepped too, not frozen below sleep_tolerance as in C MuJoCo",
+            False,
+        ),
+    ):
+        if model.opt.enableflags & flag.value:
+            model.opt.enableflags &= ~flag.value
+            what = f"flag {flag.name.removeprefix('mjENBL_').lower()}"
+            yield Conversion(what, "enable", "disable", reason, exact)
     for flag in ("ISLAND", "MIDPHASE", "NATIVECCD", "MULTICCD", "AUTORESET"):
         if _has(model, getattr(_DISABLE, f"mjDSBL_{flag}").value):
             reason = "chooses between algorithms of C MuJoCo; MJX has its own"
@@ -97,14 +87,6 @@ def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion("solver", name, "Newton", "the same convex problem, the same optimum")
 
 
-def _idle(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Switch off two options without effect; scenes with friction or constraints, where they act, were refused before."""
-    if model.opt.noslip_iterations > 0:
-        given, model.opt.noslip_iterations = model.opt.noslip_iterations, 0
-        yield Conversion("noslip_iterations", str(given), "0", "the scene has no friction")
-    yield from _disabled(model, _ENABLE.mjENBL_DIAGEXACT, "the scene has no constraints")
-
-
 def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.wind.any() and not has_medium(model):
         given = " ".join(f"{w:g}" for w in model.opt.wind)
@@ -112,20 +94,8 @@ def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion("wind", given, "0 0 0", "there is no medium: density = viscosity = 0")
 
 
-def _passive_flags(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Disable both passive forces by their parameters: with one flag disabled MJX drops all, C only its own."""
-    spring, damper = _has(model, _SPRING), _has(model, _DAMPER)
-    if spring and not damper:
-        model.opt.disableflags &= ~_SPRING
-        for field in ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"):
-            getattr(model, field)[:] = 0.0
-        yield Conversion("flag spring", "disable", "stiffness 0", "MJX would drop damping as well")
-    if damper and not spring:
-        model.opt.disableflags &= ~_DAMPER
-        for of in ("dof", "tendon", "actuator"):
-            getattr(model, f"{of}_damping")[:] = getattr(model, f"{of}_dampingpoly")[:] = 0.0
-        yield Conversion("flag damper", "disable", "damping 0", "MJX would drop springs as well")
-    if spring and damper and not _has(model, _EULERDAMP):
+def _no_passive_forces(model: mujoco.MjModel) -> Iterator[Conversion]:
+    if all(_has(model, flag.value) for flag in (_DISABLE.mjDSBL_SPRING, _DISABLE.mjDSBL_DAMPER)):
         model.opt.disableflags |= _EULERDAMP
         reason = "with the damper flag disabled C MuJoCo integrates no damping, MJX would"
         yield Conversion("flag eulerdamp", "enable", "disable", reason)
@@ -172,43 +142,6 @@ def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
         yield Conversion(f"friction of {name_pairs(raised)}", "0", least, reason)
 
 
-def _no_width(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Replace a zero width: C then takes the mean impedance at every depth, MJX the largest.
-
-    The largest impedance also scales stiffness and damping, so it stays. The impedance starts from the mean and rises over an
-    endless width.
-    """
-    fields = {name: getattr(model, name) for name in _IMPEDANCES}
-    flat = {name: _is_flat_but_uneven(values) for name, values in fields.items()}
-    if flat["geom_solimp"].any():
-        flat["geom_solimp"] &= ~_mixed_with_a_width(model)
-    for name, rows in flat.items():
-        if not rows.any():
-            continue
-        solimp = fields[name]
-        given = f"{solimp[rows][0, 2]:g}"
-        bounds = np.clip(solimp[rows, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-        solimp[rows, 0], solimp[rows, 2] = bounds.mean(axis=1), _ENDLESS
-        which = f" of {int(rows.sum())} rows" if rows.sum() > 1 else f" of row {int(np.flatnonzero(rows)[0])}"
-        reason = "without a width C MuJoCo takes the mean impedance at every depth, MJX the largest"
-        yield Conversion(f"width in {name}{which}", given, f"{_ENDLESS:g}, from the mean", reason)
-
-
-def _is_flat_but_uneven(solimp: np.ndarray) -> np.ndarray:
-    bounds = np.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    return (solimp[:, 2] <= mujoco.mjMINVAL) & (bounds[:, 0] != bounds[:, 1])
-
-
-def _mixed_with_a_width(model: mujoco.MjModel) -> np.ndarray:
-    """Return the geoms with contacts where their solimp is averaged with one that keeps its width."""
-    keeps = model.geom_solimp[:, 2] > mujoco.mjMINVAL
-    averaged = [list(deciding_geoms(model, pair)) for pair in contact_pairs(model)]
-    for _ in averaged:  # an average with a geom that keeps its width keeps it, too
-        for geoms in averaged:
-            keeps[geoms] = keeps[geoms].any()
-    return keeps
-
-
 def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return
@@ -227,15 +160,6 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
         names = [element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in np.flatnonzero(differs).tolist()]
         reason = "its velocity derivative ignores force and control limits and muscles"
         yield Conversion(f"integrator at {name_pairs(names)}", *both, reason, exact=False)
-
-
-def searched_contacts(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Allow contacts found on distance fields, which are refused unless the user asks for them."""
-    if found := list(searched_pairs(model)):
-        reason = (
-            "its normal may be off by 10 degrees, its derivative by any factor, or NaN; use capsules, spheres or boxes"
-        )
-        yield Conversion(f"contact of {name_pairs(found)}", "exact", "search on distance fields", reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -286,12 +210,5 @@ def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
 
 _Rules = tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...]
 # The first group avoids refusals and runs before them, the second runs after them.
-BEFORE_REFUSALS: _Rules = (_flags, _wind, _passive_flags)
-AFTER_REFUSALS: _Rules = (
-    _solver,
-    _idle,
-    _actuator_inertia,
-    _least_friction,
-    _no_width,
-    _implicitfast,
-)
+BEFORE_REFUSALS: _Rules = (_flags, _wind)
+AFTER_REFUSALS: _Rules = (_solver, _no_passive_forces, _actuator_inertia, _least_friction, _implicitfast)

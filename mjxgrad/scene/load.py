@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import itertools
 import math
 import os
 import threading
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._mjx import MJX_VERSION, counts, make_efc_address, make_efc_type, mjx
+from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.parameters import contact_pairs
@@ -26,7 +27,6 @@ from mjxgrad.scene.conversions import (
     Conversion,
     drop_sensors,
     kinematics_alone,
-    searched_contacts,
 )
 from mjxgrad.scene.omissions import switch_off
 from mjxgrad.scene.refusals import refusal_messages
@@ -46,7 +46,6 @@ def load_scene(
     keep_everything: bool = False,
     timestep: float | None = None,
     max_contacts: int | None = None,
-    distance_fields: bool = False,
     engine: Literal["mjx", "mujoco"] | None = None,
 ) -> Scene:
     """Load a scene, convert what MJX lacks and leave out what the scene does not need.
@@ -66,9 +65,6 @@ def load_scene(
         max_contacts: number of contact slots per friction dimension (`condim`), for the nearest contacts; only these cost
             anything in the solve. None has room for all possible contacts. `Trajectory.crowded` counts the steps that filled
             all slots.
-        distance_fields: accept contacts on distance fields: of cylinders and ellipsoids with each other and capsules, and of
-            ellipsoids with spheres. The motion may be good, but the gradient is often wrong or NaN. By default C MuJoCo steps
-            such a scene.
         engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None is MJX where
             possible.
 
@@ -91,7 +87,7 @@ def load_scene(
         mj_model, name = _compile(source)
     _set_timestep(mj_model, name, timestep)
     _check_model(mj_model, name)
-    mj_model, stepped, conversions, unsupported = _converted(mj_model, name, distance_fields, engine)
+    mj_model, stepped, conversions, unsupported = _converted(mj_model, name, engine)
     omissions = ()
     if not keep_everything and not unsupported:
         omissions = switch_off(stepped)
@@ -110,7 +106,7 @@ def load_scene(
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
-        messages += softness_warnings(softness, scene.model, mj_model)
+        messages += softness_warnings(softness, scene.model)
     for message in messages + scene.warnings():
         warnings.warn(f"{name}: {message}", SceneWarning, stacklevel=2)
     return scene
@@ -161,45 +157,18 @@ def _parse(read, argument: str | mujoco.MjSpec, name: str) -> tuple[mujoco.MjMod
 
 
 def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
-    count = count_pairs(model)
-    if count > MOST_PAIRS:
+    if count_pairs(model) > MOST_PAIRS:
         raise SceneError(
-            f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got about {count}: give geoms that never "
+            f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "
             "touch contype and conaffinity that do not match; then max_contacts bounds those that do"
         )
 
 
 def count_pairs(model: mujoco.MjModel) -> int:
-    """Count the pairs of geoms that can touch, without listing them; explicit `<pair>` elements count in addition."""
+    """Count the pairs of geoms that can touch, up to one more than `MOST_PAIRS`."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return 0
-    masks, weld = np.stack([model.geom_contype, model.geom_conaffinity], axis=1), model.body_weldid
-
-    def matching(first: np.ndarray, second: np.ndarray) -> int:
-        of_one, ones = np.unique(masks[first], axis=0, return_counts=True)
-        of_other, others = np.unique(masks[second], axis=0, return_counts=True)
-        match = ((of_one[:, :1] & of_other[:, 1]) | (of_one[:, 1:] & of_other[:, 0])) != 0
-        return int(ones @ match @ others)
-
-    every, body = np.full(model.ngeom, True), model.geom_bodyid
-    count = matching(every, every)
-    for fixed in np.unique(weld[body]):
-        own = weld[body] == fixed
-        count -= matching(own, own)
-    # Both orders were counted. MuJoCo also filters pairs of a body and its parent, unless that is the world, ...
-    count //= 2
-    jointed = {(int(weld[model.body_parentid[fixed]]), int(fixed)) for fixed in np.unique(weld[1:]) if fixed}
-    jointed = {pair for pair in jointed if pair[0]}
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
-        jointed = set()
-    count -= sum(matching(weld[body] == one, weld[body] == other) for one, other in jointed)
-    # ... and excluded bodies.
-    for signature in np.unique(model.exclude_signature):
-        one, other = divmod(int(signature), 1 << 16)
-        welds = (int(weld[one]), int(weld[other]))
-        if welds[0] != welds[1] and not {welds, welds[::-1]} & jointed:
-            count -= matching(body == one, body == other)
-    return count + model.npair
+    return sum(1 for _ in itertools.islice(geom_pairs(model), MOST_PAIRS + 1))
 
 
 def _set_timestep(model: mujoco.MjModel, name: str, timestep: float | None) -> None:
@@ -225,7 +194,7 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
 
 
 def _converted(
-    model: mujoco.MjModel, name: str, distance_fields: bool, engine: Literal["mjx", "mujoco"] | None
+    model: mujoco.MjModel, name: str, engine: Literal["mjx", "mujoco"] | None
 ) -> tuple[mujoco.MjModel, mujoco.MjModel, list[Conversion], str]:
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)
@@ -238,7 +207,7 @@ def _converted(
                 f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
                 "pip install 'mjxgrad[mjx]' for MJX's step"
             )
-        conversions = _make_simulable(model, name, distance_fields)
+        conversions = _make_simulable(model, name)
         stepped = copy.deepcopy(model)
         conversions += list(drop_sensors(stepped))
     except SceneError as error:
@@ -248,16 +217,16 @@ def _converted(
     return model, stepped, conversions, ""
 
 
-def _make_simulable(mj_model: mujoco.MjModel, name: str, distance_fields: bool) -> list[Conversion]:
+def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:
     """Convert in place what can be converted; refuse the rest."""
     conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
-    refused = refusal_messages(mj_model, distance_fields=distance_fields)
+    refused = refusal_messages(mj_model)
     if len(refused) == 1:
         raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
     if refused:
         listed = "\n".join(f"  - {message}" for message in refused)
         raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
-    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model)), *searched_contacts(mj_model)]
+    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model))]
 
 
 def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:

@@ -15,6 +15,7 @@ from mjxgrad.contact.parameters import contact_pairs
 
 _OBJECT = mujoco.mjtObj
 _ENABLE = mujoco.mjtEnableBit
+_DISABLE = mujoco.mjtDisableBit
 _GEOM = mujoco.mjtGeom
 _SEARCHED = (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER)
 
@@ -106,7 +107,7 @@ def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
             yield describe_pair(model, pair)
 
 
-def searched_pairs(model: mujoco.MjModel) -> Iterator[str]:
+def _searched_pairs(model: mujoco.MjModel) -> Iterator[str]:
     """Yield the pairs whose contact MJX can only find by a search on distance fields."""
     smooth = {kind.value for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, *_SEARCHED)}
     searched = {kind.value for kind in _SEARCHED}
@@ -126,23 +127,33 @@ def _margins_of_meshes(model: mujoco.MjModel) -> Iterator[str]:
             yield describe_pair(model, pair)
 
 
+_LAWS = (
+    ("geom_sol{}", _OBJECT.mjOBJ_GEOM),
+    ("pair_sol{}", _OBJECT.mjOBJ_PAIR),
+    ("jnt_sol{}", _OBJECT.mjOBJ_JOINT),
+    ("dof_sol{}", _OBJECT.mjOBJ_DOF),
+    ("eq_sol{}", _OBJECT.mjOBJ_EQUALITY),
+    ("tendon_sol{}_lim", _OBJECT.mjOBJ_TENDON),
+    ("tendon_sol{}_fri", _OBJECT.mjOBJ_TENDON),
+)
+
+
 def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
-    for field, kind in (
-        ("geom_solref", _OBJECT.mjOBJ_GEOM),
-        ("pair_solref", _OBJECT.mjOBJ_PAIR),
-        ("jnt_solref", _OBJECT.mjOBJ_JOINT),
-        ("dof_solref", _OBJECT.mjOBJ_DOF),
-        ("eq_solref", _OBJECT.mjOBJ_EQUALITY),
-        ("tendon_solref_lim", _OBJECT.mjOBJ_TENDON),
-        ("tendon_solref_fri", _OBJECT.mjOBJ_TENDON),
-    ):
+    for name, kind in _LAWS:
+        field = name.format("ref")
         for i, (first, second) in enumerate(getattr(model, field)):
             if (first > 0) != (second > 0):
                 yield f"{first:g} {second:g} in {field} of {element_name(model, kind, i)}"
 
 
-def _has_frictional_rows(model: mujoco.MjModel) -> bool:
-    return any(pair.condim > 1 for pair in contact_pairs(model)) or has_friction_loss(model)
+def _without_width(model: mujoco.MjModel) -> Iterator[str]:
+    """Name impedances that vary over no width: C MuJoCo takes their mean at every depth, MJX the largest."""
+    for name, kind in _LAWS:
+        field = name.format("imp")
+        solimp = getattr(model, field)
+        ends = np.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        for i in np.flatnonzero((solimp[:, 2] <= mujoco.mjMINVAL) & (ends[:, 0] != ends[:, 1])).tolist():
+            yield f"{field} of {element_name(model, kind, i)}"
 
 
 def _is_scalar_joint(model: mujoco.MjModel) -> np.ndarray:
@@ -167,15 +178,18 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
      "remove them, or replace signed distance fields by meshes or primitive geoms"),
     ("collision between some types of geom", _pairs_without_function,
      "exclude the pair by contype and conaffinity or <contact><exclude>, or use capsules, spheres or boxes"),
+    # In dm_control's finger, with two ellipsoids, the derivative of a search is 2000 times the slope; elsewhere it is NaN.
+    ("exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
+     _searched_pairs, "use capsules, spheres or boxes, or exclude the pair by contype and conaffinity or <contact><exclude>"),
     ("margin in contacts of meshes and height fields", _margins_of_meshes, "set margin='0' on both geoms"),
     ("integrator 'implicit'", _integrator(mujoco.mjtIntegrator.mjINT_IMPLICIT), "use 'implicitfast', 'Euler' or 'RK4'"),
     ("integrator 'discrete'", _integrator(mujoco.mjtIntegrator.mjINT_DISCRETE), "use 'implicitfast', 'Euler' or 'RK4'"),
     ("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
      "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
-    ("exact constraint diagonal", lambda m: _flag(_ENABLE.mjENBL_DIAGEXACT)(m) if has_constraints(m) else [], _DIRECTLY),
+    ("exact constraint diagonal", _flag(_ENABLE.mjENBL_DIAGEXACT), _DIRECTLY),
     ("IPC contact", _flag(_ENABLE.mjENBL_IPC), _DIRECTLY),
     ("noslip solver",
-     _when(lambda m: m.opt.noslip_iterations > 0 and _has_frictional_rows(m),
+     _when(lambda m: m.opt.noslip_iterations > 0,
            lambda m: f"noslip_iterations={m.opt.noslip_iterations}"),
      "set noslip_iterations='0', and against slip use cone='elliptic' with a larger impratio"),
     ("polynomial joint stiffness", _where(_OBJECT.mjOBJ_JOINT, lambda m: m.jnt_stiffnesspoly != 0), _LINEAR),
@@ -217,6 +231,11 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("such equality constraint",
      _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
      "use connect, weld, joint or tendon"),
+    ("flags that disable only springs or only dampers",
+     _when(lambda m: bool(m.opt.disableflags & _DISABLE.mjDSBL_SPRING) != bool(m.opt.disableflags & _DISABLE.mjDSBL_DAMPER),
+           "one of <flag spring='disable'/> and <flag damper='disable'/>"),
+     "set stiffness or damping to zero instead"),
+    ("impedance that rises over no width", _without_width, "give solimp a width, or equal d0 and dwidth"),
     ("solref of mixed signs", _mixed_solrefs,
      "give two positive numbers (time constant, damping ratio) or two that are not (−stiffness, −damping)"),
     ("joint limit that acts on both ends at once",
@@ -229,19 +248,10 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
 )  # fmt: skip
 
 
-# In dm_control's finger, with two ellipsoids, the derivative is 2000 times the slope; elsewhere it is NaN.
-_SEARCH = (
-    "exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
-    searched_pairs,
-    "use capsules, spheres or boxes, exclude the pair by contype and conaffinity or <contact><exclude>, or take MJX's "
-    "search by load_scene(..., distance_fields=True): its normal may be off by 10 degrees, its derivative by any factor, or NaN",
-)
-
-
-def refusal_messages(model: mujoco.MjModel, *, distance_fields: bool = False) -> list[str]:
-    """Return one sentence per feature that MJX cannot simulate; distance fields are allowed on request."""
+def refusal_messages(model: mujoco.MjModel) -> list[str]:
+    """Return one sentence per feature that MJX cannot simulate."""
     messages = []
-    for feature, find, remedy in REFUSALS if distance_fields else (*REFUSALS, _SEARCH):
+    for feature, find, remedy in REFUSALS:
         if found := list(find(model)):
             more = f" and {len(found) - 4} more" if len(found) > 4 else ""
             messages.append(f"MJX has no {feature}, got {', '.join(found[:4])}{more}; {remedy}")

@@ -89,17 +89,11 @@ class Scene(eqx.Module):
         Works under `jax.jit`, `jax.vmap` and `jax.grad`. If the values are known, it warns about
         parts without effect and about contacts that the time step cannot follow.
 
-        Args:
-            softness: the change, and the pairs that it applies to.
-
-        Returns:
-            The scene with other contact parameters.
-
         Raises:
             ValueError: as `Softness.apply`.
         """
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
-        for message in softness_warnings(softness, scene.model, self.mj_model) + scene.warnings():
+        for message in softness_warnings(softness, scene.model) + scene.warnings():
             _warn(self, message)
         return scene
 
@@ -107,15 +101,11 @@ class Scene(eqx.Module):
         """Return the scene with other numbers of the MJX model, such as `geom_friction`, `timestep`, `gravity` or `wind`.
 
         Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. Constants that
-        MuJoCo
-        derives from masses, inertias, lengths and sizes are updated, unless they are given, too; see `mg.set_const`.
+        MuJoCo derives from masses, inertias, lengths and sizes are updated, unless they are given, too; see `mg.set_const`.
 
         Args:
             **fields: new values of the model's floating-point arrays, each of unchanged shape. Allowed options are the time
                 step (s), gravity (m/s²) and wind (m/s), which acts only in a medium.
-
-        Returns:
-            The scene with these values.
 
         Raises:
             ValueError: if there is no such field, it is not an array of numbers, or the shape differs. Known values are also
@@ -315,10 +305,8 @@ def _contacts(scene: Scene) -> str:
         slots, every = scene.data._impl.ncon, sum(map(len, candidates(scene.model).values()))
         title += f"; room for {slots} contacts of {every}" if slots < every else f", at {every} points"
     is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-    legend = "effective k = ω₀², b = 2ζω₀ = 2/τ, per mass of the contact"
+    legend = "effective k and b = 2ζ√k, per mass of the contact"
     legend += "; stable while h²k + 2hb < 4" if is_euler else ""
-    if columns[-1][0] == "at rest":
-        legend += "\n  at rest: distance under gravity, negative for a depth"
     if len(rows) < count:
         legend += "\n  all of them: scene.pairs"
     heads = [("pair", *(name for name, _, _ in columns)), ("", *(unit for _, unit, _ in columns))]
@@ -332,8 +320,6 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]
     yield "k", "1/s²", _numbers(parameters.stiffness)
     yield "b", "1/s", _numbers(parameters.damping)
-    yield "ω₀", "rad/s", _numbers(parameters.natural_frequency)
-    yield "τ", "ms", _numbers(1e3 * parameters.time_constant)
     yield "ζ", "", _numbers(parameters.damping_ratio)
     yield "impedance", "", [_range(row) for row in np.asarray(parameters.impedance)]
     yield "width", "mm", _numbers(1e3 * parameters.width)
@@ -341,10 +327,6 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     frictions = np.asarray(parameters.friction).tolist()
     yield "friction", "", [_friction(pair.condim, row) for pair, row in zip(scene.pairs, frictions, strict=True)]
     yield "margin", "mm", _numbers(1e3 * parameters.margin)
-    gravity = float(np.linalg.norm(np.asarray(scene.model.opt.gravity)))
-    # A margin makes the rest position under gravity worth a column.
-    if gravity > 0 and np.any(parameters.margin) and np.all(parameters.stiffness > 0):
-        yield "at rest", "mm", _numbers(1e3 * parameters.rest_distance(gravity))
 
 
 def _numbers(values) -> list[str]:
@@ -394,15 +376,7 @@ def _bullets(title: str, sentences: Sequence[str]) -> str:
 
 
 def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
-    """Return the reading of a sensor.
-
-    Args:
-        model: the scene's model.
-        data: data with computed sensors, after `forward`, a step or a rollout.
-        name: name of the sensor.
-
-    Returns:
-        Its numbers, in MuJoCo's units for this sensor; one for a touch sensor, three for a force.
+    """Return the reading of a sensor after `forward`, a step or a rollout, in MuJoCo's units for this sensor.
 
     Raises:
         ValueError: if there is no such sensor, or MJX cannot compute it.
@@ -415,12 +389,7 @@ def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:
 
 
 def site_position(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, "3"]:
-    """Return the position of a site in world coordinates (m).
-
-    Args:
-        model: the scene's model.
-        data: data with computed positions, after `forward`, a step or a rollout.
-        name: name of the site.
+    """Return the position of a site in world coordinates (m), after `forward`, a step or a rollout.
 
     Raises:
         ValueError: if there is no such site.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.batched import maps, primitives
+from mjxgrad.batched import maps
 from mjxgrad.bodies import spatial
 
 BILINEAR = {
@@ -28,13 +28,13 @@ LINEAR = {
     "sums": np.tril(np.ones((5, 5))),
     "a choice": np.eye(4)[[2, 2, 0]],
     "signs": np.array([[1.0, 0, -1], [0, 0, 0], [0, 2.5, 0]]),
-    "many terms": np.ones((2, primitives.LONGEST_SUM + 1)),
+    "many terms": np.ones((2, maps.LONGEST_SUM + 1)),
     "one that is long": np.concatenate([np.eye(6)[[0, 0, 1, 2]], -np.ones((2, 6)), np.eye(6)[3:]]),
     "nothing": np.zeros((0, 3)),
     "of nothing": np.zeros((2, 0)),
 }
 
-_WAYS = (primitives._bilinear_by_slices, primitives._bilinear_by_gathers)
+_WAYS = (maps._bilinear_by_slices, maps._bilinear_by_gathers)
 
 
 def _table(bilinear, of_first, of_second):
@@ -80,7 +80,7 @@ def test_an_item_that_is_no_number_spoils_only_gathered_sums_of_it(name):
     matrix = LINEAR[name]
     for item in range(matrix.shape[1]):
         x = jnp.ones(matrix.shape[1]).at[item].set(jnp.nan)
-        found = primitives._linear_by_gathers(x, matrix=primitives._Matrix(matrix), batch=0)
+        found = maps._linear_by_gathers(x, matrix=maps._Matrix(matrix), batch=0)
         np.testing.assert_array_equal(np.isnan(found), matrix[:, item] != 0)
 
 
@@ -107,13 +107,13 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
     np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("evaluate", [primitives._linear_by_slices, primitives._linear_by_gathers])
+@pytest.mark.parametrize("evaluate", [maps._linear_by_slices, maps._linear_by_gathers])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("name", LINEAR)
 def test_a_linear_map_is_its_sum(name, axis, evaluate):
     matrix = LINEAR[name]
     x = jax.random.normal(jax.random.key(0), np.insert([3, 2], axis, matrix.shape[1]))
-    found = evaluate(x, matrix=primitives._Matrix(matrix), batch=axis)
+    found = evaluate(x, matrix=maps._Matrix(matrix), batch=axis)
     np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), rtol=0, atol=1e-13)
 
 
@@ -172,7 +172,7 @@ def test_a_contraction_and_its_derivatives_are_those_of_the_einstein_sum(subscri
 
 
 def test_a_sum_of_many_products_is_not_written_out():
-    size = primitives.LONGEST_SUM + 1
+    size = maps.LONGEST_SUM + 1
     a, b = jnp.ones((2, 3, size)), jnp.ones((2, size))
     mapped = jax.jit(jax.vmap(functools.partial(maps.contract, "ij,j->i")))
     np.testing.assert_array_equal(mapped(a, b), np.full((2, 3), size))

@@ -26,7 +26,7 @@ BALL = """
 SOFT = Softness(stiffness=2000, damping_ratio=1, impedance=(0.2, 0.8), width=0.01)
 GRAVITY = 9.81
 
-# All touch the floor; two and three, 5 mm apart, touch each other besides.
+# All touch the floor; two and three touch each other besides.
 THREE = """
 <mujoco>
   <worldbody>
@@ -119,41 +119,12 @@ def test_rest_depth_has_the_derivative_of_its_equation(pyramids):
     np.testing.assert_allclose(by_parts.stiffness * SOFT.stiffness, -by_load * GRAVITY, rtol=1e-9)
 
 
-def test_a_margin_is_shared_so_that_unselected_pairs_keep_theirs(three):
-    before = three.contact_parameters()
-    assert len(three.pairs) == 4
-    # The floor keeps its 1 mm, for it touches the others too, and the ball takes the rest.
-    after = three.with_softness(Softness(margin=0.006, pairs=(("one", "floor"),))).contact_parameters()
-    for i, pair in enumerate(three.pairs):
-        expected = 0.006 if "one" in pair.names else before.margin[i]
-        np.testing.assert_allclose(after.margin[i], expected, rtol=1e-12)
-
-
-def test_margins_that_cannot_be_shared_are_refused(three):
-    # The floor keeps 1 mm and "three" nothing, so "two" would need 5 mm for the one and 6 for the other.
-    with pytest.raises(ValueError, match=r"margin of the pair .* cannot be set .*<pair>"):
-        three.with_softness(Softness(margin=0.006, pairs=(("two", "floor"), ("two", "three"))))
+def test_the_margin_of_selected_pairs_is_theirs_alone(three):
+    """All pairs of "one" are selected, but the floor touches the others, too."""
+    after = three.with_softness(Softness(margin=0.006)).contact_parameters()
+    np.testing.assert_allclose(after.margin, 0.006, rtol=1e-12)
     with pytest.raises(ValueError, match=r"two – three would also change the pair .* shares the geom"):
         three.with_softness(Softness(margin=0.006, pairs=(("two", "three"),)))
-
-
-@pytest.mark.parametrize(
-    ("subset", "names"),
-    [
-        ({"bodies": ("a",)}, {"one"}),
-        ({"groups": (2,)}, {"two", "three"}),
-        ({"groups": (1, 2)}, {"one", "two", "three"}),
-    ],
-)
-def test_bodies_and_groups_select_every_pair_of_theirs(three, subset, names):
-    selected = Softness(stiffness=1.0, **subset).selected(three.model)
-    assert set(selected) == {pair for pair in three.pairs if names & set(pair.names)}
-
-
-@pytest.mark.parametrize("subset", [{"bodies": ("d",)}, {"groups": (5,)}])
-def test_a_subset_of_nothing_is_answered_with_what_there_is(three, subset):
-    with pytest.raises(ValueError, match=r"got .*those that can: .*(a|1)"):
-        three.with_softness(Softness(margin=0.01, **subset))
 
 
 @pytest.mark.parametrize(
@@ -186,50 +157,6 @@ def test_bodies_that_would_hover_are_warned_about_by_name(pyramids):
         pyramids.with_softness(_with(SOFT, margin=0.02))
 
 
-def test_bodies_that_do_not_touch_but_push_each_other_are_warned_about_by_name(three):
-    # "two" and "three" stand 5 mm apart.
-    with pytest.warns(SceneWarning, match=r"two – three.*reference pose.*0\.005 m apart.*margin of 0\.02 m"):
-        three.with_softness(Softness(margin=0.02))
-
-
-def test_bodies_that_rest_inside_each_other_are_warned_about_by_name(pyramids):
-    softness = _with(SOFT, margin=0.1, rest_acceleration=0.1)
-    with pytest.warns(SceneWarning, match=r"floor – ball.*rest .* m inside each other.*smaller \(0\.1 m\)"):
-        pyramids.with_softness(softness)
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_kept_height_needs_no_warning(pyramids):
     pyramids.with_softness(_with(SOFT, margin=0.005, rest_acceleration=GRAVITY))
-
-
-def test_the_summary_says_where_bodies_rest(pyramids):
-    scene = pyramids.with_softness(_with(SOFT, margin=0.02, rest_acceleration=GRAVITY))
-    row = next(line for line in scene.summary().splitlines() if line.startswith("  floor – ball"))
-    expected = 1e3 * float(pyramids.with_softness(SOFT).contact_parameters().rest_distance(GRAVITY)[0])
-    assert float(row.split()[-1]) == pytest.approx(expected, rel=5e-3)  # three digits are printed
-    assert "at rest" not in pyramids.summary()
-
-
-def test_half_way_between_two_values_of_softness_lies_the_mean_of_its_kind():
-    start = Softness(100.0, 0.5, impedance=(0.0, 0.8), width=0.01, margin=0.02)
-    end = Softness(10000.0, 1.0, impedance=(0.2, 0.9), width=0.04, margin=0.0)
-    half = Softness.between(start, end, 0.5)
-    # √(100 · 10000) and √(0.01 · 0.04); the rest (start + end) / 2.
-    expected = Softness(1000.0, 0.75, impedance=(0.1, 0.85), width=0.02, margin=0.01)
-    for ours, theirs in zip(jax.tree.leaves(half), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
-def test_a_schedule_ends_at_its_end_and_stays_there():
-    schedule = jax.jit(lambda step: Softness.between(Softness(1e2, 1.0), Softness(1e4, 1.0), step / 4).stiffness)
-    np.testing.assert_allclose([schedule(step) for step in (0, 1, 4, 9)], [1e2, 10**2.5, 1e4, 1e4], rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("end", "message"),
-    [(Softness(1.0), "both have a damping_ratio or neither"), (Softness(1.0, 1.0, geoms=("a",)), "same geoms")],
-)
-def test_softness_of_other_parts_or_pairs_has_no_between(end, message):
-    with pytest.raises(ValueError, match=message):
-        Softness.between(Softness(2.0, 1.0), end, 0.5)

@@ -21,7 +21,7 @@ GEOMS = {
     "winner": 'priority="2" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="0.1 0 0" condim="6" margin="0.002"',
     "loser": 'priority="-1" solref="0.03 1.5" solimp="0.5 0.7 0.01 0.5 2" friction="3 0 0"',
     "direct": 'solref="-3000 -70" solimp="0.5 0.7 0.01 0.5 2"',
-    "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0 0.5 2"',
+    "clamped": 'priority="1" solref="0.001 1" solimp="0 1.5 0.002 0.5 2"',
     "explicit": 'solref="0.9 1" friction="9 9 9"',
 }
 PAIR = (
@@ -106,12 +106,6 @@ def test_without_contact_there_are_no_pairs():
         assert contact_pairs(mujoco.MjModel.from_xml_string(source)) == ()
 
 
-def test_parameters_of_a_traced_model_are_those_of_the_model(scene):
-    traced = jax.jit(lambda s: s.contact_parameters())(scene)
-    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(scene.contact_parameters()), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
 PRESSED = """
 <mujoco>
   <option timestep="0.002" tolerance="1e-12" {integrator}/>
@@ -124,16 +118,6 @@ PRESSED = """
   </worldbody>
 </mujoco>
 """
-
-
-def test_a_pressed_contact_rests_at_the_depth_of_the_formula():
-    scene = load_scene(PRESSED.format(solref="0.02 1", d="0.9", integrator=""))
-    data = mujoco.MjData(scene.mj_model)
-    mujoco.mj_step(scene.mj_model, data, nstep=1000)
-    depth = scene.contact_parameters().rest_depth(9.81)[0]
-    # (1 − d) a₀ / k = 0.1 · 9.81 / 2500.
-    np.testing.assert_allclose(depth, 0.1 * 9.81 / 2500, rtol=1e-12)
-    np.testing.assert_allclose(-data.qpos[0], depth, rtol=1e-9)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])

@@ -9,11 +9,10 @@ from scipy.stats import norm
 
 from mjxgrad import estimators
 from mjxgrad.estimators import Diagnosis, Reason, rules
-from mjxgrad.objective import closed_loop, parameter_noise
+from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 
 alpha_order = eqx.filter_jit(estimators.alpha_order)
-per_step = eqx.filter_jit(estimators.per_step)
 STDDEVS = jnp.array([0.1, 0.2, 0.3])
 POINT = jnp.array([0.3, 0.1, -0.5])
 BUMPY = parameter_noise(textbook.bumpy, STDDEVS)
@@ -128,45 +127,3 @@ def test_without_finite_derivatives_the_unbiased_part_stands_alone(key):
 def test_rollouts_are_counted_once(key):
     estimate = alpha_order(BUMPY, POINT, key, num_samples=200)
     assert estimate.num_rollouts == estimate.num_gradient_rollouts == 200
-
-
-def test_by_step_each_parameter_has_its_own_weight_where_the_noise_is_on_them(parts):
-    key, first, unbiased = parts
-    estimate = per_step(BUMPY, POINT, key, num_samples=200, rule=rules.InverseVariance())
-    # The variance of terms, without the correction of the standard error for their dependence (1/n of it).
-    zeroth, derivatives = np.asarray(unbiased.covariance_diagonal), np.asarray(first.covariance_diagonal)
-    np.testing.assert_allclose(estimate.alpha, zeroth / (zeroth + derivatives), rtol=0.01)
-    weights = np.asarray(estimate.alpha)
-    mixed = weights * np.asarray(first.value) + (1 - weights) * np.asarray(unbiased.value)
-    np.testing.assert_allclose(estimate.value, mixed, rtol=1e-9)
-    assert Reason[Reason.inverse_variance] == Reason[jax.tree.map(lambda leaf: leaf[0], estimate.reason)]
-
-
-def test_by_step_is_unbiased_in_closed_loop_if_its_parts_are():
-    """Weights that do not depend on the samples keep it unbiased; the expected cost is known by recursion."""
-    task, params = textbook.LinearSystem(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
-    objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
-    flat, times = objective.ravel(params), 10_000
-    rule = rules.FixedAlpha(0.6)
-    run = jax.jit(jax.vmap(lambda k: estimators.per_step(objective, flat, k, num_samples=10, rule=rule)))
-    estimates = run(jax.random.split(jax.random.key(4), times))
-    truth = jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2))(flat)
-    values = np.asarray(estimates.value)
-    np.testing.assert_array_less(np.abs(values.mean(axis=0) - truth), 4 * values.std(axis=0) / np.sqrt(times))
-    assert estimates.alpha.shape == (times, task.horizon * task.num_controls)
-
-
-def test_a_sample_without_another_in_its_group_has_no_baseline_by_step_either():
-    """About one sample in sixty is finite, of two groups of 64: often one stands alone in its group."""
-    objective = parameter_noise(lambda x: jnp.where(x[0] > 0.21, x[0] ** 2, jnp.nan), 0.1, dim=1)
-    keys, at = jax.random.split(jax.random.key(0), 60), jnp.zeros(1)
-
-    def used(key):
-        whole = estimators.control_variate(objective, at, key, num_samples=128)
-        by_step = estimators.per_step(objective, at, key, num_samples=128)
-        first = estimators.first_order(objective, at, key, num_samples=128)
-        return whole.num_finite, by_step.num_finite, first.num_finite
-
-    whole, by_step, finite = jax.jit(jax.vmap(used))(keys)
-    assert np.any(np.asarray(whole) < np.asarray(finite))
-    np.testing.assert_array_equal(by_step, whole)

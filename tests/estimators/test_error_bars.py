@@ -78,34 +78,6 @@ def test_first_order_knows_its_error_even_from_three_samples():
     )
 
 
-@pytest.mark.parametrize(("baseline", "antithetic"), EVERY_WAY)
-def test_errors_in_units_of_the_claimed_ones_have_variance_one(baseline, antithetic):
-    times = 400
-    objective = parameter_noise(textbook.step, textbook.STDDEV)
-    estimates = repeat(
-        objective,
-        zeroth_order,
-        jnp.array([0.07]),
-        times=times,
-        seed=4,
-        num_samples=200,
-        baseline=baseline,
-        antithetic=antithetic,
-    )
-    z = (np.asarray(estimates.value) - textbook.step_gradient(0.07)) / np.asarray(estimates.standard_error)
-    # The variance of a mean of squares of normal numbers is 2/times; t from 100 pairs adds 2 %.
-    assert abs((z**2).mean() - 1) < 4 * np.sqrt(2 / times)
-    assert abs(z.mean()) < 4 / np.sqrt(times)
-
-
-def test_two_samples_are_unbiased_at_a_step():
-    """The leave-one-out baseline is independent of its sample."""
-    times = 20_000
-    objective = parameter_noise(textbook.step, textbook.STDDEV)
-    values = np.asarray(repeat(objective, zeroth_order, jnp.array([0.07]), times=times, seed=5, num_samples=2).value)
-    assert abs(values.mean() - textbook.step_gradient(0.07)) < 4 * values.std() / np.sqrt(times)
-
-
 def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():
     """0.195 without it, 0.0975 with it, at N = 1000 and θ = 0."""
     objective = parameter_noise(textbook.step, textbook.STDDEV)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import first_and_zeroth_order, first_order, zeroth_order
@@ -114,24 +113,6 @@ def test_the_noise_of_a_sample_does_not_depend_on_the_number_of_samples(key):
 def _remember(x, rows):
     jax.debug.callback(lambda value: rows.append(float(value[0])), x)
     return x[0]
-
-
-def test_estimates_can_be_compiled_and_batched(objective, key):
-    """The objective is a pytree: it goes through jit, and noise and points through vmap."""
-    compiled = jax.jit(estimators.zeroth_order, static_argnames=("num_samples", "baseline", "antithetic", "chunk_size"))
-    np.testing.assert_allclose(
-        compiled(objective, POINT, key, num_samples=50).value,
-        zeroth_order(objective, POINT, key, num_samples=50).value,
-        rtol=1e-10,
-    )
-    stddevs = jnp.array([0.1, 0.2])
-    batch = jax.vmap(
-        lambda point, stddev: first_order(parameter_noise(textbook.quadratic_sine, stddev), point, key, num_samples=10)
-    )(jnp.array([[0.1], [0.3]]), stddevs)
-    assert batch.value.shape == (2, 1)
-    assert batch.variance.shape == batch.finite_fraction.shape == (2,)
-    single = first_order(parameter_noise(textbook.quadratic_sine, 0.2), jnp.array([0.3]), key, num_samples=10)
-    np.testing.assert_allclose(batch.value[1], single.value, rtol=1e-10)
 
 
 def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(key):

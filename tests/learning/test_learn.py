@@ -183,7 +183,10 @@ def test_an_evaluation_ends_with_the_episode(cartpole, key):
 
 def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     """The gradient of one update against that of a plain sum over all windows; with hardly any noise, from the same starts."""
-    settings = learning.apg(num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf)
+    settings = learning.Settings(
+        num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
+        discount=1.0, rule=FixedAlpha(1.0), has_critic=False,
+    )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
     before = ActorCritic(cartpole, settings, 1).init(key)
 
@@ -236,15 +239,6 @@ def test_the_rate_falls_to_zero_or_by_a_share(decay, rates):
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         learning.Settings(**change)
-
-
-def test_logs_reach_a_file(tmp_path):
-    log = learning.to_csv(tmp_path / "run.csv")
-    log(10, {"reward": 1.5, "alpha": 1.0})
-    log(20, {"reward": 2.5, "alpha": 0.5})
-    assert (tmp_path / "run.csv").read_text().splitlines() == ["step,reward,alpha", "10,1.5,1.0", "20,2.5,0.5"]
-    with pytest.raises(ValueError, match="must have the columns step, cost"):
-        learning.to_csv(tmp_path / "run.csv")(30, {"cost": 1.0})
 
 
 _PROGRAM = """

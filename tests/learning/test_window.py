@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from mjxgrad import envs
 from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
 from mjxgrad.learning import learner
-from mjxgrad.learning.networks import Normaliser, make_actor, make_critic
+from mjxgrad.learning.networks import Network, Normaliser
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, returned, run_window, window_gradients
 
 STEPS, STDDEV, DISCOUNT = 3, 0.3, 0.9  # of the windows that are run
@@ -76,9 +76,9 @@ def cartpole():
 def networks():
     """Values large and curved enough that their part of the derivative is seen."""
     actor_key, critic_key = jax.random.split(jax.random.key(3))
-    actor = make_actor(5, 1, (6,), actor_key)
+    actor = Network.make((5, 6, 1), actor_key, final_scale=0.01)
     actor = eqx.tree_at(lambda a: a.layers[-1].weight, actor, 50 * actor.layers[-1].weight)
-    critic = make_critic(5, (6,), critic_key, final_scale=5.0)
+    critic = Network.make((5, 6, 1), critic_key, final_scale=5.0)
     return actor, critic, Normaliser.make(5).with_more(jax.random.normal(jax.random.key(4), (20, 5)))
 
 

@@ -66,15 +66,6 @@ def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uni
     assert_same(resumed, uninterrupted)
 
 
-def test_an_interruption_between_two_saves_loses_nothing(tmp_path, uninterrupted):
-    path = tmp_path / "run.npz"
-    with pytest.raises(KilledError):
-        run(path, checkpoint_every=100, log=kill_at(14, KilledError))
-    steps = []
-    assert_same(run(path, log=lambda step, _: steps.append(step)), uninterrupted)
-    assert steps[0] == 16
-
-
 def test_a_finished_run_is_read_without_running(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
     run(path)

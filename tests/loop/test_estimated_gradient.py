@@ -26,7 +26,6 @@ def test_the_trajectory_is_that_of_optimise(key):
     settings = {
         "optimiser": optax.adam(0.05),
         "annealing": optax.exponential_decay(1.0, 10, 0.5),
-        "clip_norm": 0.9,
     }
 
     def smoothed(scale):

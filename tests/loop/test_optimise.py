@@ -11,7 +11,6 @@ import optax
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.estimators import Reason
 from tests.loop import problems
 from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
 
@@ -115,16 +114,6 @@ def test_a_step_draws_its_noise_from_its_number(key):
     np.testing.assert_allclose(run(key, problems.first_order, num_steps=5).params, x, rtol=1e-12)
 
 
-def test_a_clipped_gradient_has_the_threshold_as_its_norm(key):
-    result = run(key, lambda *_: made_up([3.0, -4.0]), clip_norm=2.0, num_steps=1)
-    np.testing.assert_allclose(result.params, START - 0.1 * jnp.array([1.2, -1.6]), rtol=1e-12)
-
-
-def test_a_short_gradient_is_not_clipped(key):
-    result = run(key, lambda *_: made_up([0.3, -0.4]), clip_norm=2.0, num_steps=1)
-    np.testing.assert_allclose(result.params, START - 0.1 * jnp.array([0.3, -0.4]), rtol=1e-12)
-
-
 def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
     """Every other estimate is NaN: Adam ends where it would have without those."""
 
@@ -174,16 +163,6 @@ def test_the_best_has_no_advantage_from_samples_left_out(key):
     assert result.best_cost == result.history.cost[full].min() > result.history.cost.min()
 
 
-def test_the_reason_of_the_least_weight_is_kept(key):
-    def in_blocks(objective, params, key):
-        reason = jax.tree.map(lambda a, b: jnp.stack([a, b]), Reason.inverse_variance, Reason.uncertain)
-        return dataclasses.replace(made_up([1.0, 1.0]), alpha=jnp.array([0.8, 0.2]), reason=reason)
-
-    history = run(key, in_blocks, num_steps=2).history
-    np.testing.assert_allclose(history.alpha, 0.5)
-    assert np.all(history.reason == Reason.uncertain)
-
-
 def test_the_optimiser_is_told_the_cost(key):
     """reduce_on_plateau shortens the step as soon as what it is told no longer falls: here it falls all the way."""
     plateau = optax.chain(optax.sgd(1.0), optax.contrib.reduce_on_plateau(factor=0.5, patience=1))
@@ -198,7 +177,6 @@ def test_the_optimiser_is_told_the_cost(key):
     [
         ({"num_steps": 0}, "num_steps must be at least 1, got 0"),
         ({"evaluate_every": 0}, "evaluate_every must be at least 1, got 0"),
-        ({"clip_norm": 0.0}, "clip_norm must be positive, got 0.0"),
         ({"annealing": optax.constant_schedule(1.0)}, "objective must be a function from a scale"),
         ({"checkpoint": "/nowhere/at/all.npz"}, "checkpoint must be in a folder that exists"),
     ],

@@ -57,9 +57,13 @@ REFUSED = {
     "override": (_fill(BALL, flag="<flag override='enable'/>"), "<flag override", "o_solref"),
     "diagexact": (_fill(BALL, flag="<flag diagexact='enable'/>"), "<flag diagexact", "remove"),
     "noslip": (_fill(BALL, option="noslip_iterations='9'"), "noslip_iterations=9", "impratio"),
-    "noslip for friction loss": (
-        _fill(PENDULUM, option="noslip_iterations='9'", joint="frictionloss='9'"),
-        "noslip_iterations=9", "impratio"),
+    "no springs": (
+        _fill(PENDULUM, flag="<flag spring='disable'/>", joint="stiffness='5' damping='1'"), "spring='disable'", "zero"),
+    "no dampers": (
+        _fill(PENDULUM, flag="<flag damper='disable'/>", joint="stiffness='5' damping='1'"), "damper='disable'", "zero"),
+    "contact without width": (_fill(BALL, geom="solimp='.1 .95 0'"), "geom_solimp of geom 'g'", "width"),
+    "limit without width": (
+        _fill(PENDULUM, joint="limited='true' range='-5 -1' solimplimit='.2 .9 0'"), "jnt_solimp of joint 'j'", "width"),
     "joint stiffness polynomial": (
         _fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
     "joint damping polynomial": (
@@ -174,13 +178,9 @@ def _pair(kinds, contact="", mask=""):
 
 
 @pytest.mark.parametrize("kinds", SEARCHED)
-def test_contact_by_a_search_on_distance_fields_is_refused_unless_asked_for(kinds):
-    with pytest.raises(
-        SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*<exclude>.*distance_fields=True"
-    ):
+def test_contact_by_a_search_on_distance_fields_is_refused(kinds):
+    with pytest.raises(SceneError, match=r"'(one|other)' .* with '(one|other)'.*contype.*<exclude>"):
         load_scene(_pair(kinds), engine="mjx")
-    with pytest.warns(SceneWarning, match="search on distance fields instead of exact.*derivative"):
-        assert len(load_scene(_pair(kinds), distance_fields=True).pairs) == 1
 
 
 @pytest.mark.parametrize(
@@ -211,11 +211,9 @@ def test_with_contact_disabled_no_pair_is_an_obstacle():
 
 
 def test_unused_settings_are_no_obstacle():
-    # An ellipsoid fluid shape without fluid, noslip without friction, a group without actuators.
+    # An ellipsoid fluid shape without fluid, a group without actuators.
     load_scene(_fill(PENDULUM, geom="fluidshape='ellipsoid'"))
-    load_scene(_fill(PENDULUM, option="noslip_iterations='9'"))
     load_scene(_fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))
-    load_scene(_fill(PENDULUM, flag="<flag diagexact='enable'/>"))
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import mjxgrad as mg
-from mjxgrad.envs.quadruped import MOST_COMMAND
+from experiments.problems.quadruped import MOST_COMMAND, quadruped
 
 
 @pytest.fixture(scope="module")
 def robot():
-    return mg.envs.quadruped(is_randomised=False)
+    return quadruped(is_randomised=False)
 
 
 def test_who_stands_still_earns_more_than_who_falls(robot):

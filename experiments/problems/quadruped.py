@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.bodies.spatial import rotation_matrix
-from mjxgrad.envs.environment import Environment
+from mjxgrad.envs import Environment
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.tasks.action_task import scene_path
+from mjxgrad.tasks import scene_path
 
 Memory = dict[str, Float[Array, "..."]]
 MOST_COMMAND = (2.0, 1.0, 1.5)  # m/s forward, m/s to the left, rad/s about the vertical
