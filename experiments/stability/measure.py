@@ -480,7 +480,7 @@ def _in_chunks(run: Callable, arrays: tuple, size: int) -> Any:
     for start in range(0, total, size):
         index = np.minimum(np.arange(start, start + size), total - 1)
         found = run(*jax.tree.map(lambda x, i=index: x[i].astype(dtype), arrays))
-        parts.append(jax.tree.map(lambda x, n=min(size, total - start): np.asarray(x)[:n], found))
+        parts.append(jax.tree.map(lambda x, count=total - start: np.asarray(x)[:count], found))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 

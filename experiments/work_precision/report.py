@@ -80,8 +80,8 @@ def answer(outcome: Outcome) -> str:
         one.estimate.estimator for course in outcome.courses if (one := cheapest(course.estimates, target)) is not None
     )
     span = "–".join(dict.fromkeys(map(_milliseconds, (costs[0], costs[-1]))))
-    motion = f"{percent(target)} error: {span} ms a simulated second on {len(costs)} of {len(outcome.courses)} scenes"
-    soonest = f"; gradients: mostly {ways.most_common(1)[0][0]}" if ways else ""
+    motion = f"{percent(target)} error: {span} ms a second on {len(costs)} of {len(outcome.courses)} scenes"
+    soonest = f"; gradients: {ways.most_common(1)[0][0]}" if ways else ""
     return f"{motion}{soonest}."
 
 

@@ -48,7 +48,9 @@ def test_the_report_says_who_arrives_and_who_does_not_move(tmp_path):
 
 @pytest.mark.slow
 def test_a_rod_that_is_not_touched_is_pushed_on_smoothed_models_alone(tmp_path):
-    settings = "finger=[0.0,-0.08] goal=[0.0,0.04,0.0] horizon=8 num_iterations=24 position_tolerance=0.01 video.speed=10"
+    settings = (
+        "finger=[0.0,-0.08] goal=[0.0,0.04,0.0] horizon=8 num_iterations=24 position_tolerance=0.01 video.speed=10"
+    )
     assert main(["run", "planar_push", *settings.split(), "--output", str(tmp_path)]) == 0
     said = json.loads((tmp_path / "planar_push" / "summary.json").read_text())["verdict"]
     assert "reaches its goal" in said
