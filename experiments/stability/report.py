@@ -53,8 +53,8 @@ def verdict(outcome: Outcome) -> str:
     """Say whether a failure goes unflagged, and how mjxgrad compares with C MuJoCo."""
     found = outcome.found
     sentences = [
-        f"{_count(found.silent)} rollouts have a number that is not finite and no flag; "
-        f"`soundness` misses {_count(found.missed)} of the gradients that explode or are not finite."
+        f"Rollouts with a number that is not finite, and no flag: {_count(found.silent)}; gradients that explode or are not "
+        f"finite, and that `soundness` misses: {_count(found.missed)}."
     ]
     for name in outcome.settings.precisions:
         signs = against_c(found, name)

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from experiments.config import FOLDER, ConfigurationError, load_runs, read_header
+from experiments.config import FOLDER, ConfigurationError, load_runs
 
 VALID = """\
 # Is it so?
@@ -57,11 +57,6 @@ def test_all_mistakes_are_told_at_once(write):
         "stddev", "num_sampels", "num_samples", "angles", "video.speed", "video.angles", "video.stiffness", "nonsense",
         "seed",
     }  # fmt: skip
-
-
-def test_a_misspelt_key_is_answered_with_the_right_one(write):
-    (sentence,) = mistakes(write(VALID + "dampign_ratio = 1.0\n"))
-    assert sentence == 'dampign_ratio: unknown key; did you mean "damping_ratio"?'
 
 
 def test_a_misspelt_key_in_a_table_is_answered_from_that_table(write):
@@ -153,26 +148,6 @@ def test_a_mistake_in_a_sweep_is_told_once_and_by_its_path(write):
     }
 
 
-def test_a_sweep_below_a_value_is_refused(write):
-    """It would be swept in name alone: every run the same."""
-    found = mistakes(write(VALID + "[sweep]\nstddev.x = [1, 2]\n"))
-    assert found == ("sweep.stddev.x: stddev is a value, not a table",)
-
-
-def test_a_missing_file_is_answered_with_those_there_are():
-    assert mistakes("ball_wal") == ('there is no such file; did you mean "ball_wall"?',)
-
-
-def test_broken_toml_is_told_with_its_line(write):
-    (sentence,) = mistakes(write(VALID + "seed = = 1\n"))
-    assert sentence.startswith("not TOML: ")
-    assert "line 11" in sentence
-
-
-def test_a_file_without_a_comment_has_no_question():
-    assert read_header("seed = 1\n") == ("", "")
-
-
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -213,9 +188,3 @@ def test_of_many_mistakes_the_first_are_shown_and_the_others_counted_in_no_time(
         load_runs(write(VALID + "".join(f"key_{i} = 1\n" for i in range(5000))), [])
     assert str(caught.value).endswith("\n  and 4980 more")
     assert time.process_time() - begun < 5
-
-
-@pytest.mark.parametrize("name", ["...toml", "a\nb.toml"])
-def test_a_name_that_is_none_for_a_folder_is_refused(tmp_path, name):
-    (tmp_path / name).write_text(VALID)
-    assert mistakes(str(tmp_path / name))[0].startswith("its name must be one for a folder")

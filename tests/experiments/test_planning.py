@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.planning import Attempt, Outcome, Settings, drawings, tables, verdict
+from experiments.planning import Attempt, Outcome, Settings, answer, drawings, tables, verdict
 from experiments.theme import save
 
 SETTINGS = Settings(experiment="planning", goal=(0.1, 0.0, 0.0))
@@ -42,6 +42,7 @@ def test_the_share_of_the_way_is_that_of_the_coordinate_farthest_off(share):
 def test_the_report_says_who_arrives_and_who_does_not_move(tmp_path):
     found = outcome(attempt("analytic", 0.099), attempt("none", 0.0))
     assert "reaches its goal to 1.0 mm and 0.000 rad; with no smoothing the rod does not move" in verdict(found)
+    assert answer(found) == "Yes, with smoothed models; no, with plain ones."
     assert tables(found)[0].rows[0][1:5] == ["yes", "1.0 mm", "0.000 rad", "1 of 2"]
     assert len(save(drawings(found), found, tmp_path)) == 2
 
