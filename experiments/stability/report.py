@@ -104,8 +104,8 @@ def tables(outcome: Outcome) -> list[Table]:
             ("scene", "simulator", *(kind.label for kind in Motion)),
             motions,
             "Points by what the motion does. “Gains energy” is more kinetic energy than start, gravity and compressed springs "
-            "had to give; “not solved” is an acceleration that is off by a thousandth of a step’s velocity, by the forces that it "
-            "leaves unbalanced; where these are rounded, in float32, by the forces of the same state in float64.",
+            "had to give; “not solved” is an acceleration that is off by a thousandth of a step’s velocity, by the forces that "
+            "it leaves unbalanced; where these are rounded, in float32, by the forces of the same state in float64.",
         ),
         Table(
             ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),

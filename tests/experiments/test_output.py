@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from experiments.config import ExperimentError
-from experiments.output import building, recover, write_csv, write_text, write_toml
+from experiments.output import building, recover, write_csv, write_toml
 
 
 def listing(folder):
@@ -75,8 +75,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     sentence = r"cannot write the results to .*file/run: not a directory.*--output"
     with pytest.raises(ExperimentError, match=sentence), building(tmp_path / "file" / "run"):
         pass
-
-
 
 
 def test_settings_survive_their_way_through_toml(tmp_path):

@@ -96,8 +96,8 @@ def test_its_controls_are_what_is_optimised_from_those_of_the_key_frame(folder):
 
 
 def test_error_against_run_time_starts_where_the_key_frame_is(folder):
-    sizes = {"scenes": (), "refinements": (), "tolerances": (), "batch": 1, "num_rollouts": 8, "num_samples": ()}
-    sizes |= {"gradient_refinements": (), "softenings": (), "repeats": 1, "seconds": 0.1, "has_all_variants": False}
+    sizes = {"scenes": (), "refinements": (), "batch": 1, "num_rollouts": 8, "num_samples": ()}
+    sizes |= {"gradient_refinements": (), "repeats": 1, "seconds": 0.1}
     own = {"experiment": "work_precision", "sizes": sizes, "scene": "block.xml", "start": "near", "horizon": 50}
     case = own_case(WorkSettings(**own))
     np.testing.assert_allclose(
