@@ -59,19 +59,19 @@ mujoco4: .venv/.installed  ## run C's engine, check and sweep beside a later MuJ
 	@.cache/mujoco4/bin/python -m pytest -n 2 --dist worksteal tests/native tests/checking $(PYTEST_ARGS)
 
 bench: .venv/.installed  ## measure speed and memory against mjx.step
-	@$(BIN)/python -m experiments.benchmarks bench $(ARGS)
+	@$(BIN)/python -m experiments bench $(ARGS)
 
 throughput: .venv/.installed  ## measure a sweep over softness in one program against ten, and its memory
-	@$(BIN)/python -m experiments.benchmarks throughput $(ARGS)
+	@$(BIN)/python -m experiments throughput $(ARGS)
 
 engines: .venv/.installed  ## measure a gradient by C MuJoCo, by MJX and by hand
-	@$(BIN)/python -m experiments.benchmarks engines $(ARGS)
+	@$(BIN)/python -m experiments engines $(ARGS)
 
 costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
-	@$(BIN)/python -m experiments.benchmarks costs $(ARGS)
+	@$(BIN)/python -m experiments costs $(ARGS)
 
 identify-bench: .venv/.installed  ## measure identification against mujoco.sysid, answers included
-	@$(BIN)/python -m experiments.identification_bench $(ARGS)
+	@$(BIN)/python -m experiments identify-bench $(ARGS)
 
 robots: .venv/.installed  ## measure motion and derivatives of the robots of ten packages (downloads 0.4 GB)
 	@$(BIN)/python -m experiments.robots $(ARGS)

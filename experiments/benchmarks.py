@@ -22,7 +22,6 @@ all alike.
 compiled program and once as ten programs, as ten runs of a script would make them. Nothing is read from a compilation cache.
 """
 
-import argparse
 import copy
 import dataclasses
 import functools
@@ -32,9 +31,11 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
+import cyclopts
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -100,38 +101,29 @@ class Row(NamedTuple):
         return statistics.median(self.runs) if self.runs else float("nan")
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark that the command line names, and print its tables."""
-    mg.keep_compiled()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    bench = commands.add_parser("bench", help="speed and memory against mjx.step")
-    bench.add_argument("--scene", nargs="*", choices=list(_SCENES), default=list(_SCENES))
-    bench.add_argument("--batch", type=int, nargs="*", default=[256])
-    bench.add_argument("--steps", type=int, default=100)
-    bench.add_argument(
-        "--runs", type=int, default=5, help="0 compiles and reports memory, which may exceed the machine's"
-    )
-    bench.add_argument("--forward", action="store_true", help="leave out all gradients")
-    bench.add_argument("--skip-patched", action="store_true", help="leave out MJX's own gradient")
-    bench.add_argument("--per-core", action="store_true", help="split every batch over one CPU device per core")
-    bench.set_defaults(run=_bench)
-    costs = commands.add_parser("costs", help="what onset, slope at MuJoCo's motion and smoothing cost")
-    costs.add_argument("--batch", type=int, default=256)
-    costs.add_argument("--repeats", type=int, default=7)
-    costs.add_argument("--only", default="", help="word that cases must hold, besides the plain ones")
-    costs.set_defaults(run=_costs)
-    engines = commands.add_parser("engines", help="a gradient by C MuJoCo, by MJX and by hand")
-    engines.add_argument("--scene", nargs="*", choices=list(_SCENES), default=["hopper", "quadruped", "humanoid"])
-    engines.add_argument("--batch", type=int, nargs="*", default=[1, 16, 256])
-    engines.add_argument("--steps", type=int, default=50)
-    engines.add_argument("--repeats", type=int, default=3)
-    engines.set_defaults(run=_engines)
-    throughput = commands.add_parser("throughput", help="a sweep over softness in one program against ten")
-    throughput.add_argument("--samples", type=int, default=1000)
-    throughput.set_defaults(run=_throughput)
-    options = parser.parse_args(arguments)
-    options.run(options)
+_Many = cyclopts.Parameter(consume_multiple=True, negative="")
+SceneName = Literal["two_bodies", "hopper", "half_cheetah", "ant", "quadruped", "humanoid"]
+
+
+@cyclopts.Parameter(name="*")
+@dataclass(frozen=True)
+class Bench:
+    """What `bench` measures."""
+
+    scene: Annotated[tuple[SceneName, ...], _Many] = tuple(_SCENES)  # pyright: ignore[reportAssignmentType]
+    """The scenes."""
+    batch: Annotated[tuple[int, ...], _Many] = (256,)
+    """States that are stepped together."""
+    steps: int = 100
+    """Steps of a rollout."""
+    runs: int = 5
+    """Runs of each; 0 compiles and reports memory, which may exceed the machine's."""
+    forward: bool = False
+    """Leave out all gradients."""
+    skip_patched: bool = False
+    """Leave out MJX's own gradient."""
+    per_core: bool = False
+    """Split every batch over one CPU device per core."""
 
 
 def announce(work: str) -> None:
@@ -156,8 +148,10 @@ def _compile(function: Any, *arguments: Any) -> tuple[Any, float, float]:
     return program, seconds, memory.temp_size_in_bytes if memory else float("nan")
 
 
-def _bench(options: argparse.Namespace) -> None:
-    """Print one table per scene and batch, and draw them."""
+def bench(*, options: Bench | None = None) -> None:
+    """Measure speed and memory against mjx.step: one table per scene and batch, and a picture of several batches."""
+    options = options or Bench()
+    mg.keep_compiled()
     if options.per_core:
         jax.config.update("jax_num_cpu_devices", num_cores())
     announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
@@ -216,7 +210,7 @@ def _draw(found: dict[str, dict[int, list[Row]]], steps: int) -> None:
     print(f"\n{path}")
 
 
-def _rows(name: str, batch: int, options: argparse.Namespace) -> Iterator[Row]:
+def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
     mj_model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
     mj_model.opt.tolerance, mj_model.opt.iterations, mj_model.opt.ls_iterations = _TOLERANCE, 100, 20
     mj_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -272,7 +266,7 @@ def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int
     return jnp.sum(final[0] ** 2) + jnp.sum(final[1] ** 2)
 
 
-def _patched(scene: mg.Scene, states: Any, options: argparse.Namespace) -> Row:
+def _patched(scene: mg.Scene, states: Any, options: Bench) -> Row:
     """Measure MJX's own gradient with `while_loop` replaced by a scan that stops counting once it is done."""
     model = scene.model.tree_replace({"opt.iterations": _PATCHED_ITERATIONS})
     patched_scene = dataclasses.replace(scene, model=model)
@@ -302,7 +296,7 @@ def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
     return Row(name, [_seconds(program, states) for _ in range(runs + 1 if runs else 0)][1:], compilation, memory)
 
 
-def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
+def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: Bench) -> Row:
     import warp  # pyright: ignore[reportMissingImports]
     from mujoco.mjx.third_party import mujoco_warp
 
@@ -335,7 +329,7 @@ def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options
     return Row("MuJoCo Warp", [_seconds(run) for _ in range(options.runs + 1)][1:], compilation, float("nan"))
 
 
-def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: argparse.Namespace) -> Row:
+def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: Bench) -> Row:
     threads = num_cores()
     data = [mujoco.MjData(mj_model) for _ in range(threads)]
     size = mujoco.mj_stateSize(mj_model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -360,16 +354,23 @@ def _print(row: Row, base: Row, steps: int) -> None:
     )
 
 
-def _costs(options: argparse.Namespace) -> None:
-    """Print one table per scene."""
-    announce(f"batch {options.batch}, {_NUM_STEPS} steps")
+def costs(*, batch: int = 256, repeats: int = 7, only: str = "") -> None:
+    """Measure what onset, slope at MuJoCo's motion and smoothing cost.
+
+    Args:
+        batch: states that are stepped together.
+        repeats: runs of each case.
+        only: a word that cases must hold, besides the plain ones.
+    """
+    mg.keep_compiled()
+    announce(f"batch {batch}, {_NUM_STEPS} steps")
     for name, (place, height) in _STARTS.items():
         scene = mg.load_scene(_SCENES[name])
-        _cost(name, scene, scene.data.qpos.at[place].add(height), options)
+        _cost(name, scene, scene.data.qpos.at[place].add(height), batch, repeats, only)
 
 
-def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespace) -> None:
-    qvel = 0.3 * jax.random.normal(jax.random.key(0), (options.batch, scene.model.nv))
+def _cost(name: str, scene: mg.Scene, qpos: jax.Array, batch: int, repeats: int, only: str) -> None:
+    qvel = 0.3 * jax.random.normal(jax.random.key(0), (batch, scene.model.nv))
 
     def cost(qvel, **settings):
         state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
@@ -384,9 +385,9 @@ def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespa
         f"{what}, {way}" if way else what: jax.jit(jax.vmap(transforms[what](functools.partial(cost, **_WAYS[way]()))))
         for what, ways in _COSTS.items()
         for way in ways
-        if not way or options.only in f"{what}, {way}"
+        if not way or only in f"{what}, {way}"
     }
-    turns = [{case: _seconds(program, qvel) for case, program in programs.items()} for _ in range(options.repeats + 1)]
+    turns = [{case: _seconds(program, qvel) for case, program in programs.items()} for _ in range(repeats + 1)]
     seconds = {case: [turn[case] for turn in turns[1:]] for case in programs}
     for case, times in seconds.items():
         base = float(np.median(seconds[case.split(",")[0]]))
@@ -397,31 +398,45 @@ def _cost(name: str, scene: mg.Scene, qpos: jax.Array, options: argparse.Namespa
         )
 
 
-def _engines(options: argparse.Namespace) -> None:
-    """Print seconds of a gradient by the start's velocities and all controls, of each engine and of what people write by hand."""
-    announce(f"{options.steps} steps, float32")
-    for name in options.scene:
+def engines(
+    *,
+    scene: Annotated[tuple[SceneName, ...], _Many] = ("hopper", "quadruped", "humanoid"),
+    batch: Annotated[tuple[int, ...], _Many] = (1, 16, 256),
+    steps: int = 50,
+    repeats: int = 3,
+) -> None:
+    """Measure a gradient by the start's velocities and all controls, of each engine and of what people write by hand.
+
+    Args:
+        scene: the scenes.
+        batch: states that are stepped together.
+        steps: steps of a rollout.
+        repeats: runs after the first one.
+    """
+    mg.keep_compiled()
+    announce(f"{steps} steps, float32")
+    for name in scene:
         model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # MuJoCo's own differences refuse RK4
-        scene = mg.load_scene(model)
-        for batch in options.batch:
+        loaded = mg.load_scene(model)
+        for size in batch:
             random = np.random.default_rng(0)
-            speeds = jnp.asarray(0.3 * random.normal(size=(batch, scene.model.nv)), scene.data.qpos.dtype)
-            controls = jnp.asarray(0.1 * random.normal(size=(batch, options.steps, scene.model.nu)), speeds.dtype)
+            speeds = jnp.asarray(0.3 * random.normal(size=(size, loaded.model.nv)), loaded.data.qpos.dtype)
+            controls = jnp.asarray(0.1 * random.normal(size=(size, steps, loaded.model.nu)), speeds.dtype)
 
-            def cost(speeds: jax.Array, controls: jax.Array, engine: str, scene: mg.Scene = scene) -> jax.Array:
+            def cost(speeds: jax.Array, controls: jax.Array, engine: str, scene: mg.Scene = loaded) -> jax.Array:
                 start = mg.initial_state(scene, qvel=speeds)
                 return jnp.sum(mg.rollout(scene, start, controls, gradient="slope", engine=engine).qpos[-1])  # pyright: ignore[reportArgumentType]
 
             for engine in ("mujoco", "mjx"):
                 program = jax.jit(jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1))))
-                first, *runs = [_seconds(program, speeds, controls) for _ in range(options.repeats + 1)]
+                first, *runs = [_seconds(program, speeds, controls) for _ in range(repeats + 1)]
                 print(
-                    f"{name:12} {batch:4} {engine:8} first {first:7.2f} s, then {statistics.median(runs):8.3f} s",
+                    f"{name:12} {size:4} {engine:8} first {first:7.2f} s, then {statistics.median(runs):8.3f} s",
                     flush=True,
                 )
-            took = _by_hand(scene.mj_model, np.asarray(speeds, float), np.asarray(controls, float))
-            print(f"{name:12} {batch:4} mjd_transitionFD in a Python loop {took:8.3f} s", flush=True)
+            took = _by_hand(loaded.mj_model, np.asarray(speeds, float), np.asarray(controls, float))
+            print(f"{name:12} {size:4} mjd_transitionFD in a Python loop {took:8.3f} s", flush=True)
 
 
 def _by_hand(model: mujoco.MjModel, speeds: np.ndarray, controls: np.ndarray) -> float:
@@ -439,13 +454,17 @@ def _by_hand(model: mujoco.MjModel, speeds: np.ndarray, controls: np.ndarray) ->
     return time.perf_counter() - started
 
 
-def _throughput(options: argparse.Namespace) -> None:
-    """Print the time of the sweep, in one program and in ten, and a table of memory."""
+def throughput(*, samples: int = 1000) -> None:
+    """Measure a sweep over softness in one program against ten, and the memory of the three estimators.
+
+    Args:
+        samples: rollouts of an estimate.
+    """
     jax.config.update("jax_enable_compilation_cache", False)
-    announce(f"{options.samples} samples, float32")
+    announce(f"{samples} samples, float32")
     task, key = mg.tasks.ball_wall(), jax.random.key(0)
 
-    def estimates(stiffness: jax.Array, key: jax.Array, num_samples: int = options.samples) -> list:
+    def estimates(stiffness: jax.Array, key: jax.Array, num_samples: int = samples) -> list:
         objective = task.objective(0.1, mg.tasks.wall_softness(stiffness))
         return [estimator(objective, jnp.array([_ANGLE]), key, num_samples=num_samples) for estimator in _ESTIMATORS]
 
@@ -465,7 +484,3 @@ def _throughput(options: argparse.Namespace) -> None:
     for count in (10**3, 10**4, 10**5, 10**6):
         _, _, memory = _compile(functools.partial(estimates, num_samples=count), _STIFFNESS[0], key)
         print(f"{count:8d} {memory / 1e6:10.2f} MB", flush=True)
-
-
-if __name__ == "__main__":
-    main()

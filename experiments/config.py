@@ -1,5 +1,6 @@
 """A run's configuration: a TOML file, checked as a whole before anything heavy is imported."""
 
+import copy
 import difflib
 import importlib
 import itertools
@@ -67,11 +68,11 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     try:
         # Windows' editors begin a file with a mark that TOML has no place for.
         text = path.read_text(encoding="utf-8-sig")
-        return _load(path, text, _parsed(text), overrides)
+        return _load(path, text, tomllib.loads(text), overrides)
     except UnicodeDecodeError as error:
         raise ConfigurationError(path.name, [f"not UTF-8, at byte {error.start}; save it as UTF-8"]) from None
-    except tomllib.TOMLDecodeError as error:
-        # tomllib's own words for a key that is there twice.
+    # tomllib's own error, and Python's on a number of too many digits.
+    except ValueError as error:
         told = str(error).replace("Cannot overwrite a value", "a key is given twice")
         raise ConfigurationError(path.name, [f"not TOML: {told}"]) from None
     except RecursionError:
@@ -83,7 +84,6 @@ def _load(path: Path, text: str, table: dict[str, Any], overrides: list[str]) ->
     sweep, sweep_problems = _take_sweep(table)
     if (count := math.prod(map(len, sweep.values()))) > _MOST_RUNS:
         raise ConfigurationError(path.name, [f"sweep: must be at most {_MOST_RUNS} runs, got {count}"])
-    combinations = [dict(zip(sweep, values, strict=True)) for values in itertools.product(*sweep.values())]
     question, expected = read_header(text)
     if len(question) + len(expected) > _LONGEST_HEADER:
         problems.append(
@@ -93,28 +93,17 @@ def _load(path: Path, text: str, table: dict[str, Any], overrides: list[str]) ->
     if not path.stem.strip(".") or not path.stem.isprintable():
         problems.append(f"its name must be one for a folder, got {path.name!r}")
     runs = []
-    for varied in combinations:
-        candidate = json.loads(json.dumps(table, default=str))
-        for key, value in varied.items():
-            if wrong := _assign(candidate, key.split("."), value):
-                problems.append(f"sweep.{wrong}")
+    for values in itertools.product(*sweep.values()):
+        varied, candidate = dict(zip(sweep, values, strict=True)), copy.deepcopy(table)
+        wrong = [_assign(candidate, key.split("."), value) for key, value in varied.items()]
+        problems += [f"sweep.{one}" for one in wrong if one]
         _choose_size(candidate)
         settings, found = _validate(candidate, swept=set(sweep))
         problems += found
         runs.append(Run(path.stem, settings, question or path.stem, expected, varied))
     if problems or sweep_problems:
-        raise ConfigurationError(path.name, list(dict.fromkeys(problems + sweep_problems)))
+        raise ConfigurationError(path.name, problems + sweep_problems)
     return runs
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:
-        # Python's limit on the digits of an integer, where TOML's is 64 bits.
-        raise (
-            error if isinstance(error, tomllib.TOMLDecodeError) else tomllib.TOMLDecodeError("a number is too long")
-        ) from None
 
 
 def find_file(file: str) -> Path:
@@ -163,10 +152,9 @@ def _choose_size(table: dict[str, Any]) -> None:
 
 def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
     """Check a table against the settings of its kind: these or None, and one sentence per mistake."""
-    kind = table.get("experiment")
-    if kind is None:
+    if "experiment" not in table:
         return None, [f"experiment: required, and missing; choose one of {', '.join(kinds())}"]
-    if not isinstance(kind, str) or kind not in kinds():
+    if (kind := table["experiment"]) not in kinds():
         return None, [f"experiment: there is no experiment {_shown(kind)}; {suggest(str(kind)[:100], kinds())}"]
     settings = part(kind, "settings").Settings
     try:
@@ -183,27 +171,26 @@ def _validate(table: dict[str, Any], swept: set[str]) -> tuple[Any, list[str]]:
 
 
 def _sentence(settings: type[BaseModel], detail: ErrorDetails, swept: set[str]) -> str:
-    # Pydantic puts a union's branch into the path too; only names of settings and positions in arrays help a reader.
-    parts, owner = _walk(settings, detail["loc"])
-    path = ".".join(part or '""' for part in parts)
-    swept_path = f"sweep.{path}" if path in swept else path
-    given = _shown(detail.get("input"))
+    path, owner = "", settings
+    for step in detail["loc"]:
+        owner = _table(owner, path) or owner
+        path += f"[{step}]" if isinstance(step, int) else "." * bool(path) + (step or '""')
+    shown = f"sweep.{path}" if path in swept else path
+    context, given = detail.get("ctx", {}), _shown(detail.get("input"))
     match detail["type"]:
         case "extra_forbidden":
-            return f"{swept_path}: unknown key; {suggest(parts[-1], owner.model_fields)}"
+            return f"{shown}: unknown key; {suggest(str(detail['loc'][-1]), owner.model_fields)}"
         case "missing":
-            return f"{swept_path}: required, and missing"
+            return f"{shown}: required, and missing"
         case "literal_error":
-            expected = detail.get("ctx", {}).get("expected", "").replace("'", "")
-            choices = expected.replace(" or ", ", ").split(", ")
-            return f"{swept_path}: there is no {given}; {suggest(str(detail.get('input')), choices)}"
+            choices = context["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+            return f"{shown}: there is no {given}; {suggest(str(detail['input']), choices)}"
         case "too_short":
-            return f"{swept_path}: must hold at least {detail.get('ctx', {}).get('min_length')}, got {given}"
+            return f"{shown}: must hold at least {context['min_length']}, got {given}"
         case "value_error":
-            reason = detail["msg"].removeprefix("Value error, ")
-            return f"{swept_path}: {reason}" if path else reason
+            return f"{shown}: {context['error']}" if path else str(context["error"])
     reason = detail["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-    return f"{swept_path}: must be {reason}, got {given}"
+    return f"{shown}: must be {reason}, got {given}"
 
 
 def _shown(value: object) -> str:
@@ -211,25 +198,15 @@ def _shown(value: object) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-def _walk(settings: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], type[BaseModel]]:
-    """Follow an error's location through nested settings: its readable parts, and the last table on its way."""
-    owner, table, parts = settings, settings, []
-    for step in location:
-        if isinstance(step, int):
-            parts[-1] = f"{parts[-1]}[{step}]"
-            continue
-        if not parts or table is not None:
-            parts.append(step)
-            owner = table or owner
-            field = owner.model_fields.get(step)
-            table = _nested(field.annotation) if field else None
-    return parts, owner
-
-
-def _nested(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-        return annotation if issubclass(annotation, BaseModel) else None
-    return next((found for argument in get_args(annotation) if (found := _nested(argument))), None)
+def _table(owner: type[BaseModel], path: str) -> type[BaseModel] | None:
+    """Return the table of settings within a field of another, by the end of its path; None if it is a value."""
+    field = owner.model_fields.get(re.sub(r"\[\d+\]", "", path).rpartition(".")[2])
+    inside = [field.annotation] if field else []
+    for one in inside:
+        if isinstance(one, type) and issubclass(one, BaseModel):
+            return one
+        inside += get_args(one)
+    return None
 
 
 def _apply(table: dict[str, Any], override: str) -> str | None:
@@ -239,8 +216,8 @@ def _apply(table: dict[str, Any], override: str) -> str | None:
     if not equals or not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", key):
         return f'{override}: not an override; write key=value, such as seed=1 or softness.stiffness="[1e3, 1e4]"'
     try:
-        parsed = _parsed(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except ValueError:
         # A shell eats the quotes of a TOML string, so a bare word stands for one, alone or in a list.
         words = value[1:-1].split(",") if value.startswith("[") and value.endswith("]") else [value]
         words = [word.strip() for word in words]

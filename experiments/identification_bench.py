@@ -12,7 +12,6 @@ values and minimise the same residuals in double precision. They take turns, so 
 Of what `mujoco[sysid]` brings, absl-py, colorama, pyyaml, scipy and tabulate are needed here.
 """
 
-import argparse
 import contextlib
 import gc
 import io
@@ -23,8 +22,9 @@ import statistics
 import tempfile
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import cyclopts
 import jax
 import mujoco
 import mujoco.rollout
@@ -214,14 +214,24 @@ def verdict(rows: Mapping[tuple[int, int], Row]) -> str:
     return f"Ours is faster, {'; '.join(parts)}; theirs elsewhere. Values differ by at most {apart:.0e} of an interval."
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print the table and where ours is faster."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parameters", type=int, nargs="*", default=[1, 8, 30])
-    parser.add_argument("--windows", type=int, nargs="*", default=[1, 10, 100])
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--limit", type=float, default=120, help="of a problem, after which no other run begins (s)")
-    options = parser.parse_args(arguments)
+_Many = cyclopts.Parameter(consume_multiple=True, negative="")
+
+
+def identify(
+    *,
+    parameters: Annotated[tuple[int, ...], _Many] = (1, 8, 30),
+    windows: Annotated[tuple[int, ...], _Many] = (1, 10, 100),
+    runs: int = 5,
+    limit: float = 120,
+) -> None:
+    """Measure identification against mujoco.sysid: the table, and where ours is faster.
+
+    Args:
+        parameters: how many are unknown, case by case.
+        windows: how many are recorded, case by case.
+        runs: runs of a problem.
+        limit: of a problem, after which no other run begins (s).
+    """
     logging.getLogger("absl").setLevel(logging.ERROR)  # theirs warns of each window that angles are no sensors
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
@@ -232,17 +242,13 @@ def main(arguments: list[str] | None = None) -> None:
         f"seconds are the median of the runs (and the least), differences the largest\n\n{_HEAD}"
     )
     rows = {}
-    for case in itertools.product(options.parameters, options.windows):
+    for case in itertools.product(parameters, windows):
         # Nothing of one problem helps the next to compile, or is searched for garbage while theirs runs.
         jax.clear_caches()
         gc.collect()
         with tempfile.TemporaryDirectory() as empty:
             jax.config.update("jax_compilation_cache_dir", empty)
             compilation_cache.reset_cache()
-            rows[case] = compare(problem(*case), options.runs, options.limit)
+            rows[case] = compare(problem(*case), runs, limit)
         _print(case, rows[case])
     print(f"\n{verdict(rows)}")
-
-
-if __name__ == "__main__":
-    main()

@@ -14,7 +14,6 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
-from experiments.bundle import bundled
 from experiments.problems.quadruped import quadruped
 from experiments.problems.trot import apg, trot
 from experiments.report import MOST_WORDS, Table
@@ -27,18 +26,17 @@ from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
 
-Method = Literal["onset", "discrete", "slope", "bundled", "alpha", "inverse_variance", "zeroth", "ppo"]
+Method = Literal["onset", "discrete", "slope", "alpha", "inverse_variance", "zeroth", "ppo"]
 NAMES = {
     "onset": "first order",
     "discrete": "first order without an onset",
     "slope": "first order by the slope",
-    "bundled": "first order, bundled",
     "alpha": "α-order",
     "inverse_variance": "weighed by variance",
     "zeroth": "zeroth order",
     "ppo": "PPO",
 }
-_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
+_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
     "quadruped": quadruped,
@@ -317,8 +315,6 @@ def _stepped(environment: Environment, method: Method) -> Environment:
     """Return the environment whose derivative is the method's."""
     if method in ("discrete", "slope"):
         return environment.with_gradient(method)
-    if method == "bundled":
-        return bundled(environment.with_onset(None))
     return environment
 
 

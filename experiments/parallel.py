@@ -1,10 +1,8 @@
-"""Several at once: threads for programs, which XLA compiles mostly on one core each and without Python; processes for Python."""
+"""Several programs at once, in threads: XLA compiles each mostly on one core and without Python."""
 
-import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 _Item, _Result = TypeVar("_Item"), TypeVar("_Result")
@@ -34,10 +32,3 @@ def in_threads(
             done.append(result)
             advance_to(len(done))
     return done
-
-
-@contextmanager
-def processes() -> Iterator[ProcessPoolExecutor]:
-    """Give one process per core, each begun afresh: one that is forked from a process with JAX's threads may hang."""
-    with ProcessPoolExecutor(num_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield pool

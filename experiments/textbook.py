@@ -19,7 +19,6 @@ from experiments import theme
 from experiments.config import ExperimentError, suggest
 from experiments.problems import estimators as library
 from experiments.problems import textbook
-from experiments.problems.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
@@ -78,8 +77,6 @@ class Settings(RunSettings):
     """Rollouts per estimate in the sweep of stiffness."""
     amplitude: Positive = 0.1
     """Of the sine."""
-    missed_samples: Annotated[int, Field(ge=10)] = 500
-    """First-order samples from which the chance to miss the slope is estimated (soft step only)."""
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
 
@@ -111,8 +108,6 @@ class Outcome:
     by_samples: xr.Dataset
     by_stiffness: xr.Dataset | None
     problem: Textbook  # the shown one
-    # For the soft step, by stiffness: the exact chance β of a sample to hit the slope, and what first-order samples tell of it.
-    hits: list[tuple[float, EmpiricalBias]]
 
     @property
     def sweeps(self) -> list[xr.Dataset]:
@@ -137,7 +132,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     named = {one.label: _estimator(one) for one in settings.estimators}
     shown = settings.shown_stiffness
     problem = _problem(settings, shown)
-    samples_key, stiffness_key, hits_key = jax.random.split(jax.random.key(settings.seed), 3)
+    samples_key, stiffness_key = jax.random.split(jax.random.key(settings.seed))
 
     def sweep(key: Array, cells: Sequence[tuple[float | None, int]], done: int) -> xr.Dataset:
         tables = []
@@ -163,10 +158,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     with workspace.stage("estimates", "settings", len(by_samples) + len(by_stiffness)) as advance_to:
         over_samples = sweep(samples_key, by_samples, 0)
         over_stiffness = sweep(stiffness_key, by_stiffness, len(by_samples)) if by_stiffness else None
-    with workspace.stage("missed slopes", "stiffnesses", len(settings.stiffness)):
-        hits = _hits(settings, hits_key) if settings.problem == "soft_heaviside" else []
     gradient = float(problem.gradient(settings.point, settings.stddev))
-    return Outcome(settings, gradient, over_samples, over_stiffness, problem, hits)
+    return Outcome(settings, gradient, over_samples, over_stiffness, problem)
 
 
 def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tables: Sequence[Comparison]) -> xr.Dataset:
@@ -219,19 +212,6 @@ def _exact_error(one: EstimatorSettings, settings: Settings, stiffness: float | 
     return float(jnp.sqrt(problem.zeroth_order_variance(point, stddev, baseline) / (rollouts - is_paid)))
 
 
-def _hits(settings: Settings, key: Array) -> list[tuple[float, EmpiricalBias]]:
-    """Estimate the chance to hit the slope from first-order samples."""
-    found, point, stddev = [], settings.point, settings.stddev
-    for i, stiffness in enumerate(settings.stiffness):
-        problem, params = textbook.soft_heaviside(1 / stiffness), jnp.array([point])
-        objective, count = problem.objective(stddev), settings.missed_samples
-        samples = first_order_samples(objective, params, jax.random.fold_in(key, i), num_samples=count)
-        truth = float(problem.gradient(point, stddev))
-        told = empirical_bias(samples, reference=truth, confidence=settings.confidence)
-        found.append((float(problem.slope_probability(point, stddev)), told))
-    return found
-
-
 def answer(outcome: Outcome) -> str:
     """Say which estimators see a jump; what a stiffness, what a ripple does to both orders."""
     if outcome.by_stiffness is None:
@@ -250,11 +230,7 @@ def answer(outcome: Outcome) -> str:
     )
     if outcome.settings.problem == "quadratic_sine":
         return f"It multiplies first order's error by {first}, zeroth order's by {zeroth}."
-    unseen = [
-        x for x, (_, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True) if not found.num_outlying
-    ]
-    missed = f"all samples miss from 1/ν = {power(unseen[0])}" if unseen else "samples never all miss"
-    return f"First order's error grows {first}×, zeroth order's {zeroth}×; {missed}."
+    return f"First order's error grows {first}×, zeroth order's {zeroth}×."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -263,7 +239,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """Say what no table shows: agreement with closed forms, slopes that were never hit, and what was left out."""
+    """Say what no table shows: agreement with closed forms, and what was left out."""
     hits = total = lost = 0
     for table in outcome.sweeps:
         exact = table.exact_rmse
@@ -273,7 +249,7 @@ def findings(outcome: Outcome) -> list[str]:
     confidence = f"{outcome.settings.confidence:.0%}"
     agreement = f"{hits} of {total} intervals of the error contain the closed form, at {confidence} each."
     left_out = f"{lost} estimates were not finite and were left out." if lost else ""
-    return [sentence for sentence in (agreement, _unseen(outcome), left_out) if sentence]
+    return [sentence for sentence in (agreement, left_out) if sentence]
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -356,27 +332,10 @@ def _crossing(outcome: Outcome) -> str | None:
     )
 
 
-def _unseen(outcome: Outcome) -> str:
-    """Say whether samples tell how rare hits of the slope are, and what the first stiffness without any implies."""
-    if not outcome.hits:
-        return ""
-    rarer = [(min(p, 1 - p), found.probability_interval) for p, found in outcome.hits]
-    covered = sum(low <= p <= high for p, (low, high) in rarer)
-    sentence = f"The interval of β contains the closed form at {covered} of {len(rarer)} stiffnesses."
-    for x, (p, found) in zip(outcome.settings.stiffness, outcome.hits, strict=True):
-        if found.num_outlying == 0:
-            return (
-                f"{sentence} At {stiffness_name(outcome)} = {power(x)} none of {found.num_samples} samples hit the slope and "
-                f"their variance is {found.variance:.3g}; the discrepancy to the gradient implies at least "
-                f"{quantity(found.implied_variance_bound)}, and the truth is {quantity((2 * x) ** 2 * p * (1 - p))}."
-            )
-    return sentence
-
-
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
     found: dict[str, Any] = {} if outcome.by_stiffness is None else {"stiffness": stiffness}
-    return found | {"samples": samples, "problem": problem} | ({"missing": missing} if outcome.hits else {})
+    return found | {"samples": samples, "problem": problem}
 
 
 def stiffness_name(outcome: Outcome) -> str:
@@ -448,28 +407,6 @@ def stiffness(outcome: Outcome):
         "closed forms, dotted ones join marks that have none."
     )
     return figure, "Error against stiffness", caption
-
-
-def missing(outcome: Outcome):
-    """Chance that N samples all miss the slope."""
-    figure, axes = subplots(1, 1, height=4.0)
-    axis, settings, grid = axes[0, 0], outcome.settings, np.geomspace(2, 1000, 200)
-    for x, (p, found), colour in zip(settings.stiffness, outcome.hits, theme.shades(len(outcome.hits)), strict=True):
-        axis.plot(grid, (1 - p) ** grid, color=colour, lw=1.3, label=power(x))
-        if p > 0.5:
-            continue  # most samples are on the slope, so that the event is to be on it
-        # Where half of the sets miss, and so the interval is widest; bands of all stiffnesses would hide each other.
-        at = np.clip(np.log(0.5) / np.log1p(-p), 2, 1000)
-        middle, ends = found.miss_probability(at), found.miss_probability_interval(at)
-        theme.errorbar(axis, at, middle, ends, color=colour, marker="D", ms=5, capsize=3, mec="white")
-    axis.set(xlabel="samples N", ylabel="chance that all miss", xscale="log", ylim=(-0.03, 1.03))
-    _ticks(axis, np.array([2.0, 10.0, 100.0, 1000.0]))
-    axis.legend(title=stiffness_name(outcome), loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    caption = (
-        f"For each stiffness: line, the closed form (1 − β)ᴺ; diamonds, what {settings.missed_samples} first-order samples tell, "
-        f"with its {settings.confidence:.0%} interval."
-    )
-    return figure, "How often samples miss the slope", caption
 
 
 def _repeats(outcome: Outcome) -> str:

@@ -156,16 +156,13 @@ def _span(values: Sequence[float], write: Callable[[float], str] = percent) -> s
 _COLOURS = {DISCRETE: FIRST, ONSET: ZEROTH}
 _MARKERS = {DISCRETE: "o", ONSET: "s"}
 _SMALLEST = 1e-3
-_OBSERVED = ("thigh", "leg", "foot", "thigh's speed", "leg's speed", "foot's speed", "offset")
-_MOTORS = ("thigh", "leg", "foot")
-_THROWS, _PUSHES = ("ball_wall", "ball_wall_default"), ("push_soft", "push_stiff")
+_THROWS = ("ball_wall", "ball_wall_default")
 
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    by_problem = {"throw": (throw, _THROWS), "hopper": (hopper, ("hopper",)), "push": (push, _PUSHES)}
-    found = {name: drawing for name, (drawing, problems) in by_problem.items() if outcome.of(*problems)}
-    return {"summary": summarised, **found} | ({"descent": descent} if outcome.courses else {})
+    found: Drawings = {"summary": summarised} | ({"throw": throw} if outcome.of(*_THROWS) else {})
+    return found | ({"descent": descent} if outcome.courses else {})
 
 
 def summarised(outcome: Outcome):
@@ -248,60 +245,6 @@ def throw(outcome: Outcome):
     return figure, "Throws over the wall", caption
 
 
-def push(outcome: Outcome):
-    """A panel per stiffness: components of the gradient over the steps."""
-    cells = outcome.of(*_PUSHES)
-    figure, axes = subplots(1, len(cells), height=3.4)
-    for axis, cell in zip(axes[0], cells, strict=True):
-        mean, error = mean_and_error(cell.reference)
-        step = np.arange(len(mean))
-        axis.fill_between(
-            step, mean - 2 * error, mean + 2 * error, color=MUTED, alpha=0.4, lw=0, label="unbiased reference"
-        )
-        for gradient in GRADIENTS:
-            style = {"ls": (0, (4, 2))} if gradient == ONSET else {"lw": 2.4}
-            first = cell.estimates[gradient].first.mean(axis=0)
-            axis.plot(step, first, color=_COLOURS[gradient], label=f"{gradient} gradient", **style)
-        axis.set(title=cell.title, xlabel="step")
-        axis.yaxis.set_major_formatter("{x:g}")
-    axes[0, 0].set_ylabel("gradient, 1/N")
-    legend_below(figure, axes[0, 0], 3)
-    caption = (
-        f"Components of the gradient by the force at each moment: {outcome.settings.num_references} unbiased estimates with a "
-        "band of two standard errors, first-order means before it."
-    )
-    return figure, "Control gradient of the push", caption
-
-
-def hopper(outcome: Outcome):
-    """A panel per motor: components of the policy gradient by what is observed."""
-    (cell,) = outcome.of("hopper")
-    figure, axes = subplots(1, 3, height=3.8, sharey=True)
-    looks = [(REFERENCE, "D", "unbiased reference", cell.reference, 0.0)]
-    for gradient, shift in zip(GRADIENTS, (-0.22, 0.22), strict=True):
-        label, first = f"first order, {gradient} gradient", cell.estimates[gradient].first
-        looks.append((_COLOURS[gradient], _MARKERS[gradient], label, first, shift))
-    places = np.arange(len(_OBSERVED))
-    for motor, axis in enumerate(axes[0]):
-        axis.axhline(0, color=MUTED, lw=0.8)
-        for colour, marker, label, vectors, shift in looks:
-            values, errors = (_by_motor(flat)[motor] for flat in mean_and_error(vectors))
-            axis.errorbar(
-                places + shift, values, 2 * errors, color=colour, marker=marker, ms=5, ls="", elinewidth=1, label=label
-            )
-        axis.set(title=f"Motor of the {_MOTORS[motor]}")
-        axis.set_xticks(places, _OBSERVED, rotation=35, ha="right")
-        axis.grid(axis="x", visible=False)
-    axes[0, 0].yaxis.set_major_formatter("{x:g}")
-    axes[0, 0].set_ylabel("gradient, m per unit of gain")
-    legend_below(figure, axes[0, 0], 3)
-    caption = (
-        "Components of the policy gradient: rows are the motors, columns what the policy observes, and the offset. Error bars "
-        "are two standard errors."
-    )
-    return figure, "Policy gradient of the hopper", caption
-
-
 def descent(outcome: Outcome):
     """A column per task and estimator: cost above, α below."""
     courses = outcome.courses
@@ -328,8 +271,3 @@ def descent(outcome: Outcome):
         "each step; below, weight of the first order."
     )
     return figure, "Descents", caption
-
-
-def _by_motor(flat: np.ndarray) -> np.ndarray:
-    """Give (motor, observed) from the flattened gain and offset."""
-    return np.concatenate([flat[:18].reshape(3, 6), flat[18:, None]], axis=1)

@@ -1,48 +1,98 @@
-"""From settings to numbers: mjxgrad beside C MuJoCo on every point."""
+"""From settings to numbers: mjxgrad beside C MuJoCo on every point, and what each rollout and derivative turned out to be."""
 
-import functools
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import enum
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
-from experiments.parallel import in_threads, processes
-from experiments.stability.classes import (
-    UNSOLVED,
-    Derivative,
-    Motion,
-    MotionRecord,
-    classify_derivative,
-    classify_motion,
+from experiments.parallel import in_threads
+from experiments.stability.scenes import (
+    FIELDS,
+    GRAVITY,
+    Points,
+    StabilityScene,
+    catalogue,
+    configure,
+    effective,
+    points,
 )
-from experiments.stability.scenes import GRAVITY, Points, StabilityScene, catalogue, effective, points
 from experiments.stability.settings import Settings
-from experiments.stability.simulators import (
-    WIDTHS,
-    Course,
-    Program,
-    Reference,
-    Run,
-    along,
-    direction,
-    errors_of_solves,
-    simulate,
-)
 from experiments.workspace import Workspace
-from mjxgrad.contact.bounce import Bounce, integrated_restitution
+from mjxgrad._mjx import mjx
 from mjxgrad.diagnostics import soundness
 
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1
 """In the place of a value of `Derivative` that was not asked for."""
-_JUDGED = ("derivative", "derivative_by_parameters", "slope_derivative")
+_VELOCITY_LIMIT = 1e4
+"""Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
+_WIDTHS = (1e-4, 2e-5)
+"""Of finite differences by the start, in units of what a body flies in one step."""
+_PARAMETER_WIDTHS = (1e-6, 2e-7)
+_RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
+"""Fields of the model that are changed in proportion, to judge the derivative by them."""
+_TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
+
+# The thresholds are coarse on purpose: a class is a kind of behaviour, not an accuracy.
+UNSOLVED = 1e-3
+"""Share of a step's velocity by which a solve may be off."""
+GAIN = 0.05
+"""Share by which kinetic energy may exceed what there was to draw on."""
+AT_REST = 1e-3
+"""Share of that energy below which a body has settled."""
+
+
+class _Kind(enum.IntEnum):
+    @property
+    def label(self) -> str:
+        """The kind in words."""
+        return self.name.lower().replace("_", " ")
+
+
+class Motion(_Kind):
+    """What a rollout did; the larger, the worse. Those from `GAINS_ENERGY` on are failures."""
+
+    SETTLES = 0
+    MOVES_ON = 1
+    GAINS_ENERGY = 2
+    TUNNELS = 3
+    NOT_SOLVED = 4
+    DIVERGES = 5
+
+
+class Derivative(_Kind):
+    """What a derivative turned out to be.
+
+    `UNJUDGED` where the truth is not known well enough, `NONE` where the rollout diverged and has no derivative.
+    """
+
+    RIGHT = 0
+    UNJUDGED = 1
+    WRONG = 2
+    EXPLODES = 3
+    NOT_FINITE = 4
+    NONE = 5
+
+
+@dataclass(frozen=True)
+class Course:
+    """What one simulator did on every point."""
+
+    qpos: Float[np.ndarray, "points nq"]  # positions after the last step, or the last good one
+    kinetic: Float[np.ndarray, "points states"]  # energy of motion before each step and at the end (J)
+    potential: Float[np.ndarray, "points states"]  # energy of height, likewise
+    residual: Float[np.ndarray, " points"]  # largest share of a step's velocity by which a solve is off
+    is_sound: Bool[np.ndarray, " points"]  # whether all states were finite and below the velocity limit
 
 
 @dataclass(frozen=True)
@@ -51,14 +101,11 @@ class SceneOutcome:
 
     scene: StabilityScene  # of the catalogue
     points: Points  # of its grid
-    # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that of the
-    # discrete gradient along a change of the start (`derivative`) and of the model's parameters
-    # (`derivative_by_parameters`), and that of the slope at MuJoCo's motion (`slope_derivative`); whether numbers that are
-    # not finite left the rollout without a flag (`silent`), whether some step is not solved and `Trajectory.unsolved` is zero
-    # (`untold`), whether the gradient is not finite or explodes where `Trajectory.diverged` is false
-    # (`gradient_unflagged_by_rollout`), and `soundness` finds nothing wrong either (`missed`); difference of the final
-    # positions from those of C MuJoCo over what a body flies (`apart_from_c`), and largest kinetic energy over what there
-    # was to draw on (`energy`).
+    # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that along a
+    # change of the start (`derivative`) and of the model's parameters (`derivative_by_parameters`); whether numbers that are
+    # not finite left the rollout without a flag (`silent`); whether some step is not solved and `Trajectory.unsolved` is zero
+    # (`untold`); whether the gradient is not finite or explodes and neither `Trajectory.diverged` nor `soundness` tells
+    # (`missed`); difference of the final positions from those of C MuJoCo over what a body flies (`apart_from_c`).
     found: xr.Dataset
 
 
@@ -75,63 +122,100 @@ class Outcome:
         return xr.concat([one.found for one in self.scenes], "point")
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per point, for metrics.csv."""
+        """Return one row per point, for metrics.csv."""
         return [row for one in self.scenes for row in _rows(one)]
 
 
 def against_c(found: xr.Dataset, precision: str) -> np.ndarray:
     """Compare mjxgrad's motion with that of C MuJoCo: above 0 where it is of a worse kind, below where of a better one."""
     # All that are fine have one rank.
-    ranks = np.maximum(found.motion, Motion.BOUNCES_RIGHT)
+    ranks = np.maximum(found.motion, Motion.MOVES_ON)
     return (ranks.sel(simulator=precision) - ranks.sel(simulator=C_MUJOCO)).values
 
 
 def _rows(one: SceneOutcome) -> list[dict[str, Any]]:
-    columns: dict[str, Any] = {}
+    kinds = {"motion": Motion, "derivative": Derivative, "derivative_by_parameters": Derivative}
+    columns = {}
     for name in one.found.simulator.values:
-        of_one = one.found.sel(simulator=name)
-        keys = [key for key in of_one.data_vars if key != "missed"] if name != C_MUJOCO else ["motion", "derivative"]
-        prefix = "c" if name == C_MUJOCO else name
-        columns |= {f"{prefix}_{key}": _readable(str(key), of_one[key].values) for key in keys}
+        for key, values in one.found.sel(simulator=name).data_vars.items():
+            if name != C_MUJOCO or key == "motion":
+                told = [kinds[str(key)](v).label for v in values.values] if key in kinds else values.values
+                columns[f"{'c' if name == C_MUJOCO else name}_{key}"] = told
     planes = ["random" if i < 0 else " × ".join(one.points.planes[i]) for i in one.points.family]
     return [
-        {
-            "scene": one.scene.name,
-            "plane": plane,
-            **one.points[i],
-            **{key: values[i] for key, values in columns.items()},
-        }
+        {"scene": one.scene.name, "plane": plane, **one.points[i], **{key: told[i] for key, told in columns.items()}}
         for i, plane in enumerate(planes)
     ]
 
 
-def _readable(key: str, values: np.ndarray) -> list[Any]:
-    if key != "motion" and key not in _JUDGED:
-        return values.tolist()
-    kind = Derivative if key in _JUDGED else Motion
-    return ["" if value == NOT_ASKED else kind(value).label for value in values]
+def classify_motion(
+    course: Course, gain: np.ndarray, rest: np.ndarray, has_crossed: np.ndarray
+) -> Int[np.ndarray, " points"]:
+    """Return what each rollout did, by values of `Motion`; of several failures the worst.
+
+    Args:
+        course: the rollouts.
+        gain: the largest kinetic energy over what there was to draw on: start, gravity and compressed springs.
+        rest: the final kinetic energy over the same.
+        has_crossed: whether bodies ended on the wrong side of each other.
+    """
+    # A comparison with NaN is false, so each question is asked in the form that NaN fails.
+    answers = (
+        (~course.is_sound, Motion.DIVERGES),
+        (~(course.residual <= UNSOLVED), Motion.NOT_SOLVED),
+        (has_crossed, Motion.TUNNELS),
+        (~(gain <= 1 + GAIN), Motion.GAINS_ENERGY),
+        (rest <= AT_REST, Motion.SETTLES),
+    )
+    return np.select([is_so for is_so, _ in answers], [int(kind) for _, kind in answers], int(Motion.MOVES_ON))
 
 
-_RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
-"""Fields of the model that are changed in proportion, to judge the derivative by them."""
-_PARAMETER_WIDTHS = (1e-6, 2e-7)
-_TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
-_SLOPE_TOLERANCE = 0.1
-# What C MuJoCo is not asked for.
-_NOTHING = {
-    "derivative_by_parameters": NOT_ASKED, "slope_derivative": NOT_ASKED, "silent": False, "untold": False,
-    "gradient_unflagged_by_rollout": False, "missed": False, "apart_from_c": 0.0,
-}  # fmt: skip
+def classify_derivative(
+    derivative: Float[np.ndarray, " points"],
+    is_finite: Bool[np.ndarray, " points"],
+    is_sound: Bool[np.ndarray, " points"],
+    truth: Float[np.ndarray, "2 points"],
+    *,
+    largest: float,
+    tolerance: float,
+) -> Int[np.ndarray, " points"]:
+    """Return whether each derivative of one number by one direction is right, by values of `Derivative`.
+
+    The whole gradient that it was taken from is finite, and its rollout sound, or not. The truth comes by differences of two
+    widths, the finer last. Where they disagree by more than the tolerance, a share of the larger of the truth and one, nothing
+    is judged; beyond `largest` a derivative explodes.
+    """
+    with np.errstate(invalid="ignore"):
+        fine, error = truth[1], np.abs(truth[1] - truth[0])
+        scale = tolerance * np.maximum(np.abs(fine), 1.0)
+        answers = (
+            (~is_sound, Derivative.NONE),
+            (~is_finite | ~np.isfinite(derivative), Derivative.NOT_FINITE),
+            (np.abs(derivative) > largest, Derivative.EXPLODES),
+            (~(error <= scale), Derivative.UNJUDGED),
+            (np.abs(derivative - fine) <= scale + error, Derivative.RIGHT),
+        )
+    return np.select([is_so for is_so, _ in answers], [int(kind) for _, kind in answers], int(Derivative.WRONG))
 
 
 @dataclass(frozen=True)
 class _Case:
-    """A scene with its points, and what C MuJoCo did on them."""
+    """A scene with its points: starts, the model's fields for every point, and the directions of derivatives."""
 
     scene: StabilityScene
     grid: Points
-    reference: Reference
     settings: Settings
+
+    @cached_property
+    def starts(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Fields of the model, positions and velocities of every point."""
+        model = self.scene.model()
+        data, rows = mujoco.MjData(model), []
+        for i in range(len(self.grid)):
+            configure(self.scene, model, data, self.grid[i])
+            fields = {name: np.array(getattr(model, name)) for name in FIELDS}
+            rows.append((fields | {"timestep": np.array(model.opt.timestep)}, *self.scene.start(self.grid[i])))
+        return jax.tree.map(lambda *x: np.stack(x), *rows)
 
     @property
     def flown(self) -> Float[np.ndarray, " points"]:
@@ -148,174 +232,44 @@ class _Case:
         return 100.0 * 2 * self.settings.num_steps
 
     @cached_property
-    def push(self) -> dict[str, np.ndarray]:
-        """The change of the start along which derivatives are taken."""
-        shift, push = direction(self.scene, self.settings.num_steps, self.grid.values["timestep"])
-        return {"qpos": shift, "qvel": push}
+    def pushes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Change of positions and velocities along which derivatives are taken, both moving the outcome alike.
+
+        Quaternions stay.
+        """
+        model = self.scene.model()
+        shift = np.cos(1.0 + np.arange(model.nq))
+        for start in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]:
+            shift[start + 3 : start + 7] = 0.0
+        push = np.sin(2.0 + np.arange(model.nv))
+        seconds = self.settings.num_steps * self.grid.values["timestep"]
+        return np.tile(shift, (len(self.grid), 1)), push / seconds[:, None]
 
     @cached_property
     def changes(self) -> dict[str, np.ndarray]:
-        """The change of the model's parameters: each number by a share of itself, no two by the same."""
+        """Change of the model's parameters: each number by a share of itself, no two by the same."""
+        fields = self.starts[0]
         return {
-            name: value * (1 + 0.3 * np.cos(np.arange(value[0].size))).reshape(value[0].shape)
-            for name, value in self.reference.fields.items()
-            if name in _RELATIVE
+            name: fields[name] * (1 + 0.3 * np.cos(np.arange(fields[name][0].size))).reshape(fields[name][0].shape)
+            for name in _RELATIVE
         }
 
-    @cached_property
-    def restitution(self) -> Float[np.ndarray, " points"]:
-        """That of the motion itself, where it is a single bounce from outside."""
-        found = np.full(len(self.grid), np.nan)
-        for i in range(len(self.grid) if self.scene.bounces else 0):
-            point = self.grid[i]
-            stiffness, damping = effective(self.scene, point)
-            constant, ratio = 2 / damping, damping / (2 * np.sqrt(stiffness))
-            impedance = (point["impedance_first"], point["impedance_last"], point["width"])
-            if impedance[0] == impedance[1]:
-                found[i] = float(Bounce(constant, ratio, point["speed"]).restitution)
-            elif impedance[2] > 0:
-                with suppress(ValueError):
-                    found[i] = integrated_restitution(constant, ratio, impedance, point["speed"])[0]
-        return found
-
-
-@dataclass(frozen=True)
-class _Runs:
-    """What mjxgrad did on all points of a scene in one precision."""
-
-    discrete: Run  # motion and discrete gradient
-    event: Run | None  # the same with the slope at MuJoCo's motion; None where it was not asked for
-    differences: np.ndarray | None  # of the outcome (start and parameters, widths, points), in float64
-
-
-def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Run every scene in every precision, and C MuJoCo beside it."""
-    size = settings.sizes
-    scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
-    cases = []
-    with workspace.stage("C MuJoCo", "scenes", len(scenes)) as advance_to, processes() as pool:
-        for scene in scenes:
-            grid = points(scene, size.resolution, size.num_random, settings.seed)
-            in_c = functools.partial(simulate, scene, grid, settings.num_steps, pool)
-            cases.append(_Case(scene, grid, workspace.once(f"C {scene.name}", in_c), settings))
-            advance_to(len(cases))
-    found = [{C_MUJOCO: _of_c(case)} for case in cases]
-    truths: list[np.ndarray] = []
-    for precision in settings.precisions:
-        with _precision(precision):
-            runs = _run_all(cases, precision, workspace)
-        if precision == "float64":
-            truths = [run.differences for run in runs if run.differences is not None]
-        else:
-            runs = _judge_solves(cases, runs, size.chunk, workspace)
-        for one, case, run, truth in zip(found, cases, runs, truths, strict=True):
-            one[precision] = _of_mjxgrad(case, run, truth, precision)
-    labelled = [SceneOutcome(case.scene, case.grid, _labelled(one)) for case, one in zip(cases, found, strict=True)]
-    return Outcome(settings, labelled)
-
-
-def _labelled(found: dict[str, dict[str, np.ndarray]]) -> xr.Dataset:
-    """Label what each simulator did on the points of a scene."""
-    ours, count = found["float64"], len(found["float64"]["motion"])
-    arrays = {
-        key: np.stack([np.broadcast_to(one[key] if key in one else _NOTHING[key], count) for one in found.values()])
-        for key in ours
-    }
-    return xr.Dataset(
-        {key: (("simulator", "point"), array) for key, array in arrays.items()}, {"simulator": list(found)}
-    )
-
-
-@contextmanager
-def _precision(name: str) -> Iterator[None]:
-    before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_enable_x64", name == "float64")
-    try:
-        yield
-    finally:
-        jax.config.update("jax_enable_x64", before)
-
-
-def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_Runs]:
-    """Run the programs of all scenes, some at a time: most of it is compilation."""
-
-    def run(case: _Case) -> _Runs:
-        scene, settings, size = case.scene, case.settings, case.settings.sizes
-        arrays = (case.reference.fields, case.reference.qpos, case.reference.qvel)
-        onset = mg.Onset() if settings.onset else None
-        program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
-        has_event = not settings.onset and (size.event is None or scene.name in size.event)
-        event = Program(scene, settings.num_steps, "slope", size.chunk).run(*arrays) if has_event else None
-        # In float64 alone, whose differences judge the derivatives of both.
-        truth = _differences(case, program) if precision == "float64" else None
-        return _Runs(program.run(*arrays), event, truth)
-
-    with workspace.stage(f"mjxgrad, {precision}", "scenes", len(cases)) as advance_to:
-        return in_threads(
-            lambda case: workspace.once(f"{precision} {case.scene.name}", lambda: run(case)), cases, advance_to
-        )
-
-
-def _judge_solves(cases: list[_Case], runs: list[_Runs], chunk: int, workspace: Workspace) -> list[_Runs]:
-    """Judge what seems not to be solved in single precision by the forces in double precision."""
-
-    def judge(pair: tuple[_Case, _Runs]) -> _Runs:
-        case, run = pair
-        course, steps = run.discrete.course, run.discrete.steps
-        seems_wrong = np.flatnonzero(~(course.residual <= UNSOLVED))
-        if not len(seems_wrong):
-            return run
-        steps, fields = jax.tree.map(lambda x: x[seems_wrong], (steps, case.reference.fields))
-        # The numbers that were given to the solves.
-        fields = {name: value.astype(steps.qpos.dtype) for name, value in fields.items()}
-        errors = errors_of_solves(case.scene, fields, steps, chunk)
-        residual = course.residual.copy()
-        residual[seems_wrong] = np.fmin(steps.unbalanced, errors).max(axis=1)
-        return replace(run, discrete=replace(run.discrete, course=replace(course, residual=residual)))
-
-    with _precision("float64"), workspace.stage("solves, again in float64", "scenes", len(cases)) as advance_to:
-        return in_threads(judge, zip(cases, runs, strict=True), advance_to)
-
-
-def _differences(case: _Case, program: Program) -> np.ndarray:
-    """Give central differences (start and parameters, widths, points) of mjxgrad's own outcome."""
-    reference = case.reference
-
-    def from_start(width: float) -> np.ndarray:
-        step = (width * case.grid.flown)[:, None]
-        moved = {name: getattr(reference, name) + step * push for name, push in case.push.items()}
-        return program.values(reference.fields, **moved)
-
-    def by_parameters(width: float) -> np.ndarray:
-        fields = {name: value + width * case.changes.get(name, 0.0) for name, value in reference.fields.items()}
-        return program.values(fields, reference.qpos, reference.qvel)
-
-    kinds = ((from_start, WIDTHS, case.grid.flown), (by_parameters, _PARAMETER_WIDTHS, case.flown))
-    return np.array(
-        [[(end(width) - end(-width)) / (2 * width * unit) for width in widths] for end, widths, unit in kinds]
-    )
-
-
-def _record(case: _Case, course: Course) -> MotionRecord:
-    scene, grid, start, count = case.scene, case.grid, case.reference.qpos, len(case.grid)
-    with np.errstate(all="ignore"):
-        stored = np.array([_stored(scene, grid[i]) for i in range(count)])
-        budget = course.kinetic[:, 0] + stored + course.potential[:, 0] - course.potential.min(axis=1)
-        gain, rest = course.kinetic.max(axis=1) / budget, course.kinetic[:, -1] / budget
-        crossed = np.zeros(count, bool)
-        for first, second in scene.crossing:
-            ahead = course.qpos[:, second] - course.qpos[:, first] + scene.spacing
-            crossed |= (ahead < 0) & (start[:, second] - start[:, first] + scene.spacing > 0)
-        has_left = np.zeros(count, bool)
-        if scene.bounces:
-            has_left = (course.qvel[:, 0] > 0) & (course.qpos[:, 0] > grid.values["margin"])
-        restitution = np.where(has_left, course.qvel[:, 0] / grid.values["speed"], np.nan)
-    is_sound = course.first_bad_step < 0
-    return MotionRecord(is_sound, course.residual, gain, rest, crossed, restitution, case.restitution)
+    def motion(self, course: Course) -> Int[np.ndarray, " points"]:
+        """Return what the rollouts did, by values of `Motion`."""
+        scene, grid, start = self.scene, self.grid, self.starts[1]
+        with np.errstate(all="ignore"):
+            stored = np.array([_stored(scene, grid[i]) for i in range(len(grid))])
+            budget = course.kinetic[:, 0] + stored + course.potential[:, 0] - course.potential.min(axis=1)
+            gain, rest = course.kinetic.max(axis=1) / budget, course.kinetic[:, -1] / budget
+            crossed = np.zeros(len(grid), bool)
+            for first, second in scene.crossing:
+                before, after = (x[:, second] - x[:, first] + scene.spacing for x in (start, course.qpos))
+                crossed |= (after < 0) & (before > 0)
+        return classify_motion(course, gain, rest, crossed)
 
 
 def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
-    """Bound on the energy of springs compressed at the start, all bodies taken together (J)."""
+    """Return a bound on the energy of springs compressed at the start, all bodies taken together (J)."""
     if point["depth"] <= 0:
         return 0.0
     stiffness, _ = effective(scene, point)
@@ -324,46 +278,259 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
 
 
-def _of_c(case: _Case) -> dict[str, np.ndarray]:
-    record = _record(case, case.reference.course)
-    coarse, fine = case.reference.differences
-    bounds = {"largest": case.largest, "tolerance": _TOLERANCE["float64"]}
-    derivative = classify_derivative(fine, np.isfinite(fine), record.is_sound, fine, np.abs(fine - coarse), **bounds)
-    return {"motion": classify_motion(record), "derivative": derivative, "energy": record.gain}
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Run every scene in every precision, and C MuJoCo beside it, some scenes at a time: most of it is compilation."""
+    size = settings.sizes
+    scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
+    # A simulation that goes wrong is what is looked for; C MuJoCo would write a file about it.
+    mujoco.set_mju_user_warning(lambda _: None)
+
+    def run(scene: StabilityScene) -> SceneOutcome:
+        case = _Case(scene, points(scene, size.resolution, size.num_random, settings.seed), settings)
+        return SceneOutcome(scene, case.grid, workspace.once(scene.name, lambda: _found(case)))
+
+    try:
+        with workspace.stage("simulating", "scenes", len(scenes)) as advance_to:
+            return Outcome(settings, in_threads(run, scenes, advance_to))
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
-def _of_mjxgrad(case: _Case, runs: _Runs, truth: np.ndarray, precision: str) -> dict[str, np.ndarray]:
-    run, event = runs.discrete, runs.event
-    record = _record(case, run.course)
-    motion, bound = classify_motion(record), case.largest
-    slopes = [along(run, case.push), along(run, case.changes) / case.flown]
-    bounds = {"largest": bound, "tolerance": _TOLERANCE[precision]}
-    kinds = [
-        classify_derivative(slope, run.is_gradient_finite, record.is_sound, fine, np.abs(fine - coarse), **bounds)
-        for slope, (coarse, fine) in zip(slopes, truth, strict=True)
-    ]
-    is_wild = ~run.is_gradient_finite | ~(np.abs(slopes) <= bound).all(axis=0)
-    judged = jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
-        (run.gradient[0], *slopes), ~record.is_sound
+def _found(case: _Case) -> xr.Dataset:
+    """Return what every simulator did on the points of a scene."""
+    in_c = in_c_mujoco(case.scene, case.grid, case.settings.num_steps)
+    found, truth = {C_MUJOCO: {"motion": case.motion(in_c)}}, np.zeros(0)
+    for precision in case.settings.precisions:
+        with jax.enable_x64(precision == "float64"):
+            program = Program(case.scene, case.settings)
+            # Differences in float64 judge the derivatives of both precisions.
+            truth = _differences(case, program) if precision == "float64" else truth
+            run = program.run(case.starts)
+        if precision != "float64":
+            run = _judged_again(case, run)
+        found[precision] = _of_mjxgrad(case, run, truth, in_c, _TOLERANCE[precision])
+    nothing = {
+        key: np.full_like(values, NOT_ASKED if "derivative" in key else 0) for key, values in found["float64"].items()
+    }
+    found[C_MUJOCO] = nothing | found[C_MUJOCO]
+    arrays = {key: (("simulator", "point"), np.stack([one[key] for one in found.values()])) for key in nothing}
+    return xr.Dataset(arrays, {"simulator": list(found)})
+
+
+def in_c_mujoco(scene: StabilityScene, grid: Points, num_steps: int) -> Course:
+    """Run C MuJoCo on every point, and look at every state up to the first bad one."""
+    model = scene.model()
+    data, rows = mujoco.MjData(model), []
+    for i in range(len(grid)):
+        configure(scene, model, data, grid[i])
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = scene.start(grid[i])
+        rows.append(_follow(model, data, num_steps))
+    return Course(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _follow(model: mujoco.MjModel, data: mujoco.MjData, num_steps: int) -> tuple[np.ndarray, ...]:
+    mass, residual, energies, is_sound = np.zeros((model.nv, model.nv)), 0.0, np.zeros((num_steps + 1, 2)), True
+    for i in range(num_steps):
+        qpos, qvel = data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_step(model, data)
+        energies[i:] = data.energy
+        mujoco.mj_fullM(model, data, mass)
+        forces = data.qfrc_smooth, data.qfrc_constraint
+        residual = max(residual, float(unbalanced(mass, data.qacc, qvel, *forces, model.opt.timestep)))
+        is_sound = bool(np.isfinite(data.qpos).all() and np.abs(data.qvel).max() < _VELOCITY_LIMIT)
+        if not is_sound:
+            return qpos, energies[:, 1], energies[:, 0], np.array(residual), np.array(False)
+    mujoco.mj_forward(model, data)
+    energies[-1] = data.energy
+    return data.qpos.copy(), energies[:, 1], energies[:, 0], np.array(residual), np.array(True)
+
+
+def unbalanced(mass, acceleration, velocity, smooth, constraint, timestep):
+    """Return the share of a step's velocity by which a solve is off, in the norm of kinetic energy; of NumPy or JAX arrays.
+
+    The norm takes the diagonal of the mass matrix (..., nv, nv); all others are (..., nv). It is 0 where nothing moves and
+    nothing pulls.
+    """
+    inertia = (mass @ acceleration[..., None])[..., 0]
+    weight = mass.diagonal(axis1=-2, axis2=-1)
+
+    def norm(force):
+        # Scaled, for squares of large forces overflow in float32.
+        largest = abs(force).max(axis=-1) + 1e-30
+        return largest * ((force / largest[..., None]) ** 2 / weight).sum(axis=-1) ** 0.5
+
+    moved = norm(weight * velocity) + timestep * (norm(inertia) + norm(smooth) + norm(constraint))
+    return timestep * norm(inertia - smooth - constraint) / (moved + 1e-30)
+
+
+class Steps(eqx.Module):
+    """What the solves of a rollout were given and found."""
+
+    qpos: Float[np.ndarray, "points steps nq"]  # positions before each step
+    qvel: Float[np.ndarray, "points steps nv"]  # velocities, likewise
+    qacc: Float[np.ndarray, "points steps nv"]  # the acceleration found
+    unbalanced: Float[np.ndarray, "points steps"]  # share of the forces that it leaves; 0 from the first bad step on
+
+
+@dataclass(frozen=True)
+class Run:
+    """What mjxgrad did on every point."""
+
+    course: Course
+    gradient: tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]  # by the model's fields, positions and velocities
+    is_silent: np.ndarray  # whether a rollout returned a number that is not finite without a flag
+    is_unsolved: np.ndarray  # whether the rollout says that some step's forces are not in balance
+    steps: Steps  # state and solution at each step, for a closer look at those that seem wrong
+
+
+def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, ...]:
+    mass, forces = mjx.full_m(model, data), (data.qfrc_smooth, data.qfrc_constraint)
+    kinetic = 0.5 * data.qvel @ mass @ data.qvel
+    potential = -model.body_mass @ (data.xipos @ model.opt.gravity)
+    return kinetic, potential, unbalanced(mass, data.qacc, data.qvel, *forces, model.opt.timestep), data.qacc
+
+
+class Program:
+    """A scene's rollout with its gradient, vectorised over points, a chunk at once."""
+
+    def __init__(self, scene: StabilityScene, settings: Settings):
+        self._scene, self._settings = mg.load_scene(scene.model()), settings
+        self._weights = jnp.array(scene.outcome)
+        self._both = jax.jit(jax.vmap(jax.value_and_grad(self._outcome, argnums=(0, 1, 2), has_aux=True)))
+        # Finite differences need no gradient, which takes four times as long as its value.
+        self._value = jax.jit(jax.vmap(lambda *start: self._outcome(*start, observe=None)[0]))
+
+    def values(self, starts: tuple) -> Float[np.ndarray, " points"]:
+        """Return the outcome alone, from the model's fields and the start of every point."""
+        return _in_chunks(self._value, starts, self._settings.sizes.chunk)
+
+    def run(self, starts: tuple) -> Run:
+        """Simulate and differentiate, likewise."""
+        (value, trajectory), gradient = _in_chunks(self._both, starts, self._settings.sizes.chunk)
+        kinetic, potential, residual, qacc = trajectory.observations
+        # From the first bad step on the solver is asked what has no answer.
+        first_bad, step = trajectory.first_bad_step[:, None], np.arange(residual.shape[1])
+        residual = np.where((first_bad >= 0) & (step >= first_bad), 0.0, residual)
+        course = Course(trajectory.qpos[:, -1], kinetic, potential, residual.max(axis=1), first_bad[:, 0] < 0)
+        is_silent = ~trajectory.diverged & ~_all_finite((trajectory, value))
+        last = self._settings.num_steps
+        steps = Steps(trajectory.qpos[:, :last], trajectory.qvel[:, :last], qacc[:, :last], residual[:, :last])
+        return Run(course, gradient, is_silent, trajectory.unsolved > 0, steps)
+
+    def _outcome(
+        self, fields: dict[str, Array], qpos: Array, qvel: Array, observe: Any = _observe
+    ) -> tuple[Array, Any]:
+        scene = _with_fields(self._scene, fields)
+        trajectory = mg.rollout(
+            scene,
+            mg.initial_state(scene, qpos, qvel),
+            horizon=self._settings.num_steps,
+            observe=observe,
+            gradient="discrete",
+            onset=mg.Onset() if self._settings.onset else None,
+        )
+        return trajectory.qpos[-1] @ self._weights, trajectory
+
+
+def errors_of_solves(
+    scene: StabilityScene, fields: dict[str, np.ndarray], steps: Steps, chunk: int
+) -> Float[np.ndarray, "points steps"]:
+    """Return the share of a step's velocity by which each solve is off, by the forces of its state in the present precision.
+
+    Forces out of balance bound the error of an acceleration, but in single precision those of stiff rows may be out of balance
+    by rounding alone, with hardly an error.
+    """
+    loaded = mg.load_scene(scene.model())
+
+    def error(fields: dict[str, Array], qpos: Array, qvel: Array, qacc: Array) -> Array:
+        model = _with_fields(loaded, fields).model
+        data = mg.forward(model, loaded.data.replace(qpos=qpos, qvel=qvel))
+        forces = (data.qfrc_smooth, data.qfrc_constraint)
+        return unbalanced(mjx.full_m(model, data), qacc, qvel, *forces, model.opt.timestep)
+
+    run = jax.jit(jax.vmap(jax.vmap(error, in_axes=(None, 0, 0, 0))))
+    return _in_chunks(run, (fields, steps.qpos, steps.qvel, steps.qacc), max(1, chunk // steps.qpos.shape[1]))
+
+
+def _judged_again(case: _Case, run: Run) -> Run:
+    """Judge what seems not to be solved in single precision by the forces in double precision."""
+    seems_wrong = np.flatnonzero(~(run.course.residual <= UNSOLVED))
+    if not len(seems_wrong):
+        return run
+    steps, fields = jax.tree.map(lambda x: x[seems_wrong], (run.steps, case.starts[0]))
+    # The numbers that were given to the solves.
+    fields = {name: value.astype(steps.qpos.dtype) for name, value in fields.items()}
+    with jax.enable_x64(True):
+        errors = errors_of_solves(case.scene, fields, steps, case.settings.sizes.chunk)
+    residual = run.course.residual.copy()
+    residual[seems_wrong] = np.fmin(steps.unbalanced, errors).max(axis=1)
+    return replace(run, course=replace(run.course, residual=residual))
+
+
+def _with_fields(scene: mg.Scene, fields: dict[str, Array]) -> mg.Scene:
+    others = {name: value for name, value in fields.items() if name != "timestep"}
+    model = scene.model.replace(**others).tree_replace({"opt.timestep": fields["timestep"]})
+    return eqx.tree_at(lambda scene: scene.model, scene, model)
+
+
+def _in_chunks(run: Callable, arrays: tuple, size: int) -> Any:
+    """Run pieces of one length, the last filled up with its last point, in the present precision."""
+    total, dtype, parts = len(arrays[1]), jnp.zeros(()).dtype, []
+    for start in range(0, total, size):
+        index = np.minimum(np.arange(start, start + size), total - 1)
+        found = run(*jax.tree.map(lambda x, i=index: x[i].astype(dtype), arrays))
+        parts.append(jax.tree.map(lambda x, count=total - start: np.asarray(x)[:count], found))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def _differences(case: _Case, program: Program) -> Float[np.ndarray, "2 widths points"]:
+    """Return central differences of mjxgrad's own outcome, by the start and by parameters."""
+    (fields, qpos, qvel), (shift, push) = case.starts, case.pushes
+
+    def by_start(width: float) -> np.ndarray:
+        step = (width * case.grid.flown)[:, None]
+        return program.values((fields, qpos + step * shift, qvel + step * push))
+
+    def by_parameters(width: float) -> np.ndarray:
+        changed = {name: value + width * case.changes.get(name, 0.0) for name, value in fields.items()}
+        return program.values((changed, qpos, qvel))
+
+    kinds = ((by_start, _WIDTHS, case.grid.flown), (by_parameters, _PARAMETER_WIDTHS, case.flown))
+    return np.array(
+        [[(end(width) - end(-width)) / (2 * width * unit) for width in widths] for end, widths, unit in kinds]
     )
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(run.course.qpos - case.reference.course.qpos).max(axis=1) / case.flown
+
+
+def _of_mjxgrad(case: _Case, run: Run, truth: np.ndarray, in_c: Course, tolerance: float) -> dict[str, np.ndarray]:
+    motion, bound, is_sound = case.motion(run.course), case.largest, run.course.is_sound
+    fields, qpos, qvel = run.gradient
+    shift, push = case.pushes
+    with np.errstate(all="ignore"):
+        by_start = (qpos * shift).sum(axis=1) + (qvel * push).sum(axis=1)
+        terms = [(fields[name] * change).reshape(len(qpos), -1).sum(axis=1) for name, change in case.changes.items()]
+        slopes = [by_start, np.sum(terms, axis=0) / case.flown]
+        apart = np.abs(run.course.qpos - in_c.qpos).max(axis=1) / case.flown
+    is_finite = _all_finite(run.gradient)
+    kinds = [
+        classify_derivative(slope, is_finite, is_sound, one, largest=bound, tolerance=tolerance)
+        for slope, one in zip(slopes, truth, strict=True)
+    ]
+    is_wild = ~is_finite | ~(np.abs(slopes) <= bound).all(axis=0)
+    judged = jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
+        (fields, *slopes), ~is_sound
+    )
     return {
         "motion": motion,
         "derivative": kinds[0],
         "derivative_by_parameters": kinds[1],
-        "slope_derivative": np.array(NOT_ASKED) if event is None else _judge_event(record, event, bound),
-        "silent": run.is_silent if event is None else run.is_silent | event.is_silent,
-        "untold": (motion == Motion.UNSOLVED) & ~run.is_unsolved,
-        "gradient_unflagged_by_rollout": is_wild & record.is_sound,
-        "missed": is_wild & record.is_sound & np.asarray(judged),
+        "silent": run.is_silent,
+        "untold": (motion == Motion.NOT_SOLVED) & ~run.is_unsolved,
+        "missed": is_wild & is_sound & np.asarray(judged),
         "apart_from_c": apart,
-        "energy": record.gain,
     }
 
 
-def _judge_event(record: MotionRecord, run: Run, bound: float) -> np.ndarray:
-    """Compare with the restitution after a right bounce; elsewhere only tell what is not finite or explodes."""
-    truth = np.where(classify_motion(record) == Motion.BOUNCES_RIGHT, -record.expected, np.nan)
-    slope, bounds = run.gradient[1][:, 0], {"largest": bound, "tolerance": _SLOPE_TOLERANCE}
-    return classify_derivative(slope, run.is_gradient_finite, record.is_sound, truth, 0 * truth, **bounds)
+def _all_finite(tree: Any) -> np.ndarray:
+    leaves = [x for x in jax.tree.leaves(tree) if np.issubdtype(np.asarray(x).dtype, np.floating)]
+    return np.all([np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in leaves], axis=0)

@@ -62,7 +62,6 @@ class StabilityScene:
     crossing: tuple[tuple[int, int], ...] = ()
     spacing: float = 0.0  # of these two where their positions are equal (m)
     depth_unit: float = RADIUS  # what a depth of one is (m, or rad)
-    bounces: bool = False  # whether it is a single bounce, with a restitution in closed form
     has_refsafe: bool = True  # whether MuJoCo may replace time constants
     has_limits: bool = False  # whether the point's parameters are those of joint limits
 
@@ -141,7 +140,7 @@ def _balls() -> list[StabilityScene]:
     found = []
     for name, refsafe in (("ball", "disable"), ("ball, refsafe", "enable")):
         mjcf, has_refsafe = _mjcf("ball", body, flags=f'refsafe="{refsafe}"'), refsafe == "enable"
-        found.append(StabilityScene(name, mjcf, "ball", start, _alone, (1.0,), bounces=True, has_refsafe=has_refsafe))
+        found.append(StabilityScene(name, mjcf, "ball", start, _alone, (1.0,), has_refsafe=has_refsafe))
     return found
 
 
@@ -248,7 +247,7 @@ def _chain() -> StabilityScene:
 Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 """From places in [0, 1] to values."""
 
-# In the planes of a single bounce the impedance is constant, for a restitution in closed form.
+# In the planes of a single bounce the impedance is constant.
 CONSTANT = {"impedance_first": 0.9, "impedance_last": 0.9}
 PLANES: dict[str, tuple[tuple[str, str, dict[str, float]], ...]] = {
     "ball": (

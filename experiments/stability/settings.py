@@ -16,8 +16,6 @@ class Sizes(SettingsTable):
     """Points of a Latin hypercube over all parameters of a scene."""
     scenes: tuple[str, ...] | None = None
     """By name; None for all."""
-    event: tuple[str, ...] | None = None
-    """Scenes whose slope at MuJoCo's motion is looked at, too; None for all."""
     chunk: int
     """Rollouts that go through a program at once."""
 
@@ -32,7 +30,7 @@ class Settings(RunSettings):
     num_steps: Annotated[int, Field(ge=20, le=1000)] = 100
     """Of every rollout, whatever its time step."""
     onset: bool = False
-    """Whether contacts begin within the step, in place of MuJoCo's motion with both its derivatives."""
+    """Whether contacts begin within the step, in place of MuJoCo's motion."""
     precisions: Annotated[tuple[Literal["float32", "float64"], ...], Field(min_length=1, max_length=2)] = (
         "float64",
         "float32",

@@ -11,14 +11,8 @@ from jaxtyping import Float
 from experiments.motion import own_task
 from experiments.sawtooth import ball
 from experiments.sawtooth import case as landing_case
-from experiments.work_precision.outcome import Cone
 from experiments.work_precision.settings import Settings
 from mjxgrad.tasks import scene_path
-
-CONES: dict[Cone, mujoco.mjtCone] = {
-    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-}
 
 
 @dataclass(frozen=True)
@@ -61,10 +55,6 @@ class Case:
     @property
     def timestep(self) -> float:
         return self.model.opt.timestep
-
-    @property
-    def cone(self) -> Cone:
-        return next(name for name, cone in CONES.items() if cone == self.model.opt.cone)
 
 
 def _filled(base: np.ndarray, values: Mapping[int, float]) -> np.ndarray:

@@ -16,13 +16,8 @@ class Sizes(SettingsTable):
 
     scenes: tuple[SceneName, ...]
     """By name."""
-    with_asides: tuple[SceneName, ...] | None = None
-    """Scenes in which a state alone, MJX in double precision and the other cone are looked at, too; None for all. Each is one
-    more program to compile."""
     refinements: tuple[float, ...]
     """By what a scene's own time step is divided, coarse to fine."""
-    tolerances: tuple[float, ...]
-    """Of the solver, beside the tight one of every other run."""
     batch: int
     """Starts that are simulated together, and over which the error is taken."""
     num_rollouts: int
@@ -31,14 +26,10 @@ class Sizes(SettingsTable):
     """Of an estimate."""
     gradient_refinements: tuple[float, ...]
     """As `refinements`, of gradients."""
-    softenings: tuple[float, ...]
-    """Factors on the contacts' time constant, beside 1."""
     repeats: int
     """At most, of every timing."""
     seconds: float
     """After which a timing is not repeated again, once it has been repeated."""
-    has_all_variants: bool
-    """Whether MJX is run with every integrator, mg.step in single precision with more, and with few iterations."""
 
 
 class Settings(OwnScene, RunSettings):
@@ -55,10 +46,6 @@ class Settings(OwnScene, RunSettings):
         1e-3,
     )
     """Relative errors for which a setting is recommended."""
-
-    def has_asides(self, name: str) -> bool:
-        """Say whether a scene is looked at in every way that the size has."""
-        return self.sizes.with_asides is None or name in self.sizes.with_asides
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":

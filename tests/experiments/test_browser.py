@@ -6,14 +6,13 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from experiments.report import Figure, Report, Table, gallery, overview, page
+from experiments.report import Figure, Report, Table, page
 from mjxgrad.report import svg
 from mjxgrad.rollouts.render import write_video
 
@@ -108,35 +107,3 @@ def test_on_a_telephone_pictures_can_be_read_and_what_goes_on_sideways_has_a_sig
     assert found["before"] >= 640
     assert "sideways" in found["hint"]
     assert "gradient" in found["shade"]
-
-
-def test_a_click_shows_a_figure_at_full_size_and_another_brings_it_back(report, tmp_path):
-    found, _ = opened(report, tmp_path, width=900)
-    # One point of the picture to one of the screen; before, no wider than the window.
-    assert found["full"] >= PICTURE
-    assert found["again"] < 900
-
-
-def test_the_page_over_a_sweep_fits_a_telephone_however_many_methods_it_compares(tmp_path):
-    runs = []
-    for task in ("push_soft", "push_stiff"):
-        runs.append(SimpleNamespace(name="many", question="Which?", varied={"task": task}))
-        (tmp_path / task).mkdir()
-        cells = {f"method {i}": "1234 ± 12" for i in range(20)}
-        (tmp_path / task / "summary.json").write_text(json.dumps({"answer": "First order.", "headline": cells}))
-    found, complaints = opened(overview(runs, [tmp_path / run.varied["task"] for run in runs], "Both."), tmp_path)
-    assert not complaints
-    assert found["beyond"] <= 0
-
-
-def test_a_gallery_fits_a_telephone_with_its_pictures(report, tmp_path):
-    del report
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-        shutil.copy(tmp_path / "picture.svg", tmp_path / name)
-        shutil.copy(tmp_path / "video.mp4", tmp_path / name)
-    still = {"name": "first", "question": "Why?", "answer": "So.", "figure": "picture.svg", "video": None}
-    found, complaints = opened(gallery({"first": still, "second": still | {"video": "video.mp4"}}), tmp_path)
-    assert not complaints
-    assert found["beyond"] <= 0
-    assert found["loaded"]

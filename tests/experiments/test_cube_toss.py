@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss import Course, Outcome, Point, cube_toss, fastest, substepped_step, verdict
+from experiments.cube_toss import Course, Outcome, Point, answer, cube_toss, fastest, substepped_step, verdict
 from mjxgrad.rollouts.state import data_of
 from tests.rollouts.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
 
@@ -35,6 +35,7 @@ def test_a_lucky_coarse_step_is_not_the_fastest(course):
 
 
 def test_the_verdict_names_the_fastest_and_what_never_is_right(course):
+    assert answer(Outcome((course,))) == "MuJoCo's default: 0.3 s, slope at MuJoCo's motion."
     assert verdict(Outcome((course,))) == (
         "With MuJoCo's default contact the first below 2% is slope (time step 0.001 s): 1.5% in 0.3 s of processor time; "
         "adaptive, differentiated stays above 20% at every setting."
@@ -53,13 +54,6 @@ def test_the_first_contact_is_that_of_c_mujoco():
     mujoco.mj_step(model, data, nstep=horizon)
     assert np.abs(data.qpos[0:3] - [0, -0.007, 0.06]).max() < 0.05
     assert np.allclose(found, data.qpos, atol=1e-9)
-
-
-def test_the_default_contact_is_what_mujoco_takes_if_nothing_is_said():
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-    chosen = cube_toss("default").scene.model
-    assert np.allclose(chosen.pair_solref[0], model.geom_solref[0])
-    assert np.allclose(chosen.pair_solimp[0], model.geom_solimp[0])
 
 
 @pytest.mark.slow

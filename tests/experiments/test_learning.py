@@ -3,16 +3,14 @@
 import csv
 import importlib.util
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from experiments import learning
 from experiments.__main__ import main
 from experiments.config import ExperimentError, load_runs
-from experiments.learning import Course, Outcome, Settings, Sizes, answer, findings, measure, verdict
+from experiments.learning import Course, Outcome, Settings, Sizes, findings, measure, verdict
 from experiments.workspace import Workspace
 
 QUICK = Settings(
@@ -67,25 +65,6 @@ def test_a_reward_that_falls_again_is_not_the_soonest():
     assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["onset"]
 
 
-def test_a_quadruped_is_judged_by_its_command():
-    """Squares of 0.04 m²/s² and 0.09 rad²/s² are 0.2 m/s and 0.3 rad/s."""
-    settings = QUICK.model_copy(update={"environment": "quadruped"})
-    one = replace(
-        course("onset", [[1, 1]] * 2), terms={"speed": np.full((2, 2), -0.04), "turning": np.full((2, 2), -0.09)}
-    )
-    outcome = Outcome(settings, [one], None)
-    assert answer(outcome) == "First order is off its command by 0.200 m/s and 0.300 rad/s."
-    assert findings(outcome)[1].endswith("pushes included: first order 0.200 m/s and 0.300 rad/s.")
-
-
-def test_curves_are_means_of_the_last_ten():
-    values = np.arange(24.0).reshape(12, 2)
-    smooth = learning._smooth(values)
-    assert_allclose(smooth[0], values[0])
-    assert_allclose(smooth[4], values[:5].mean(axis=0))
-    assert_allclose(smooth[11], values[2:].mean(axis=0))
-
-
 def test_the_trot_is_learned_as_published_but_for_the_rate():
     """MuJoCo's notebook: 64 windows of 32; five times brax's rate, its decay, and no discount."""
     (published,) = load_runs("learn_trot", ['size="full"'])
@@ -107,30 +86,6 @@ def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
     assert [row["update"] for row in rows] == ["1", "2"]
     assert "in C MuJoCo" in json.loads((folder / "summary.json").read_text())["verdict"]
     assert not list(tmp_path.glob(".learn_cartpole.kept-*"))
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_keeps_what_was_learned(tmp_path, monkeypatch):
-    """It is cut off where the policies are judged; begun anew, nothing is learned twice."""
-    command = [*COMMAND, "video.width=64", "--output", str(tmp_path)]
-    evaluate = learning.learning.evaluate
-
-    def cut_off(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(learning.learning, "evaluate", cut_off)
-    assert main(command) == 130
-    assert not (tmp_path / "learn_cartpole").exists()
-    (kept,) = tmp_path.glob(".learn_cartpole.kept-*")
-    assert (kept / "onset").is_file()
-    monkeypatch.setattr(learning.learning, "evaluate", evaluate)
-
-    def written(*args):
-        raise AssertionError("what is finished is learned again")
-
-    monkeypatch.setattr("mjxgrad.loop.checkpoint.save", written)
-    assert main(command) == 0
-    assert (tmp_path / "learn_cartpole" / "report.html").is_file()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("brax") is not None, reason="brax is installed")

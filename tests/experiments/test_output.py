@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from experiments.config import ExperimentError
-from experiments.output import building, recover, write_csv, write_text, write_toml
+from experiments.output import building, recover, write_csv, write_toml
 
 
 def listing(folder):
@@ -22,15 +22,6 @@ def test_a_folder_appears_whole_and_replaces_the_former(tmp_path):
             assert not (tmp_path / "run" / content).exists()
     assert listing(tmp_path) == ["run"]
     assert listing(tmp_path / "run") == ["new"]
-
-
-def test_files_are_on_the_disk_before_their_folder_gets_its_name(tmp_path, monkeypatch):
-    synced, run = [], tmp_path / "run"
-    monkeypatch.setattr("os.fsync", lambda file: synced.append((os.fstat(file).st_ino, run.exists())))
-    with building(run) as folder:
-        (folder / "inner").mkdir()
-        (folder / "inner" / "a").write_text("a")
-    assert synced == [((run / "inner" / "a").stat().st_ino, False)]
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
@@ -78,26 +69,12 @@ def test_a_second_run_into_a_folder_is_refused_by_the_number_of_the_first_and_le
     assert listing(tmp_path) == [".run.partial-old", "run"]
 
 
-def test_remains_are_cleared_without_a_run_too(tmp_path):
-    (tmp_path / ".run.partial-123").mkdir()
-    recover(tmp_path / "run")
-    assert listing(tmp_path) == []
-
-
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     """A path below a file: no user may write there, root neither."""
     (tmp_path / "file").write_text("")
     sentence = r"cannot write the results to .*file/run: not a directory.*--output"
     with pytest.raises(ExperimentError, match=sentence), building(tmp_path / "file" / "run"):
         pass
-
-
-def test_a_text_is_whole_or_absent(tmp_path):
-    write_text(tmp_path / "a.html", "one")
-    with pytest.raises(TypeError):
-        write_text(tmp_path / "a.html", 5)
-    assert (tmp_path / "a.html").read_text() == "one"
-    assert listing(tmp_path) == ["a.html"]
 
 
 def test_settings_survive_their_way_through_toml(tmp_path):

@@ -1,11 +1,10 @@
 """Work in threads keeps its order, tells how far it is, and does not hide what went wrong."""
 
-import os
 import threading
 
 import pytest
 
-from experiments.parallel import in_threads, num_compilers, num_cores, processes
+from experiments.parallel import in_threads, num_compilers, num_cores
 
 
 def test_results_keep_the_order_of_the_items():
@@ -37,14 +36,3 @@ def test_the_first_mistake_is_raised():
 
 def test_there_are_no_more_compilers_than_cores():
     assert 1 <= num_compilers() <= num_cores()
-
-
-def _square_and_process(item):
-    return item * item, os.getpid()
-
-
-def test_processes_keep_the_order_and_are_not_this_one():
-    with processes() as pool:
-        squares, ids = zip(*pool.map(_square_and_process, range(5)), strict=True)
-    assert squares == (0, 1, 4, 9, 16)
-    assert os.getpid() not in ids

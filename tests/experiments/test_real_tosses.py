@@ -24,8 +24,6 @@ from experiments.real_tosses import (
     cube,
     errors,
     fall,
-    find_tosses,
-    lowest,
     parameters,
     read_toss,
     recordings,
@@ -108,23 +106,10 @@ def test_errors_are_those_of_a_known_shift_and_turn(flight):
     np.testing.assert_allclose(errors(moved, toss), [0.5, 30.0], rtol=1e-9)
 
 
-def test_the_lowest_corner_is_that_of_the_turned_cube(flight):
-    _, toss = flight
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    turns = Rotation.from_quat(toss.qpos[:, [4, 5, 6, 3]]).as_matrix()
-    expected = toss.qpos[:, 2] + HALF_SIDE * (turns @ signs.T)[:, 2].min(axis=1)
-    np.testing.assert_allclose(lowest(toss.qpos), expected, atol=1e-12)
-
-
 def test_a_file_that_would_run_code_is_refused(tmp_path):
     (tmp_path / "0.pt").write_bytes(pickle.dumps(os.getcwd, 2))
     with pytest.raises(ExperimentError, match="must be a toss of ContactNets as its repository has it: it holds posix"):
         read_toss(tmp_path / "0.pt")
-
-
-def test_without_tosses_it_says_where_they_are(tmp_path):
-    with pytest.raises(ExperimentError, match=r"git clone https://github.com/DAIRLab/contact-nets"):
-        find_tosses(str(tmp_path))
 
 
 def test_side_and_radius_move_corners_as_a_cube_with_them_has_them():

@@ -5,7 +5,7 @@ import pytest
 from experiments.bias_variance.report import _with_half_width
 from experiments.report import Figure, Report, Table, page
 from experiments.theme import power
-from experiments.words import percent, quantity
+from experiments.words import quantity
 
 
 @pytest.mark.parametrize(
@@ -33,11 +33,6 @@ def test_a_gradient_has_at_most_three_digits_where_its_interval_is_smaller():
         return _with_half_width({"x": 0.0021312, "x_low": 0.0021312 - half, "x_high": 0.0021312 + half}, "x")
 
     assert [written(7.3e-6), written(1e-4)] == ["0.00213", "0.00213 ± 0.00010"]
-
-
-@pytest.mark.parametrize(("share", "text"), [(0.44, "44%"), (0.0323, "3.2%"), (0.996, "100%"), (1.426, "143%")])
-def test_a_share_has_two_digits(share, text):
-    assert percent(share) == text
 
 
 @pytest.mark.parametrize(

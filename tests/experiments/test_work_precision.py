@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import pytest
@@ -15,37 +14,38 @@ from scipy.stats import norm
 import mjxgrad as mg
 from experiments.__main__ import main
 from experiments.config import ConfigurationError, load_runs
+from experiments.theme import save
 from experiments.work_precision import report
 from experiments.work_precision.cases import case
-from experiments.work_precision.measure import Recorded, Truth, differences, quasi_random, smoothed_gradient, variants
-from experiments.work_precision.outcome import (
+from experiments.work_precision.measure import (
     MG,
-    MJX,
+    ONSET,
     C,
     Course,
     Estimate,
-    GradientReference,
-    Knobs,
+    Native,
     Outcome,
     Point,
+    Recorded,
     Reference,
     Variant,
+    differences,
     pareto_front,
+    quasi_random,
+    smoothed_gradient,
+    variants,
 )
-from experiments.work_precision.programs import Native, softened
 from experiments.work_precision.report import cheapest, fastest, samples_for
 
 STDDEV = 0.3
 
 
 def point(timestep, error, cost):
-    return Point(Variant(MG, batch=64), Knobs(timestep, 1e-8), error, error / 2, (cost, cost, cost))
+    return Point(Variant(MG), timestep, error, (cost, cost, cost))
 
 
 def estimate(name, bias, variance, cost, num_samples=100):
-    return Estimate(
-        name, num_samples, 0.002, 1.0, np.hypot(bias, variance**0.5), (0, 0), bias, 0.0, variance, (cost,), 0.0
-    )
+    return Estimate(name, num_samples, 0.002, np.hypot(bias, variance**0.5), bias, 0.0, variance, (cost,))
 
 
 def test_the_front_holds_what_no_other_beats_in_both():
@@ -58,16 +58,7 @@ def test_a_coarse_step_that_is_right_by_luck_is_not_recommended():
     found = [point(1e-3, 0.01, 4.0), point(2e-3, 0.04, 2.0), point(4e-3, 0.2, 1.0), point(8e-3, 0.03, 0.5)]
     chosen = fastest(found, 0.05)
     assert chosen is not None
-    assert chosen.knobs.timestep == 2e-3
-
-
-def test_a_diverged_state_makes_the_error_infinite():
-    one = case("pendulum")
-    ends = np.array([[0.1, 0.0], [0.2, 0.0]])
-    lost = np.array([[0.1, 0.0], [np.nan, 0.0]])
-    truth = Truth(one, (ends, ends), (1.0, 1.0), Reference(0.0, 0.0, 0.0))
-    assert truth.errors((ends, ends)) == (0.0, 0.0)
-    assert Point(Variant(MG), Knobs(1e-3, 1e-8), *truth.errors((lost, lost)), (1.0,)).error == np.inf
+    assert chosen.timestep == 2e-3
 
 
 def test_an_estimate_needs_its_variance_over_what_bias_leaves_of_the_target():
@@ -86,25 +77,15 @@ def test_the_cheapest_gradient_is_the_one_whose_rollouts_take_least_time_togethe
     assert choice.seconds == pytest.approx(4.0 * 4 / 100)
 
 
-def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendation():
+def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendation(tmp_path):
     lost = replace(estimate("first order, onset", np.inf, np.inf, 1.0), error=np.inf)
-    references = {(name, "pyramidal"): Reference(1e-4, 2e-4, 0.0) for name in (MG, C)}
-    known = GradientReference((1.0, 0.0), 0.01, 0.0, 0.0, 0.01)
+    references, compiling = {name: Reference(1e-4, 2e-4) for name in (MG, C)}, {"mg.step": 1.0, "mjx.step": 2.0}
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
-    course = Course("x", "X", 2e-3, "pyramidal", points, references, (lost,), known)
+    course = Course("x", "X", 2e-3, points, references, (lost,), 0.01, compiling)
     outcome = Outcome(load_runs("work_precision", [])[0].settings, (course,))
-    for draw in (report.motion, report.gradient):
-        figure, _, _ = draw(course, outcome)
-        figure.canvas.draw()
-        plt.close(figure)
-    ((_, known_to, motion, costs, gradient, *_),) = report.summary(outcome).rows
+    assert len(save(report.drawings(outcome), outcome, tmp_path)) == 1
+    ((_, known_to, _, motion, costs, gradient, *_),) = report.tables(outcome)[0].rows
     assert (known_to, motion, costs, gradient) == ("0.01%", "–", "–; –; –", "–")
-
-
-def test_the_smoothed_gradient_is_exact_where_the_cost_is_linear():
-    noise = STDDEV * quasi_random(64, 2, 0)
-    value, _ = smoothed_gradient(3.0 + noise @ np.array([1.5, -2.0]), noise, STDDEV)
-    assert value == pytest.approx([1.5, -2.0], abs=1e-12)
 
 
 def test_the_smoothed_gradient_sees_a_jump():
@@ -134,24 +115,10 @@ def test_estimators_take_records_for_rollouts(records, key, name):
     assert (np.abs(found.value - exact) < 4 * np.asarray(found.standard_error) + 1e-3).all()
 
 
-def test_a_record_is_differentiated_as_it_was_written(records):
-    found = records.differentiate(jnp.zeros(2), jnp.int32(7))
-    assert found.gradient_by_noise == pytest.approx(np.asarray(records.gradients[7]))
-    assert found.noise_score == pytest.approx(np.asarray(records.noise[7]) / STDDEV**2)
-    assert found.cost == records.costs[7]
-
-
-def test_softening_multiplies_time_constants_in_both_formats():
-    model = mg.load_scene(case("push").model).model
-    ball = mg.load_scene(case("bounce").model).model
-    assert np.asarray(softened(model, 2.0).pair_solref)[0] == pytest.approx([-1e5 / 4, 0.0])
-    assert np.asarray(softened(ball, 2.0).geom_solref)[0] == pytest.approx([0.04, 1.0])
-
-
 def test_the_threaded_rollout_ends_where_single_steps_do():
     one = case("arm")
     qvel = one.start[1] + np.array([[0.0], [0.2]]) @ one.directions[:1]
-    ends, seconds = Native(one, Variant(C, "implicitfast")).timed(qvel, Knobs(0.004, 1e-10))
+    ends, seconds = Native(one, Variant(C, "implicitfast")).timed(qvel, 0.004, 1e-10)
     model = one.model
     model.opt.integrator, model.opt.tolerance = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-10
     data = mujoco.MjData(model)
@@ -160,14 +127,6 @@ def test_the_threaded_rollout_ends_where_single_steps_do():
     assert ends[0][1] == pytest.approx(data.qpos, abs=1e-10)
     assert ends[1][1] == pytest.approx(data.qvel, abs=1e-9)
     assert seconds > 0
-
-
-def test_what_diverges_in_c_mujoco_is_no_number_and_no_message(capfd):
-    """Its servos' damping, taken explicitly, blows the arm up at 16 ms."""
-    one = case("arm")
-    ends, _ = Native(one, Variant(C)).timed(one.start[1][None], Knobs(0.016, 1e-8))
-    assert not np.abs(ends[0]).max() < 1e3
-    assert capfd.readouterr() == ("", "")
 
 
 def test_distances_of_free_bodies_are_metres_and_radians():
@@ -179,20 +138,10 @@ def test_distances_of_free_bodies_are_metres_and_radians():
     assert found[0] == pytest.approx([0.3, 0, 0, 0, 0, 0.4], abs=1e-12)
 
 
-def test_only_what_makes_a_difference_is_compiled():
-    settings = load_runs("work_precision", [])[0].settings
-    compiled = {name: variants(case(name), settings, True) for name in ("pendulum", "push", "bounce", "arm")}
-    assert all(len(found) == len(set(found)) for found in compiled.values())
-    assert [v.derivative for v in compiled["pendulum"] if v.derivative] == ["discrete"]  # no contact, no event
-    assert {v.cone for v in compiled["push"]} == {"pyramidal"}  # no friction, no cone
-    assert {v.cone for v in compiled["bounce"]} == {"pyramidal", "elliptic"}
-    implicit = {name for name, found in compiled.items() if any(v.integrator == "implicitfast" for v in found)}
-    assert implicit == {"arm"}  # its servos damp; elsewhere Euler's implicit damping is all there is
-    # Aside of the main diagram: one state alone, MJX in double precision, the other cone.
-    left_out = set(compiled["bounce"]) - set(variants(case("bounce"), settings, False))
-    aside = {(MG, 1), (MJX, 1), (MJX, settings.sizes.batch), (MG, settings.sizes.batch)}
-    assert {(one.library, one.batch) for one in left_out} == aside
-    assert {one.cone for one in left_out if (one.library, one.batch) == (MG, 32)} == {"elliptic"}
+def test_an_onset_is_compiled_where_there_is_a_contact():
+    assert {name: Variant(ONSET) in variants(case(name)) for name in ("pendulum", "push", "bounce")} == {
+        "pendulum": False, "push": True, "bounce": True,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("size", ["quick", "default", "full"])
@@ -205,19 +154,9 @@ def test_every_time_step_divides_every_motion(size):
             assert steps == pytest.approx(round(steps), abs=1e-9), (name, refinement)
 
 
-@pytest.mark.parametrize(
-    ("override", "sentence"),
-    [
-        ('precision="float32"', "precision must be float64"),
-        ('scenes=["bounce", "bounce"]', "scenes: must differ, got bounce more than once"),
-        ("scenes=[]", "scenes: must"),
-        ('size="huge"', "size"),
-        ("targets=[2.0]", "targets"),
-    ],
-)
-def test_settings_that_cannot_be_are_a_sentence(override, sentence):
-    with pytest.raises(ConfigurationError, match=sentence):
-        load_runs("work_precision", [override])
+def test_settings_that_cannot_be_are_a_sentence():
+    with pytest.raises(ConfigurationError, match="precision must be float64"):
+        load_runs("work_precision", ['precision="float32"'])
 
 
 @pytest.mark.slow
@@ -225,22 +164,12 @@ def test_a_run_leaves_its_diagrams_its_table_and_a_recommendation(tmp_path):
     settings = ["size='quick'", "scenes=['bounce']"]
     assert main(["run", "work_precision", *settings, "--output", str(tmp_path)]) == 0
     folder = tmp_path / "work_precision"
-    assert sorted(path.stem for path in (folder / "figures").iterdir()) == ["gradient_bounce", "motion_bounce"]
     with (folder / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    of_motion = [row for row in rows if row["of"] == "motion"]
-    # Both MJX and mg.step find the same motion, whatever it costs.
-    by_library = {
-        library: {row["timestep"]: float(row["error"]) for row in of_motion if _is_plain(row, library)}
-        for library in ("mg.step", "mjx.step", "C MuJoCo")
-    }
-    assert by_library["mg.step"] == pytest.approx(by_library["mjx.step"], rel=1e-5)
-    assert by_library["mg.step"] == pytest.approx(by_library["C MuJoCo"], rel=1e-5)
+        rows = [row for row in csv.DictReader(file) if row["of"] == "motion" and row["integrator"] == "Euler"]
+    # Both engines find the same motion, whatever it costs; the spread of single precision is beside it.
+    found = {(row["library"], row["precision"], row["timestep"]): float(row["error"]) for row in rows}
+    in_double = {step: error for (library, kind, step), error in found.items() if (library, kind) == (MG, "float64")}
+    assert in_double == pytest.approx({step: found[C, "float64", step] for step in in_double}, rel=1e-5)
+    assert in_double == pytest.approx({step: found["mjx.step", "float32", step] for step in in_double}, rel=0.05)
     answer = json.loads((folder / "summary.json").read_text())["verdict"]
     assert answer.startswith("For 5% error of the motion mg.step takes")
-
-
-def _is_plain(row, library):
-    is_euler = (row["library"], row["integrator"], row["cone"]) == (library, "Euler", "pyramidal")
-    is_tight = (row["precision"], row["tolerance"], row["iterations"]) == ("float64", "1e-08", "100")
-    return is_euler and is_tight and row["batch"] == "32"

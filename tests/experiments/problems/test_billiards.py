@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.billiards import MethodSettings, Outcome, Run, Settings, hard_cost, hard_optimum, verdict
+from experiments.billiards import MethodSettings, Outcome, Run, Settings, answer, hard_cost, hard_optimum, verdict
 from experiments.problems.billiards import billiards
 
 
@@ -62,11 +62,6 @@ def test_a_contact_that_begins_earlier_lets_the_derivative_see_the_other_ball(ta
     assert np.all(np.asarray(gradient - effort)[:4] < -0.01)
 
 
-def test_pieces_must_be_whole_steps():
-    with pytest.raises(ValueError, match="num_pieces must divide the 960 steps"):
-        billiards(num_pieces=7)
-
-
 def run_of(label, cost, *, touches=False):
     return Run(
         method=MethodSettings(label=label), steps=np.array([0, 80]), cost=np.array([2.3, cost]), final_cost=cost,
@@ -79,6 +74,7 @@ def test_the_verdict_tells_solved_from_stuck():
     runs = (run_of("near", 1.395), run_of("idle", 1.9999), run_of("half", 1.7), run_of("touching", 1.39, touches=True))
     settings = Settings(experiment="billiards", methods=tuple(run.method for run in runs))
     text = verdict(Outcome(settings, runs))
+    assert answer(Outcome(settings, runs)) == "1 of 3 find it to 1%: “near”."
     assert "“near” (1.395) reach the optimum of 1.3965" in text
     assert "No progress beyond standing still (cost 2): “idle” (2.000); in between: “half” (1.700)." in text
     assert "“touching”: solved (1.390)" in text

@@ -12,7 +12,6 @@ from experiments.optimisation import published as settings
 from experiments.problems import published
 from experiments.problems.published import CENTRES, RADII
 from mjxgrad import estimators
-from mjxgrad.objective import open_loop
 
 NAMES = tuple(settings.TASKS)
 LEVEL_PAD = [0.0, 0.0, 0.0]
@@ -68,12 +67,6 @@ def descend(task, estimator):
     return float(run(jax.random.key(0)))
 
 
-def test_first_order_descends_the_soft_push_to_the_published_cost():
-    mean, stddev = setting("push_soft").reference["first"]
-    # The mean is published to the nearest unit.
-    assert abs(descend(setting("push_soft"), estimators.first_order) - mean) < 0.5 + 4 * stddev
-
-
 def test_friction_separates_the_estimators_as_published():
     """First order does not see that the bodies can stay together, zeroth order does."""
     task = setting("friction")
@@ -105,11 +98,6 @@ def test_friction_is_viscous_up_to_its_limit(speed, drag):
     moved = published.friction().advance(jnp.array([0.0, 0.05, speed, 0.0]), jnp.zeros(1))
     # h/m = 0.05 m/s per N, on both with opposite signs.
     np.testing.assert_allclose(moved[2:], [speed - 0.05 * drag, 0.05 * drag], rtol=1e-12)
-
-
-def test_bodies_that_do_not_overlap_do_not_rub():
-    moved = published.friction().advance(jnp.array([0.0, 0.11, 3.0, 0.0]), jnp.zeros(1))
-    np.testing.assert_array_equal(moved[2:], [3.0, 0.0])
 
 
 def test_a_point_stops_before_a_disc():
@@ -147,17 +135,6 @@ def test_a_ball_beyond_the_pad_s_end_flies_on_and_slows_down():
     np.testing.assert_allclose(moved, [0.96, 0.19, 0.0, -0.4 * 0.999, 0.01, 0.005, 0.02], rtol=1e-12)
 
 
-def test_a_pad_that_is_hit_keeps_its_pose():
-    moved = published.tennis().advance(jnp.array([0.0, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
-    np.testing.assert_array_equal(moved[4:], LEVEL_PAD)
-
-
-def test_a_ball_at_rest_on_the_pad_has_finite_derivatives():
-    """It has no time to impact; the derivative of the quotient must not leak out of the branch not taken."""
-    slopes = jax.jacobian(published.tennis().advance)(jnp.array([0.1, 0.19, 0.0, 0.0, *LEVEL_PAD]), jnp.zeros(3))
-    assert np.isfinite(slopes).all()
-
-
 def test_tennis_starts_at_the_published_cost():
     """Published over 1000 starts, so within their standard error; a ball that is missed costs ten times the others."""
     task = setting("tennis")
@@ -177,35 +154,3 @@ def test_the_regulator_costs_what_its_geometric_series_says():
         expected = 5.25 * ((1 + 0.1 * k**2) * sum(shrink**t for t in range(10)) + 10 * shrink**10)
         found = task.run(lambda gain, state: -gain * state, k, start=start).cost
         np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_a_random_start_has_the_published_spread():
-    draw = jax.vmap(published.tennis().sample_start)(jax.random.split(jax.random.key(0), 4000))
-    drift = draw[:, 2:4] + 0.2 * draw[:, :2]
-    spread = np.array([*draw[:, :2].std(axis=0), *drift.std(axis=0), *draw[:, 4:].std(axis=0)])
-    np.testing.assert_allclose(spread, [4 / 12**0.5, 0.2, 0.03, 0.03, 0.5, 0.05, 0.05], rtol=4 / (2 * 4000) ** 0.5)
-    np.testing.assert_allclose(draw.mean(axis=0)[1], 2.0, atol=4 * 0.2 / 4000**0.5)
-
-
-def test_the_stiff_push_differs_in_more_than_stiffness():
-    assert setting("push_stiff").objective.task.horizon == 200
-    assert setting("push_soft").objective.task.horizon == 400
-
-
-def test_rates_decrease_where_the_paper_says():
-    rate = setting("tennis").learning_rate
-    np.testing.assert_allclose([rate(0), rate(99)], [1e-6, 1e-6 / 100**0.1], rtol=1e-6)
-
-
-@pytest.mark.parametrize(("stiffness", "most"), [(10.0, 0.1), (1000.0, 1.05)])
-def test_on_the_push_the_error_of_the_control_variate_is_far_below_zeroth_order_or_no_worse(stiffness, most):
-    """With 200 controls and 10 rollouts; facts: zeroth order 4.5 times the gradient, this one 0.34, and 4.31 and 4.15."""
-    task = published.push(stiffness, 0.99 if stiffness == 1000 else 0.998, horizon=200)
-    objective, params, keys = open_loop(task, 0.1), jnp.full(200, 0.1), jax.random.split(jax.random.key(3), 60)
-    results = [
-        jax.jit(jax.vmap(lambda key, e=estimator: e(objective, params, key, num_samples=10).value))(keys)
-        for estimator in (estimators.control_variate, estimators.zeroth_order)
-    ]
-    # Both are unbiased, so their spread is their error.
-    errors = [np.sqrt(((np.asarray(v) - np.asarray(v).mean(axis=0)) ** 2).sum(axis=1).mean()) for v in results]
-    assert errors[0] < most * errors[1]

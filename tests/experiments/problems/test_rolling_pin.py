@@ -1,7 +1,5 @@
 """Above a bed that it does not touch the pin has no gradient; from afar it has one; the report says which."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,8 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from experiments.problems.rolling_pin import DENT, DEPTH, rolling_pin
-from experiments.rolling_pin import Descent, Outcome, Settings, tables, verdict
-from mjxgrad.stepping import Smoothing
+from experiments.rolling_pin import Descent, Outcome, Settings, answer, tables, verdict
 
 HORIZON = 40
 
@@ -84,15 +81,6 @@ def test_the_distance_is_that_to_the_nearest_cap(task):
     np.testing.assert_allclose(task.cost.distance(jnp.asarray(moved)), np.hypot(0.03, 0.085) - 0.055, rtol=1e-12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "backward"])
-def test_a_kernel_feels_the_bed_and_only_the_forward_one_moves_it(task, mode):
-    smoothed = task.with_smoothing(Smoothing(0.02, "gaussian", mode))
-    cost, gradient = jax.jit(jax.value_and_grad(smoothed.true_cost))(jnp.zeros(2 * HORIZON))
-    assert np.abs(gradient[1::2]).max() > 1e-5
-    assert (abs(cost - 1) > 1e-9) == (mode == "forward")
-
-
 def _descent(label, costs):
     heights = np.where(np.isin(np.arange(8), DENT), -DEPTH, 0.001)
     return Descent(label, np.zeros(2 * HORIZON), np.array(costs, float), 2, 0, heights)
@@ -108,14 +96,9 @@ def outcome(task):
     return Outcome(Settings(experiment="rolling_pin", num_steps=3), descents, start_gradient=0.0, task=task)
 
 
-def test_a_cost_counts_as_reached_only_where_it_stays(outcome):
-    # Below 0.1 after one step, but not for good before the third.
-    assert outcome.descents[1].steps_to(0.1) == 3
-    assert outcome.descents[2].steps_to(0.1) is None
-
-
 def test_the_verdict_names_what_stayed_what_solved_and_what_did_not(outcome):
     said = verdict(outcome)
+    assert answer(outcome).startswith("1 of 3 ways")
     assert "its gradient is zero, exactly" in said
     assert "Solved, with a true cost below 0.1 of the untouched bed's 1, by “margin” (0.0200)" in said
     assert "Not solved by “zeroth order” (0.700)" in said
@@ -124,9 +107,3 @@ def test_the_verdict_names_what_stayed_what_solved_and_what_did_not(outcome):
     assert [row[4:6] for row in shown.rows] == [["never", ""], ["3", "6"], ["never", ""]]
     assert shown.rows[0][-1] == "1.0"  # mm
     assert shown.emphasised == frozenset({(1, 2)})
-
-
-def test_the_verdict_does_not_claim_a_zero_that_is_none(outcome):
-    moving = dataclasses.replace(outcome, start_gradient=0.5)
-    assert "gradient is zero" not in verdict(moving)
-    assert "0.5" in verdict(moving)
