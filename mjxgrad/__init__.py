@@ -31,9 +31,10 @@ from mjxgrad.rollouts import (
     rollout,
 )
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
-from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
+from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, forward, solve, step
 
 __all__ = [
+    "Discrete",
     "DivergedError",
     "History",
     "Linearisation",
@@ -42,6 +43,7 @@ __all__ = [
     "Optimisation",
     "Scene",
     "SceneTask",
+    "Slope",
     "Smoothing",
     "Softness",
     "State",

@@ -94,8 +94,7 @@ def from_task(task: SceneTask) -> TaskEnvironment:
     """
     if task.observe is not None:
         raise ValueError(f"task must have a cost of positions, velocities and controls, got observe={task.observe!r}")
-    settings = {"gradient": task.gradient, "onset": task.onset, "smoothing": task.smoothing, "engine": task.engine}
-    return TaskEnvironment(task.scene, task=task, episode_length=task.horizon, **settings)
+    return TaskEnvironment(task.scene, task=task, episode_length=task.horizon, contact=task.contact)
 
 
 def _repeated(value: Float[Array, " n"], num_states: int) -> Float[Array, "states n"]:

@@ -23,15 +23,14 @@ def rolled_out(
     noise: Float[Array, "horizon nu"],
     applied: dict[str, Array],
     gradient: Gradient,
-    velocity_limit: float | None,
     *,
     measure_growth: bool,
 ) -> Trajectory:
     """Return C MuJoCo's rollout under controls, noise included, or a policy; the last good state is held."""
     if callable(controls):
-        found = _by_policy(scene, state, controls, params, noise, applied, gradient, velocity_limit)
+        found = _by_policy(scene, state, controls, params, noise, applied, gradient)
     else:
-        found = _course(scene, state, controls, applied, gradient, velocity_limit)
+        found = _course(scene, state, controls, applied, gradient)
     growth = _growth(scene, state, found.ctrl, applied, gradient) if measure_growth else None
     return dataclasses.replace(found, growth=growth)
 
@@ -44,7 +43,6 @@ def _by_policy(
     noise: Float[Array, "horizon nu"],
     applied: dict[str, Array],
     gradient: Gradient,
-    velocity_limit: float | None,
 ) -> Trajectory:
     """Roll out step by step, since each control depends on the state before it."""
 
@@ -53,7 +51,7 @@ def _by_policy(
         index, disturbance, forces = given
         ctrl = one_each(policy(params, state), scene.model.nu) + disturbance
         forces = jax.tree.map(lambda x: x[None], forces)
-        one = _course(scene, state, ctrl[None], forces, gradient, velocity_limit)
+        one = _course(scene, state, ctrl[None], forces, gradient)
         first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
         moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
         return (moved, first_bad), (state, ctrl)
@@ -70,7 +68,6 @@ def _course(
     ctrl: Float[Array, "horizon nu"],
     applied: dict[str, Array],
     gradient: Gradient,
-    velocity_limit: float | None,
 ) -> Trajectory:
     """Return the motion under known controls: one call of C MuJoCo."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
@@ -87,7 +84,7 @@ def _course(
     )
     time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
     states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-    is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
+    is_bad = ~(jax.vmap(lambda one: is_sound(one))(states)[1:] & jnp.all(is_finite, axis=1))
     first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
     kept = jnp.arange(len(ctrl) + 1)
     kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
@@ -108,7 +105,7 @@ def _growth(scene: Scene, state: State, ctrl: Array, applied: dict[str, Array], 
 
     def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
         start = dataclasses.replace(state, qpos=qpos, qvel=qvel)
-        found = _course(scene, start, ctrl, applied, gradient, None)
+        found = _course(scene, start, ctrl, applied, gradient)
         return found.qpos, found.qvel
 
     _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))

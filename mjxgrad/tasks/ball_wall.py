@@ -40,7 +40,7 @@ class BallWall(InScene):
         """Return the trajectory of a throw at an angle above the floor, in rad."""
         qvel = self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])])
         start = initial_state(self.scene, qvel=qvel)
-        return rollout(self.scene, start, horizon=self.horizon, gradient=self.gradient, onset=self.onset)
+        return rollout(self.scene, start, horizon=self.horizon, contact=self.contact)
 
     def cost(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
         """Return the squared distance from the ball's end to the target, in m²; NaN if the rollout diverged."""
