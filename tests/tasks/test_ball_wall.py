@@ -10,6 +10,7 @@ from mjxgrad.estimators import first_and_zeroth_order
 from mjxgrad.objective import closed_loop
 from mjxgrad.rollouts import initial_state, rollout
 from mjxgrad.scene import load_scene
+from mjxgrad.stepping import Discrete
 from mjxgrad.tasks import SceneTask, ball_wall, scene_path
 from mjxgrad.tasks.ball_wall import wall_softness
 
@@ -30,7 +31,7 @@ CART = """
 @pytest.fixture(scope="session")
 def ends():
     """Where the ball ends, by stiffness; one compilation for both."""
-    task = ball_wall().with_gradient("discrete")  # MuJoCo's motion
+    task = ball_wall().with_contact(Discrete())  # MuJoCo's motion
     throw = jax.jit(
         jax.vmap(lambda softness, angle: task.with_softness(softness).trajectory(angle).qpos[-1, 0], in_axes=(None, 0))
     )
