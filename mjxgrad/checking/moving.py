@@ -171,7 +171,7 @@ class Mover:
                     with_contact(scene, contact),
                     state,
                     ctrl,
-                    contact=own_motion(kind, "mjx"),  # pyright: ignore[reportArgumentType]
+                    contact=own_motion(kind, "mjx"),
                     checkpoint=False,
                 )
                 return course.qpos[1:], course.qvel[1:], jnp.asarray(course.act)[1:]

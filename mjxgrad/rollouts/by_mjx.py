@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
@@ -80,7 +80,9 @@ class _Scan:
         state, model, settings = carry.state, self.scene.model, self.settings
         index, row, disturbance, forces = given
         seen = None if carry.before is None else self.look(state, carry.before, forces)
-        ctrl = (row if self.policy is None else self.choose(state if carry.before is None else seen)) + disturbance
+        if self.policy is not None:
+            row = one_each(self.policy(self.params, state if carry.before is None else seen), model.nu)
+        ctrl = row + disturbance
         data = data_of(self.scene, state, ctrl).replace(**forces)
         tangent, growth = carry.tangent, carry.growth
         if tangent is None or growth is None:
@@ -100,10 +102,6 @@ class _Scan:
             growth,
         )
         return following, (state.qpos, state.qvel, state.act, ctrl, self.look(state, ctrl, forces, stepped), seen)
-
-    def choose(self, seen: PyTree) -> Float[Array, " nu"]:
-        """Return the controls that the policy chooses."""
-        return one_each(self.policy(self.params, seen), self.scene.model.nu)  # pyright: ignore[reportOptionalCall]
 
     def measure(self, data: mjx.Data, tangent: tuple, growth: Array) -> tuple[mjx.Data, tuple[Array, Array], Array]:
         """Return the data after a step, the tangent there, and its largest norm so far."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float, PyTree
 
+from mjxgrad._programs import is_traced
 from mjxgrad.rollouts import by_mjx, by_mujoco
 from mjxgrad.rollouts.arguments import (
     Observe,
@@ -97,7 +98,7 @@ def rollout(
     scene.check_mjx()
     rows = (base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     settings = by_mjx.Settings(policy_sees, checkpoint, contact, measure_growth)
+    given = (scene, state, rows, policy, params if policy is not None else None, observe, settings)
     # Functions may read changing variables: every call traces them anew, unless the caller compiles.
-    if policy is None and observe is None:
-        return by_mjx.rolled_out_compiled(scene, state, rows, None, None, None, settings)
-    return by_mjx.rolled_out(scene, state, rows, policy, params, observe, settings)
+    has_functions = policy is not None or observe is not None
+    return (by_mjx.rolled_out if has_functions or is_traced(given) else by_mjx.rolled_out_compiled)(*given)

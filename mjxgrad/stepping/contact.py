@@ -32,7 +32,8 @@ class OwnMotion(eqx.Module):
             motions agree to the solver's tolerance. None is the scene's own, `scene.engine`.
     """
 
-    engine: Engine | None = eqx.field(static=True, default=None)
+    # A plain string, so that unknown names reach the check below, which lists the choices.
+    engine: str | None = eqx.field(static=True, default=None)
     gradient: ClassVar[Gradient]
 
     def __check_init__(self):
@@ -60,7 +61,7 @@ class Slope(OwnMotion):
 Contact = Discrete | Slope | Onset | Smoothing
 
 
-def own_motion(gradient: Gradient, engine: Engine | None = None) -> Discrete | Slope:
+def own_motion(gradient: str, engine: str | None = None) -> Discrete | Slope:
     """Return the record of a derivative along MuJoCo's own motion, by its name.
 
     Raises:

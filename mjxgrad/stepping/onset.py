@@ -193,12 +193,9 @@ class TwoSolves(eqx.Module):
 
 
 def begin(
-    model: mjx.Model,
-    data: mjx.Data,
-    blocks: list[Block],
-    how: Onset | _Vector,
-) -> tuple[list[Block], Shares | None]:
-    """Return rows that are active if they act for any part of the step, and their shares; None if no row begins or ends.
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], how: Onset | _Vector
+) -> tuple[list[Block], TwoSolves | None]:
+    """Return rows that are active if they act for any part of the step, and its two solves; None if no row begins or ends.
 
     The shares are those of an onset; or, with the velocity after MuJoCo's step, of MuJoCo's own motion, for a derivative there.
     """
@@ -221,13 +218,10 @@ def begin(
         rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
         found.append(share)
         sides.append(side)
-    return rows, _split(blocks, found, sides)
+    return rows, _two_solves(model, data, rows, _split(blocks, found, sides))
 
 
-def two_solves(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> TwoSolves | None:
-    """Return the two solves of a step from the rows and shares of `begin`; the rows may be under noise."""
-    if shares is None:
-        return None
+def _two_solves(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares) -> TwoSolves:
     rows = joined(blocks)
 
     def weigh(share: _PerRow) -> _PerRow:

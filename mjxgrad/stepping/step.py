@@ -127,8 +127,7 @@ def _forward(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector 
     if isinstance(contact, Smoothing):
         rows, noise, layout = smoothed(model, data, rows, contact, layout)
     elif isinstance(contact, Onset) or after is not None:
-        rows, shares = onset.begin(model, data, rows, contact if isinstance(contact, Onset) else after)
-        solves = onset.two_solves(model, data, rows, shares)
+        rows, solves = onset.begin(model, data, rows, contact if isinstance(contact, Onset) else after)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
         data = mended.sensor_vel(model, mended.sensor_pos(model, data))

@@ -14,7 +14,7 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
 from mjxgrad.solver.kernels import KERNELS
-from mjxgrad.stepping import check_contact, smoothing_warnings
+from mjxgrad.stepping import check_contact, own_motion, smoothing_warnings
 from tests.solver.test_kernels import DISTRIBUTIONS
 from tests.solver.test_smoothed_law import _nodes
 
@@ -249,5 +249,5 @@ def test_what_a_step_cannot_take_is_refused():
         mg.step(model, data, contact=mg.Slope("mujoco"))
     with pytest.raises(ValueError, match=r"mg\.Slope\(\), mg\.Onset\(\) or mg\.Smoothing\(\), got \"slope\""):
         check_contact("slope")
-
-
+    with pytest.raises(ValueError, match="gradient must be one of 'discrete', 'slope', got 'event'"):
+        own_motion("event")
