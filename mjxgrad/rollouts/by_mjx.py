@@ -135,17 +135,7 @@ def rolled_out(
     observe: Observe | None,
     settings: Settings,
 ) -> Trajectory:
-    """Return the result of `rollout` for checked arguments.
-
-    Args:
-        scene: the scene.
-        state: the initial state.
-        rows: controls, noise and inputs of each step.
-        policy: policy that replaces the rows of controls; None without one.
-        params: parameters of the policy.
-        observe: function from each state's model and data to the observations to keep.
-        settings: settings of the rollout.
-    """
+    """Return the result of `rollout` for checked arguments; `rows` are controls, noise and inputs of each step."""
     scan = _Scan(scene, policy, params, observe, settings)
     advance = scan.advance
     if settings.checkpoint:
