@@ -66,8 +66,9 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
 def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
     """Check how contact is stepped, and return it where C MuJoCo steps it, None where MJX does."""
     check_contact(contact)
-    is_native = isinstance(contact, OwnMotion) and (contact.engine or scene.engine) == "mujoco"
-    return contact if is_native else None
+    if isinstance(contact, OwnMotion) and (contact.engine or scene.engine) == "mujoco":
+        return contact
+    return None
 
 
 def one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:

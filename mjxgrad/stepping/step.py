@@ -126,8 +126,8 @@ def _forward(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector 
     layout, noise, solves = assembly.row_layout(model, data), None, None
     if isinstance(contact, Smoothing):
         rows, noise, layout = smoothed(model, data, rows, contact, layout)
-    elif isinstance(contact, Onset) or after is not None:
-        rows, solves = onset.begin(model, data, rows, contact if isinstance(contact, Onset) else after)
+    elif (how := contact if isinstance(contact, Onset) else after) is not None:
+        rows, solves = onset.begin(model, data, rows, how)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
         data = mended.sensor_vel(model, mended.sensor_pos(model, data))
@@ -209,9 +209,11 @@ def _mixed(
         force = varied.row_force(layout, acceleration)
         return force, varied.rmv(force)
 
-    found = (both, *jax.vmap(forces)(solves.variants, both))
     # In this order the result equals a single solve to the last bit where the two do not differ.
-    return _with_forces(data, *(x[1] + solves.share * (x[0] - x[1]) for x in found), num_iterations)
+    acceleration, force, total = (
+        x[1] + solves.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(solves.variants, both))
+    )
+    return _with_forces(data, acceleration, force, total, num_iterations)
 
 
 def _with_forces(data: mjx.Data, acceleration: Array, force: Array, total: Array, num_iterations: Array) -> mjx.Data:
