@@ -14,7 +14,6 @@ from mjxgrad.objective import (
     SceneTask,
     closed_loop,
     linear_policy,
-    mlp_policy,
     open_loop,
     parameter_noise,
 )
@@ -70,7 +69,6 @@ __all__ = [
     "linear_policy",
     "linearise",
     "load_scene",
-    "mlp_policy",
     "open_loop",
     "optimise",
     "over_devices",

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.objective.policy import FINAL_SCALE
+# The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend little on
+# the state. Among initialisations this choice mattered most (Andrychowicz et al., arXiv:2006.05990, section 3.2).
+FINAL_SCALE = 0.01
 
 
 class Network(eqx.Module):

@@ -116,7 +116,7 @@ def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) 
 def _forward(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None) -> mjx.Data:
     """Return data with all fields that depend on the state.
 
-    With `after`, the velocity after MuJoCo's step, the derivative is that of `Slope`, and its value is not used.
+    With `after`, the velocity after MuJoCo's step, the result has the derivative of `Slope`; its values are not used.
     """
     if isinstance(contact, Smoothing) and contact.mode == "backward":
         own = _forward(*jax.lax.stop_gradient((model, data)), Discrete())
