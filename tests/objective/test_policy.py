@@ -43,7 +43,7 @@ def test_what_is_observed_can_be_chosen():
 def test_a_policy_closes_a_loop_and_is_differentiated_by_its_noise(kind, key):
     policy, params = mg.linear_policy(2, 1)
     if kind == "mlp":
-        policy, params = lambda net, state: net(state), eqx.nn.MLP(2, 1, width_size=5, depth=2, key=key)
+        policy, params = lambda net, state: net(state), eqx.nn.MLP(2, 1, 5, 2, activation=jnp.tanh, key=key)
     objective = mg.closed_loop(textbook.LinearSystem(), policy, 0.3, params=params)
     flat, noise = objective.ravel(params) + 0.1, objective.sample_noise(key)
 
