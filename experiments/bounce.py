@@ -193,7 +193,7 @@ def _sample(
 
     Time steps differ in arrays alone, so one compilation serves them all.
     """
-    (gradient, onset), (solref, solimp), count = ARMS[arm], contacts, len(contacts[0])
+    (solref, solimp), count = contacts, len(contacts[0])
 
     def height(start: Float[Array, ""], contact: Int[Array, ""]) -> Float[Array, ""]:
         model = at_time_step(scene.model, timestep)
@@ -202,7 +202,7 @@ def _sample(
             geom_solimp=jnp.broadcast_to(solimp[contact], model.geom_solimp.shape),
         )
         data = scene.data.replace(qpos=start[None], qvel=jnp.array([-SPEED]))
-        return motion(model, data, _height, num_times=1, steps_between=num_steps, gradient=gradient, onset=onset)[0]
+        return motion(model, data, _height, num_times=1, steps_between=num_steps, contact=ARMS[arm])[0]
 
     def one(start: Float[Array, ""], contact: Int[Array, ""]) -> tuple[Array, Array]:
         return jax.jvp(lambda x: height(x, contact), (start,), (jnp.ones_like(start),))

@@ -100,7 +100,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     time = settings.timestep * np.arange(settings.horizon + 1)
     coords = {"kernel": list(settings.kernels), "name": list(names), "time": time}
     motion = xr.DataArray(np.array(motions), coords).to_dataset("name")
-    motion["hard"], motion["hard_slope"] = (("time", each) for each in _smoothed_motion(scene, settings, None))
+    motion["hard"], motion["hard_slope"] = (("time", each) for each in _smoothed_motion(scene, settings, mg.Discrete()))
     value, error = np.moveaxis(np.array(linear), 2, 0)
     dims = {"kernel": list(settings.kernels), "velocity": list(velocities), "entry": list(_ENTRIES), "way": list(WAYS)}
     table = xr.Dataset({"value": (list(dims), value), "error": (list(dims), error)}, coords=dims)
@@ -154,28 +154,28 @@ def _draw(name: str, key: Array, shape: tuple[int, ...]) -> Array:
     return size * (uniform - 0.5) / jnp.sqrt(uniform * (1 - uniform))
 
 
-def _move(scene, smoothing, point, noise):
+def _move(scene, contact, point, noise):
     """Step once from height, velocity and force, with the contact's distance shifted by the noise."""
     height, velocity, force = point
     data = scene.data.replace(qpos=(height + noise)[None], qvel=velocity[None], ctrl=force[None])
-    moved = mg.step(scene.model, data, smoothing=smoothing)
+    moved = mg.step(scene.model, data, contact=contact)
     return moved.qpos[0] - noise, moved.qvel[0]
 
 
 @eqx.filter_jit
-def _heights(scene, smoothing, start, speed, noise):
+def _heights(scene, contact, start, speed, noise):
     def advance(state, w):
-        moved = _move(scene, smoothing, (*state, jnp.zeros(())), w)
+        moved = _move(scene, contact, (*state, jnp.zeros(())), w)
         return moved, moved[0]
 
     _, heights = jax.lax.scan(advance, (start, -speed), noise)
     return jnp.concatenate([start[None], heights])
 
 
-def _smoothed_motion(scene, settings: Settings, smoothing) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed_motion(scene, settings: Settings, contact) -> tuple[np.ndarray, np.ndarray]:
     speed, noise = jnp.array(settings.speed), jnp.zeros(settings.horizon)
     start, one = jnp.array(settings.start), jnp.array(1.0)
-    height, slope = jax.jvp(lambda start: _heights(scene, smoothing, start, speed, noise), (start,), (one,))
+    height, slope = jax.jvp(lambda start: _heights(scene, contact, start, speed, noise), (start,), (one,))
     return np.asarray(height), np.asarray(slope)
 
 
@@ -197,23 +197,23 @@ def _mean(samples: Float[Array, "samples *rest"]) -> tuple[np.ndarray, np.ndarra
 
 
 @eqx.filter_jit
-def _slope(scene, smoothing, point, noise):
+def _slope(scene, contact, point, noise):
     """Return the velocity after a step, and its derivative by height, velocity and force."""
-    return jax.value_and_grad(lambda p: _move(scene, smoothing, p, noise)[1])(point)
+    return jax.value_and_grad(lambda p: _move(scene, contact, p, noise)[1])(point)
 
 
 @eqx.filter_jit
 def _samples(scene, point, noise, score):
     """Return samples of the derivative by first and by zeroth order: by the noise's score, and by differences."""
-    still = _move(scene, None, point, 0.0)[1]
+    still = _move(scene, mg.Discrete(), point, 0.0)[1]
 
     def value(shift, w):
-        return _move(scene, None, point + shift, w)[1]
+        return _move(scene, mg.Discrete(), point + shift, w)[1]
 
     pushes = _LITTLE * jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
     def sample(w, score):
-        middle, first = _slope(scene, None, point, w)
+        middle, first = _slope(scene, mg.Discrete(), point, w)
         ends = jax.vmap(value, in_axes=(0, None))(jnp.concatenate([pushes, -pushes]), w)
         others = (ends[:2] - ends[2:]) / (2 * _LITTLE)
         return first, jnp.concatenate([((middle - still) * score)[None], others])

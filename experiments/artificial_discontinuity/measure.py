@@ -21,6 +21,7 @@ from experiments.artificial_discontinuity.shapes import HALF, PATHS, Shape, shap
 from experiments.parallel import in_threads
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics import Jumps, jumps_along
+from mjxgrad.stepping import Contact, own_motion
 from mjxgrad.tasks import scene_path
 
 # Which force jumps: under the shape's own contact, which begins with a jump of force but for lattices; with an impedance that
@@ -226,8 +227,8 @@ def _static(settings: Settings, body: Shape, name: str) -> Static:
 
         return jumps_along(at, path.interval, num_points=count, smallest=_SMALLEST)
 
-    def measured(scene: mg.Scene, smoothing: mg.Smoothing | None = None) -> Jumps:
-        return jumps(lambda at: _wrenches(scene, jnp.asarray(at), smoothing)[0])
+    def measured(scene: mg.Scene, contact: Contact = mg.Discrete()) -> Jumps:
+        return jumps(lambda at: _wrenches(scene, jnp.asarray(at), contact)[0])
 
     plain = measured(body.scene)
     found = {PLAIN: plain, GENTLE: plain}
@@ -238,7 +239,7 @@ def _static(settings: Settings, body: Shape, name: str) -> Static:
         found |= {GENTLE: measured(gentle), SMOOTHED: measured(body.scene, mg.Smoothing(settings.smoothing))}
     found[C] = jumps(lambda at: _c_wrenches(body.scene.mj_model, at))
     grid = jnp.asarray(path.poses(body, settings.depth, plain.parameters))
-    _, distances, places = (np.asarray(each) for each in _wrenches(body.scene, grid, None))
+    _, distances, places = (np.asarray(each) for each in _wrenches(body.scene, grid, mg.Discrete()))
     touching = [np.round(at[gap < 0] / _NEAR) for gap, at in zip(distances, places, strict=True)]
     different = np.array([len(np.unique(one, axis=0)) for one in touching])
     return Static(
@@ -254,12 +255,12 @@ def _static(settings: Settings, body: Shape, name: str) -> Static:
 
 @eqx.filter_jit
 def _wrenches(
-    scene: mg.Scene, poses: Float[Array, "points 7"], smoothing: mg.Smoothing | None
+    scene: mg.Scene, poses: Float[Array, "points 7"], contact: Contact
 ) -> tuple[Float[Array, "points 6"], Float[Array, "points contacts"], Float[Array, "points contacts 3"]]:
     """Return force and torque, and the distances and places of all contacts."""
 
     def one(pose: Float[Array, " 7"]) -> tuple[Array, Array, Array]:
-        data = mg.forward(scene.model, scene.data.replace(qpos=pose), smoothing=smoothing)
+        data = mg.forward(scene.model, scene.data.replace(qpos=pose), contact=contact)
         return data.qfrc_constraint * _WRENCH, data._impl.contact.dist, data._impl.contact.pos
 
     return jax.vmap(one)(poses)
@@ -489,7 +490,7 @@ def _ends(
 
     def outcome(pose: Float[Array, " nq"]) -> Float[Array, ""]:
         state = mg.initial_state(scene, pose)
-        return mg.rollout(scene, state, horizon=horizon, gradient=gradient).final.qpos[index]  # pyright: ignore[reportArgumentType]
+        return mg.rollout(scene, state, horizon=horizon, contact=own_motion(gradient)).final.qpos[index]
 
     every = jnp.broadcast_to(tangents, poses.shape)
     return jax.vmap(lambda pose, tangent: jax.jvp(outcome, (pose,), (tangent,)))(poses, every)

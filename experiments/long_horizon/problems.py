@@ -12,6 +12,7 @@ from experiments.motion import advance
 from mjxgrad._mjx import mjx
 from mjxgrad.rollouts import State
 from mjxgrad.rollouts.state import data_of, state_of
+from mjxgrad.stepping import own_motion
 from mjxgrad.tasks import scene_path
 from mjxgrad.tasks.hopper import hopper
 
@@ -68,11 +69,11 @@ class Problem(eqx.Module):
         return jax.lax.scan(next_one, self.start, length=self.num_times)[1]
 
     def _segment(self, params: Float[Array, " dim"], state: State, gradient: str) -> State:
-        onset, derivative = (mg.Onset(), "discrete") if gradient == "onset" else (None, gradient)
+        contact = mg.Onset() if gradient == "onset" else own_motion(gradient)
 
         def step(data: mjx.Data) -> mjx.Data:
             data = data.replace(ctrl=self.control(params, state_of(data)))
-            return mg.step(self.scene.model, data, gradient=derivative, onset=onset)  # pyright: ignore[reportArgumentType]
+            return mg.step(self.scene.model, data, contact=contact)
 
         return state_of(advance(step, data_of(self.scene, state, self.scene.data.ctrl), self.steps_per_time))
 

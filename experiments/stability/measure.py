@@ -242,10 +242,9 @@ def _run_all(cases: list[_Case], precision: str, workspace: Workspace) -> list[_
     def run(case: _Case) -> _Runs:
         scene, settings, size = case.scene, case.settings, case.settings.sizes
         arrays = (case.reference.fields, case.reference.qpos, case.reference.qvel)
-        onset = mg.Onset() if settings.onset else None
-        program = Program(scene, settings.num_steps, "discrete", size.chunk, onset)
+        program = Program(scene, settings.num_steps, mg.Onset() if settings.onset else mg.Discrete(), size.chunk)
         has_event = not settings.onset and (size.event is None or scene.name in size.event)
-        event = Program(scene, settings.num_steps, "slope", size.chunk).run(*arrays) if has_event else None
+        event = Program(scene, settings.num_steps, mg.Slope(), size.chunk).run(*arrays) if has_event else None
         # In float64 alone, whose differences judge the derivatives of both.
         truth = _differences(case, program) if precision == "float64" else None
         return _Runs(program.run(*arrays), event, truth)

@@ -19,7 +19,7 @@ from experiments.parallel import num_cores
 from experiments.stability.scenes import FIELDS, Points, StabilityScene, catalogue, configure
 from mjxgrad._mjx import mjx
 from mjxgrad.rollouts import Observe, Trajectory
-from mjxgrad.stepping import Gradient
+from mjxgrad.stepping import Contact
 
 VELOCITY_LIMIT = 1e4
 """Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
@@ -191,13 +191,10 @@ def _observe(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array, Array, Arr
 class Program:
     """A scene's rollout with its gradient, vectorised over points, a chunk at once."""
 
-    def __init__(
-        self, scene: StabilityScene, num_steps: int, gradient: Gradient, chunk: int, onset: mg.Onset | None = None
-    ):
+    def __init__(self, scene: StabilityScene, num_steps: int, contact: Contact, chunk: int):
         self._scene = mg.load_scene(scene.model())
         self._weights = jnp.array(scene.outcome)
-        self._gradient: Gradient = gradient
-        self._onset = onset
+        self._contact = contact
         self._num_steps, self._chunk = num_steps, chunk
         both = jax.value_and_grad(self._outcome, argnums=(0, 1, 2), has_aux=True)
         self._both = jax.jit(jax.vmap(both))
@@ -233,9 +230,7 @@ class Program:
     ) -> tuple[Array, Trajectory]:
         scene = _with_fields(self._scene, fields)
         state = mg.initial_state(scene, qpos, qvel)
-        trajectory = mg.rollout(
-            scene, state, horizon=self._num_steps, observe=observe, gradient=self._gradient, onset=self._onset
-        )
+        trajectory = mg.rollout(scene, state, horizon=self._num_steps, observe=observe, contact=self._contact)
         return trajectory.qpos[-1] @ self._weights, trajectory
 
     def _chunks(self, arrays) -> Iterator[tuple[int, Any]]:

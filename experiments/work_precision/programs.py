@@ -25,6 +25,7 @@ from experiments.work_precision.cases import CONES, Case
 from experiments.work_precision.outcome import MJX, C, Integrator, Knobs, Variant
 from experiments.work_precision.settings import Sizes
 from mjxgrad._mjx import mjx
+from mjxgrad.stepping import own_motion
 
 Ends = tuple[Float[np.ndarray, "batch nq"], Float[np.ndarray, "batch nv"]]
 
@@ -164,12 +165,12 @@ def compiled(case: Case, variant: Variant) -> Program:
 def _simulate(
     variant: Variant, start: mjx.Data, model: mjx.Model, qvel: Float[Array, " nv"], num_steps: Array
 ) -> tuple[Array, Array]:
-    onset = mg.Onset() if variant.onset else None
+    contact = mg.Onset() if variant.onset else own_motion(variant.derivative or "discrete")
 
     def step(data: mjx.Data) -> mjx.Data:
         if variant.library == MJX:
             return mjx.step(model, data)
-        return mg.step(model, data, gradient=variant.derivative or "discrete", onset=onset)
+        return mg.step(model, data, contact=contact)
 
     final = advance(step, start.replace(qvel=qvel), num_steps)
     return final.qpos, final.qvel

@@ -87,7 +87,7 @@ def test_the_distance_is_that_to_the_nearest_cap(task):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test_a_kernel_feels_the_bed_and_only_the_forward_one_moves_it(task, mode):
-    smoothed = task.with_smoothing(Smoothing(0.02, "gaussian", mode))
+    smoothed = task.with_contact(Smoothing(0.02, "gaussian", mode))
     cost, gradient = jax.jit(jax.value_and_grad(smoothed.true_cost))(jnp.zeros(2 * HORIZON))
     assert np.abs(gradient[1::2]).max() > 1e-5
     assert (abs(cost - 1) > 1e-9) == (mode == "forward")
